@@ -1,0 +1,167 @@
+"""Milliseconds a frame of the renderer zbuffer, written beside this file: `python benchmarks/zbuffer.py`."""
+
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+from statistics import median
+
+import numba
+import numpy as np
+import torch
+
+from framework.camera import look_from
+from framework.renderer import Renderer, Scene
+from framework.schema import build, resolve
+
+HEIGHT, WIDTH = 410, 308
+FOCAL = 600  # pixels
+DISTANCE = 2.6  # metres
+ASKED = (("mask",), ("depth",), ("color",), ("color", "depth"))
+FIRST_CALL = """
+import time, torch
+from benchmarks.zbuffer import DISTANCE, figure, scene
+from plugins.zbuffer.renderer import ZBuffer
+drawn = scene(*figure(), distance=DISTANCE)
+start = time.perf_counter()
+ZBuffer()(drawn, ("color", "depth", "face", "mask"))
+print(time.perf_counter() - start)
+"""
+
+
+def figure(rings: int = 82, segments: int = 84) -> tuple[np.ndarray, np.ndarray]:
+    """A closed body like a standing person 1.7 m tall, z up: rings × segments + 2 vertices.
+
+    The default has 6,890 vertices and 13,776 faces.
+    """
+    polar = np.pi * np.arange(1, rings + 1) / (rings + 1)
+    around = 2 * np.pi * np.arange(segments) / segments
+    up = 0.85 * np.cos(polar)
+    heights = [-0.85, -0.8, -0.45, 0.0, 0.2, 0.45, 0.55, 0.62, 0.75, 0.85]
+    halves = [0.10, 0.16, 0.17, 0.21, 0.18, 0.24, 0.17, 0.08, 0.11, 0.0]  # half the breadth there, metres
+    breadth = np.interp(up, heights, halves)
+    rings_of = np.stack(
+        [
+            breadth[:, None] * np.cos(around),
+            0.6 * breadth[:, None] * np.sin(around),
+            up[:, None] + 0 * around,
+        ],
+        -1,
+    )
+    vertices = np.concatenate([rings_of.reshape(-1, 3), [[0, 0, 0.85], [0, 0, -0.85]]])
+    start = np.arange(rings - 1)[:, None] * segments
+    here = np.arange(segments)
+    following = (here + 1) % segments
+    a, b = (start + here).ravel(), (start + following).ravel()
+    c, d = a + segments, b + segments
+    last = (rings - 1) * segments
+    top, bottom = np.full(segments, len(vertices) - 2), np.full(segments, len(vertices) - 1)
+    faces = [(a, c, d), (a, d, b), (top, here, following), (bottom, last + following, last + here)]
+    return vertices, np.concatenate([np.stack(corners, 1) for corners in faces])
+
+
+def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each face cut into four at the middles of its edges."""
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), 1)
+    unique, which = np.unique(edges, axis=0, return_inverse=True)
+    a, b, c = faces.T
+    ab, bc, ca = (which.reshape(-1, 3) + len(vertices)).T
+    parts = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+    return np.concatenate([vertices, vertices[unique].mean(1)]), np.concatenate(
+        [np.stack(corners, 1) for corners in parts]
+    )
+
+
+def scene(vertices: np.ndarray, faces: np.ndarray, distance: float) -> Scene:
+    """The body, coloured by position, from `distance` metres; behind the camera where that is negative."""
+    camera = look_from(0.4, 0.15, 0.05, distance, 2 * math.atan(HEIGHT / 2 / FOCAL), (HEIGHT, WIDTH))
+    low, high = vertices.min(0), vertices.max(0)
+    colors = torch.tensor((vertices - low) / (high - low), dtype=torch.float32)
+    return Scene(torch.tensor(vertices, dtype=torch.float32), torch.tensor(faces), colors, camera)
+
+
+def milliseconds(call: Callable[[], object], repeats: int = 300) -> float:
+    """Median processor time of the calling thread, after ten calls to warm up."""
+    for _ in range(10):
+        call()
+    times = []
+    for _ in range(repeats):
+        start = time.thread_time()
+        call()
+        times.append(time.thread_time() - start)
+    return 1e3 * median(times)
+
+
+def row(name: str, renderer: Renderer, drawn: Scene) -> str:
+    cells = [f"{milliseconds(lambda asked=asked: renderer(drawn, asked)):.2f}" for asked in ASKED]
+    return f"| {name} | {' | '.join(cells)} |"
+
+
+def first_calls() -> tuple[float, float]:
+    """Seconds of the first call in a fresh process: with an empty compilation cache, and with a filled one.
+
+    The import of torch and numba is not in it.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
+        cold, warm = (
+            subprocess.run(
+                [sys.executable, "-c", FIRST_CALL],
+                env=environment, cwd=Path(__file__).parent.parent, check=True, capture_output=True, text=True,
+            ).stdout
+            for _ in range(2)
+        )  # fmt: skip
+    return float(cold), float(warm)
+
+
+def processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor()
+
+
+def report() -> str:
+    torch.set_num_threads(1)
+    plain, culling = (
+        build("renderer", resolve("renderer", {"name": "zbuffer", "cull": cull})) for cull in (False, True)
+    )
+    bodies = [figure(), subdivided(*figure())]
+    cover = plain(scene(*bodies[0], distance=DISTANCE), ("mask",))["mask"].float().mean().item()
+    rows = []
+    for vertices, faces in bodies:
+        size = f"{len(vertices):,} / {len(faces):,}"
+        rows.append(row(f"{size}, in view", plain, scene(vertices, faces, distance=DISTANCE)))
+        rows.append(row(f"{size}, in view, culled", culling, scene(vertices, faces, distance=DISTANCE)))
+        rows.append(row(f"{size}, out of view", plain, scene(vertices, faces, distance=-DISTANCE)))
+    cold, warm = first_calls()
+    return "\n".join(
+        [
+            "# zbuffer: milliseconds a frame",
+            "",
+            f"A synthetic closed body in {HEIGHT} rows × {WIDTH} columns, of which it covers {cover:.0%}; "
+            "one thread; processor time, median of 300 calls.",
+            "",
+            f"| vertices / faces | {' | '.join(' + '.join(asked) for asked in ASKED)} |",
+            "|---|" + "---|" * len(ASKED),
+            *rows,
+            "",
+            f"First call in a process, all channels: {cold:.1f} s where everything is compiled, "
+            f"{warm:.2f} s where the compiled code is read from the cache.",
+            "",
+            f"{processor()}, {os.cpu_count()} cores; {date.today()}; Python {platform.python_version()}, "
+            f"torch {torch.__version__}, numba {numba.__version__}, numpy {np.__version__}. "
+            "Command: `python benchmarks/zbuffer.py`.",
+            "",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    Path(__file__).with_suffix(".md").write_text(report())

@@ -1,0 +1,88 @@
+"""The command line: composes the config, runs the chosen mode, and says what went wrong in a sentence."""
+
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from framework.errors import ConfigError, UserError
+
+
+def main() -> None:
+    """Entry of `python -m framework`; exits 0, 1 (failed), 2 (refused), 130 (interrupted) or 143 (terminated)."""
+    # Hydra prints its own errors and exits unless told to raise them.
+    full_error = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        _run()
+    except UserError as error:
+        _fail(str(error), 2 if isinstance(error, ConfigError) else 1)
+    except KeyboardInterrupt:
+        _fail("interrupted.", 130)
+    except Exception as error:
+        from framework.composition import sentence
+
+        message = None if full_error == "1" else sentence(error)
+        if message is None:
+            raise
+        _fail(message, 2)
+
+
+def _run() -> None:
+    expected = Path(__file__).resolve().parent.parent / "plugins" / "__init__.py"
+    spec = find_spec("plugins")
+    if spec is None or not spec.origin or Path(spec.origin).resolve() != expected:
+        raise ConfigError(
+            f"The package `plugins` was found at {spec and spec.origin}, not at {expected}: a file or folder of that "
+            "name in the current directory hides it. Rename it, run from elsewhere, or use `python -P -m framework`."
+        )
+    if sys.argv[1:] == ["mode=plugins"]:  # needs no config, and so makes no run folder
+        from framework.modes.plugins import show
+
+        show()
+        return
+    import hydra
+    from omegaconf import DictConfig
+
+    from framework.composition import folder, refuse_logging_overrides, register
+
+    sys.argv[1:] = _with_resumed_folder(sys.argv[1:])
+    refuse_logging_overrides(sys.argv[1:])
+    register()
+
+    failures: list[BaseException] = []
+
+    @hydra.main(version_base="1.3", config_path=str(folder()), config_name="config")
+    def run(config: DictConfig) -> float | None:
+        from framework.modes import run as run_mode
+
+        try:
+            return run_mode(config)
+        except UserError as error:
+            # Hydra would print a stack trace's worth of its own around a sentence.
+            failures.append(error)
+            return None
+
+    run()
+    if failures:
+        raise failures[0]
+
+
+def _with_resumed_folder(arguments: list[str]) -> list[str]:
+    """`resume=<run folder>` runs in that folder, so that Hydra makes no new one."""
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key == "resume" and value not in ("auto", "never", "null", ""):
+            path = Path(value).expanduser()
+            if not (path / "config.yaml").is_file():
+                raise ConfigError(
+                    f"resume={value}: {path / 'config.yaml'} does not exist. Give the folder of a run, "
+                    "as printed at its start (outputs/<experiment>/<time>)."
+                )
+            return [*arguments, f"hydra.run.dir={path}"]
+    return arguments
+
+
+def _fail(message: str, code: int) -> None:
+    sys.stderr.write(f"error: {message}\n")
+    sys.exit(code)

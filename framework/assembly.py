@@ -1,0 +1,107 @@
+"""Builds the parts of the density road from a config: data, predictor, objectives, metrics."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from framework.data import Data
+from framework.density_head import DensityHead
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+from framework.metric import Metric
+from framework.model import Model, Predictor
+from framework.objective import Objective
+from framework.registry import GROUPS, installed, load
+from framework.schema import build, parts, resolve
+from framework.target import Target
+
+Resolved = dict[str, Any]
+"""Every plugin of a run with every parameter written out: plain values, by group; lists for plural groups."""
+
+
+def resolve_all(config: Mapping[str, Any]) -> Resolved:
+    """Check every plugin of a composed config before any data is read.
+
+    Raises:
+        ConfigError: a part of the road is missing, or a plugin's name, key or value is wrong.
+    """
+    for group in ("data", "density_head", "encoder"):
+        if not config.get(group):
+            raise ConfigError(
+                f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
+                f"or one of the installed: {group}={'|'.join(installed(group))}."
+            )
+    resolved: Resolved = {
+        "data": resolve("data", config["data"]),
+        "density_head": resolve("density_head", config["density_head"]),
+    }
+    for group in ("encoder", "uncertainty", "objective", "metric"):
+        chosen = config.get(group) or {}
+        resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
+    return resolved
+
+
+def build_data(resolved: Resolved) -> Data:
+    """The data set, not yet prepared."""
+    return build("data", resolved["data"])
+
+
+def build_predictor(
+    resolved: Resolved, target: Target, input_shape: tuple[int, ...], seed: int
+) -> Predictor:
+    """The untrained predictor; its initial weights are a function of `seed` and the config."""
+    torch.manual_seed(seed)
+
+    def model() -> Predictor:
+        encoders: list[Encoder] = []
+        shape = input_shape
+        for part in resolved["encoder"]:
+            encoders.append(build("encoder", part, input_shape=shape))
+            shape = encoders[-1].output_shape
+        head: DensityHead = build("density_head", resolved["density_head"], target=target)
+        return Model(encoders, head)
+
+    factory: Callable[[], Predictor] = model
+    for part in resolved["uncertainty"]:
+        factory = _wrapped(part, factory, target)
+    return factory()
+
+
+def _wrapped(part: Mapping[str, Any], inner: Callable[[], Predictor], target: Target) -> Callable[[], Predictor]:
+    return lambda: build("uncertainty", part, model=inner, target=target)
+
+
+def build_objectives(resolved: Resolved) -> Sequence[Objective]:
+    """The extra terms of the training loss; none by default."""
+    return [build("objective", part) for part in resolved["objective"]]
+
+
+def build_metrics(resolved: Resolved, target: Target) -> list[Metric]:
+    """Fresh metrics, in the order asked for."""
+    return [build("metric", part, target=target) for part in resolved["metric"]]
+
+
+def citations(resolved: Resolved) -> dict[str, str]:
+    """BibTeX of every plugin used, parts of parts included, keyed 'group name'."""
+    found: dict[str, str] = {}
+
+    def visit(group: str, part: Mapping[str, Any]) -> None:
+        cls = load(group, part["name"])
+        bibtex = str(getattr(cls, "bibtex", "")).strip()
+        if bibtex:
+            found[f"{group} {part['name']}"] = bibtex
+        for key, inner in parts(cls).items():
+            for item in _items(part.get(key)):
+                visit(inner.group, item)
+
+    for group in GROUPS:
+        for part in _items(resolved.get(group)):
+            visit(group, part)
+    return found
+
+
+def _items(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return list(value) if isinstance(value, list | tuple) else [value]

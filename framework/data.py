@@ -1,0 +1,88 @@
+"""The contract of a data set: named, labelled samples for training, validation and test."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.target import Target
+
+Batch = dict[str, Tensor]
+"""Named fields of a batch, first dimension the samples: "input"; "target" (radians for angles); "index", int64, the
+sample's number in its split; "group", int64 index into `Data.groups`; and what a plugin adds, said in its README."""
+
+
+class Data(ABC):
+    """Gives the three splits of a data set; order, batching, workers and resuming are the framework's.
+
+    The constructor only keeps its keyword-only parameters (the config): it reads nothing. `prepare` does the work
+    and is called once before anything else; after it all attributes below are set. Bad input raises a DataError
+    that says which file, what was wanted and what to do; a sample that cannot be read is never replaced silently.
+
+    A data set that cannot be shipped may be generated: its generator writes the official layout to the cache
+    (`framework.cache.folder`) and the same loader reads it; `synthetic` is then True, and the framework says so
+    wherever a number or picture made from it appears.
+    """
+
+    group: ClassVar[str] = "data"
+    bibtex: ClassVar[str]
+    """What to cite, as BibTeX."""
+    target: Target
+    """What is to be predicted."""
+    input_shape: tuple[int, ...]
+    """Shape of one input, without the batch dimension."""
+    groups: tuple[str, ...]
+    """Names by which results are also reported apart (object classes, say); one name where there is one."""
+    synthetic: bool
+    """Whether the samples were generated."""
+    skipped: int
+    """How many samples were left out because they could not be read (only when the config allows it)."""
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Find or generate the data, check its layout, read what is needed to set the attributes.
+
+        Raises:
+            DataError: a missing root, a wrong layout, an unreadable file, a label that is not finite, an empty split.
+        """
+
+    @abstractmethod
+    def train(self) -> Dataset[Batch]:
+        """The training split. Items are dicts of tensors without batch dimension; a dataset that can fetch many
+        items faster at once also has `__getitems__(indices) -> Batch`, already batched (framework.fields.Fields)."""
+
+    @abstractmethod
+    def validation(self) -> Dataset[Batch]:
+        """The validation split: early stopping and calibration see it, training does not."""
+
+    @abstractmethod
+    def test(self) -> Dataset[Batch]:
+        """The test split: seen by nothing but the test stage."""
+
+    @abstractmethod
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        """Unlabelled samples from a user's own files, for `mode=predict`: "input" and "index" only.
+
+        Raises:
+            DataError: a file cannot be read; names it.
+        """
+
+    @abstractmethod
+    def augment(self, batch: Batch) -> Batch:
+        """A training batch, randomly varied, on whatever device it is; or the batch itself.
+
+        Random numbers come from torch's global generator, which the framework seeds by (seed, step) before the call,
+        so that a resumed run sees the same variations. What changes the target (a mirror) changes it too.
+        """
+
+    @abstractmethod
+    def fingerprint(self) -> Mapping[str, str]:
+        """What identifies the data: root, version, number of samples a split, a hash over names and labels."""
+
+    @abstractmethod
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        """One input as a person would see it: (height, width, 3) uint8."""

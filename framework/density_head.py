@@ -1,0 +1,64 @@
+"""The contract of a density head: raw numbers in, a probability density over the target out."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+
+class DensityHead(nn.Module, ABC):
+    """Turns raw network outputs into a density over the target.
+
+    The framework puts one linear layer, encoder features → `size` raw numbers, in front of every head (the final
+    layer "set to match the number of required parameters", thesis §3.6.1). So a head owns the meaning of the raw
+    numbers and nothing before them, and any head can be a component of another: a mixture of K components reads
+    K × (component.size + 1) numbers.
+
+    A constructor asks for `target: Target` (framework.target) before `*`; its keyword-only parameters are the
+    config. It calls `target.require("angle", by="...")` or the like, so that it refuses what it cannot describe.
+
+    The density is a `torch.distributions.Distribution` (build it with `validate_args=False`; the head has checked)
+    with `batch_shape == raw.shape[:-1]`; its `event_shape` is `(len(target.names),)` for angles and reals, and `()`
+    for classes. It has `log_prob` (nats), `sample`, `entropy` (nats) and `mode`. Angles are radians and read
+    modulo 2π. Densities over several numbers register `marginal`, and those whose expected absolute deviation has
+    a closed-form minimiser register `median` (both in framework.density).
+
+    Raw numbers may be anything finite, however large; the head maps them to a density whose log_prob is finite
+    wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw numbers
+    are refused with a `ValueError` that names the first bad batch row. A batch may be of any shape, also empty.
+    """
+
+    group: ClassVar[str] = "density_head"
+    bibtex: ClassVar[str]
+    """What to cite, as BibTeX."""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]]
+    """Attributes that trade error for run time and may be set at any time after training, with the values worth
+    trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
+    size: int
+    """How many raw numbers the head reads per sample, > 0; set by the constructor."""
+
+    @abstractmethod
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """The density over the target, given raw numbers. Called for training, testing and prediction.
+
+        In training mode the density may be a cheaper one than in evaluation (fewer samples). Random numbers come
+        from torch's global generator, which the framework seeds before every step.
+        """
+
+    @abstractmethod
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """The training loss per sample in nats, differentiable in `raw`; the framework takes the mean.
+
+        Usually `-self(raw).log_prob(target)`; a variational head returns its negative bound.
+        """
+
+    @abstractmethod
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Fit what is not trained by gradient, such as a single global concentration (eq. 3.5), in place.
+
+        Called once after training, in evaluation mode and without gradient, with the whole validation set. What it
+        fits is a buffer, so that it is stored in the checkpoint. A head with nothing to fit does nothing.
+        """

@@ -1,0 +1,30 @@
+"""The errors a user can cause; each message says what came, what was wanted and what to do."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class UserError(Exception):
+    """Something the user can mend. Printed as a sentence, without a stack trace."""
+
+
+class ConfigError(UserError):
+    """A config names or holds something that does not exist or is out of range."""
+
+
+class DataError(UserError):
+    """Data on disk is missing, unreadable or wrong."""
+
+
+class CheckpointError(UserError):
+    """A checkpoint is damaged, or belongs to another model."""
+
+
+class NonFiniteLoss(UserError):
+    """The training loss became NaN or infinite; raised before the optimiser steps."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """' Did you mean ...?' with a leading space, or nothing where nothing is near."""
+    near = get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f" Did you mean {near[0]!r}?" if near else ""

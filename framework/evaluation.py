@@ -1,0 +1,80 @@
+"""Runs a predictor over a split: metrics, per group and in all, and what the prediction costs."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torchmetrics import Metric as AnyMetric
+
+from framework.batches import seed_step
+from framework.cost import Cost, measure
+from framework.data import Batch
+from framework.metric import Metric
+from framework.model import Predictor
+from framework.prediction import Prediction
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Numbers of one split: over everything, and per group where there are several."""
+
+    total: dict[str, float]
+    groups: dict[str, dict[str, float]]
+
+
+def on_device(batches: Iterable[Batch], device: torch.device) -> Iterator[Batch]:
+    """The same batches on `device`."""
+    for batch in batches:
+        yield {name: tensor.to(device, non_blocking=True) for name, tensor in batch.items()}
+
+
+@torch.no_grad()
+def evaluate(
+    predictor: Predictor,
+    batches: Iterable[Batch],
+    metrics: Sequence[Metric],
+    *,
+    groups: Sequence[str],
+    samples: int,
+    seed: int,
+    device: torch.device,
+) -> Evaluation:
+    """Every metric over every batch; noise is a function of (seed, batch), so a second call gives the same bits."""
+    predictor.eval().to(device)
+    several = len(groups) > 1
+    apart = {name: [metric.clone().to(device) for metric in metrics] for name in groups} if several else {}
+    together = [metric.clone().to(device) for metric in metrics]
+    for number, batch in enumerate(on_device(batches, device)):
+        seed_step(seed, number, "test")
+        _update(together, predictor, batch, samples)
+        for index, name in enumerate(groups if several else ()):
+            rows = (batch["group"] == index).nonzero().flatten()
+            if len(rows):
+                seed_step(seed, number, "test")
+                _update(apart[name], predictor, {key: value[rows] for key, value in batch.items()}, samples)
+    return Evaluation(_numbers(together), {name: _numbers(group) for name, group in apart.items()})
+
+
+def _update(metrics: Sequence[Metric], predictor: Predictor, batch: Batch, samples: int) -> None:
+    prediction = Prediction(predictor(batch["input"]), batch, samples)
+    for metric in metrics:
+        metric.update(prediction)
+
+
+def _numbers(metrics: Sequence[AnyMetric]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for metric in metrics:
+        found |= {name: float(value) for name, value in metric.compute().items()}
+    return found
+
+
+@torch.no_grad()
+def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.device) -> Cost:
+    """What one prediction costs: the density and the point prediction drawn from it."""
+    predictor.eval().to(device)
+
+    def predict(inputs: torch.Tensor) -> torch.Tensor:
+        return Prediction(predictor(inputs), {}, samples).point
+
+    parameters = sum(parameter.numel() for parameter in predictor.parameters())
+    return measure(predict, batch["input"].to(device), parameters=parameters)

@@ -1,0 +1,371 @@
+"""The local journal of a run: every number stands on disk here before anything else sees it."""
+
+import fcntl
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from framework.errors import DataError
+
+_log = logging.getLogger(__name__)
+# json.dumps with options builds its encoder anew at each call; this one is built once.
+_encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+_BLOCK = 1 << 20  # bytes read at a time: bounds the memory of a reader that is far behind
+
+
+@dataclass(frozen=True)
+class Line:
+    """What one call of `Journal.write` left; `time` in seconds since 1970."""
+
+    time: float
+    step: int
+    epoch: int
+    values: dict[str, float]
+
+
+class Journal:
+    """An append-only file of JSON lines that outlives its process.
+
+    Every line has a number `n`, which grows by one and is never given twice, not even after `drop_after`: so
+    "everything up to n is stored elsewhere" stays true whatever happens to the file. Lines of metrics hold
+    `time`, `step`, `epoch` and `values`, where a value that is not finite is the string "nan", "inf" or
+    "-inf"; other lines hold what `append` was given.
+
+    A line is with the operating system when `write` returns, and so survives SIGKILL; a thread syncs it to
+    the disk within about a second, and from then on it survives a power cut. A full disk stops nobody: lines
+    wait in memory until there is room again.
+
+    The first `write`, `append` or `drop_after` makes this process the only writer until `close`, and cuts off
+    a last line that a crash has torn. Reading changes nothing and may happen at any time, from any process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.last = 0
+        """Number of the newest line; 0 until the file is open for writing."""
+        self._lock = threading.RLock()
+        self._file = -1  # descriptor; -1: not open for writing
+        self._owner = -1  # descriptor of the file that says who writes
+        self._waiting = bytearray()  # what the disk had no room for
+        self._place = (0, 0)  # (n, byte offset behind line n): where the last read ended
+        self._rewritten = 0  # how often an offset has lost its meaning
+        self._unsynced = threading.Event()
+        self._closing = threading.Event()
+        self._syncer: threading.Thread | None = None
+
+    def write(self, values: Mapping[str, float], step: int, epoch: int) -> None:
+        """Append one line of metrics.
+
+        Raises:
+            DataError: the file cannot be opened, or another process writes it; at the first call only.
+        """
+        with self._lock:
+            self.open()
+            self.last += 1
+            line = {"n": self.last, "time": round(time.time(), 3), "step": int(step), "epoch": int(epoch)}
+            numbers = {name: float(value) for name, value in values.items()}
+            try:
+                text = _encode({**line, "values": numbers})
+            except ValueError:  # JSON knows no NaN and no infinity
+                names = {name: _name_if_not_finite(value) for name, value in numbers.items()}
+                text = _encode({**line, "values": names})
+            self._put(text)
+
+    def append(self, **record: Any) -> None:
+        """Append a line that holds something else than metrics: plain JSON values.
+
+        Raises:
+            DataError: as `write`.
+        """
+        with self._lock:
+            self.open()
+            self.last += 1
+            self._put(_encode({"n": self.last, "time": round(time.time(), 3), **record}))
+
+    def read(self, after: int = 0) -> list[dict[str, Any]]:
+        """The next lines with a number greater than `after`, about a mebibyte at most; empty at the end.
+
+        A torn last line is left out; a damaged one before it is skipped, and said. Reading on from the last
+        number returned costs only the new lines.
+        """
+        with self._lock:
+            found, offset = self._place
+            if found != after:
+                offset = 0
+            rewritten = self._rewritten
+            if not self.path.exists():
+                return []
+            file = self.path.open("rb")  # stays the file it is, should drop_after replace it now
+        records: list[dict[str, Any]] = []
+        with file:
+            file.seek(offset)
+            while not records and (block := _whole_lines(file)):
+                offset += len(block)
+                records = self._parse(block, after)
+        with self._lock:
+            if rewritten == self._rewritten:
+                self._place = (records[-1]["n"] if records else after, offset)
+        return records
+
+    def lines(self) -> Iterator[Line]:
+        """All metrics in order, NaN and infinities as floats again."""
+        after = 0
+        while records := self.read(after):
+            for record in records:
+                if "values" in record:
+                    values = {name: float(value) for name, value in record["values"].items()}
+                    yield Line(record["time"], record["step"], record["epoch"], values)
+            after = records[-1]["n"]
+
+    def drop_after(self, step: int) -> int:
+        """Remove the metrics of later steps, which a run resumed from `step` will repeat; how many lines.
+
+        The file is replaced at once or not at all, and tells of it in a line `{"resumed_after": step}`.
+
+        Raises:
+            DataError: as `write`.
+            OSError: the disk is full; the file is as it was.
+        """
+        with self._lock:
+            self.open()
+            self._flush()
+            kept: list[bytes] = []
+            dropped = 0
+            for line in self.path.read_bytes().splitlines(keepends=True):
+                record = _record(line)
+                if record is not None and record.get("step", step) > step:
+                    dropped += 1
+                else:
+                    kept.append(line)  # a damaged one too: nothing goes that was not understood
+            marker = {"n": self.last + 1, "time": round(time.time(), 3), "resumed_after": int(step)}
+            write_atomically(self.path, b"".join([*kept, _encode(marker).encode(), b"\n"]))
+            self.last += 1
+            self._reopen()
+            return dropped
+
+    def set_aside(self, path: Path) -> None:
+        """Rename the file to `path` and begin a new one.
+
+        Raises:
+            DataError: as `write`.
+        """
+        with self._lock:
+            self.open()
+            self._flush()
+            self.path.replace(path)
+            self.last = 0
+            self._reopen()
+
+    def open(self, after: int = 0) -> None:
+        """Become the only writer; nothing happens where this is so already.
+
+        Args:
+            after: a number known to be given; a power cut can have taken lines that were stored elsewhere.
+
+        Raises:
+            DataError: the file cannot be opened, or another process writes it.
+        """
+        if self._file >= 0:
+            return
+        with self._lock:
+            try:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._owner = _claim(self.path)
+                self.last = max(self._mend(), after)
+                self._file = _append_to(self.path)
+            except OSError as error:
+                if self._owner >= 0:
+                    os.close(self._owner)
+                    self._owner = -1
+                raise DataError(
+                    f"The journal {self.path} cannot be written ({error.strerror}). "
+                    "Choose a run folder that can, or free some space."
+                ) from error
+            self._closing.clear()
+            self._syncer = threading.Thread(target=self._sync_every_second, name="journal", daemon=True)
+            self._syncer.start()
+
+    def close(self) -> None:
+        """Sync to the disk and let other processes write; a later `write` opens the file again."""
+        with self._lock:
+            syncer, self._syncer = self._syncer, None
+        if syncer is None:
+            return
+        self._closing.set()
+        self._unsynced.set()
+        syncer.join()
+        with self._lock:
+            self._flush()
+            if self._waiting:
+                lost = self._waiting.count(b"\n")
+                _log.error("The last %d lines of %s are lost: its disk is full.", lost, self.path)
+                self._waiting.clear()
+            self._sync(self._file)
+            os.close(self._file)
+            os.close(self._owner)
+            self._file = self._owner = -1
+
+    def _put(self, text: str) -> None:
+        data = text.encode() + b"\n"
+        if self._waiting:
+            self._waiting += data
+            self._flush()
+            return
+        fault = "it is full"
+        try:
+            written = os.write(self._file, data)
+        except OSError as error:
+            written, fault = 0, str(error.strerror)
+        if written < len(data):
+            _log.warning(
+                "The disk of %s takes no more (%s). The run goes on; its numbers wait in memory for room.",
+                self.path,
+                fault,
+            )
+            self._waiting += data[written:]
+        if not self._unsynced.is_set():
+            self._unsynced.set()
+
+    def _flush(self) -> None:
+        while self._waiting:
+            try:
+                written = os.write(self._file, self._waiting)
+            except OSError:
+                return
+            del self._waiting[:written]
+            self._unsynced.set()
+
+    def _reopen(self) -> None:
+        before, self._file = self._file, _append_to(self.path)
+        os.close(before)
+        self._rewritten += 1
+        self._place = (0, 0)
+
+    def _sync_every_second(self) -> None:
+        while not self._closing.is_set():
+            self._unsynced.wait()
+            self._unsynced.clear()
+            with self._lock:  # a descriptor of its own, since a rewriting closes the other
+                descriptor = os.dup(self._file)
+            self._sync(descriptor)
+            os.close(descriptor)
+            self._closing.wait(1.0)
+
+    def _sync(self, descriptor: int) -> None:
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            _log.warning("%s could not be synced to its disk: %s.", self.path, error.strerror)
+
+    def _mend(self) -> int:
+        """Cut off a torn last line; the number of the last whole one."""
+        if not self.path.exists():
+            return 0
+        content = self.path.read_bytes()
+        end = content.rfind(b"\n") + 1
+        if end < len(content):
+            torn = len(content) - end
+            _log.warning(
+                "Cut off an unfinished last line (%d bytes) of %s, left by a crash.", torn, self.path
+            )
+            os.truncate(self.path, end)
+        while end > 0:
+            start = content.rfind(b"\n", 0, end - 1) + 1
+            record = _record(content[start:end])
+            if record is not None:
+                return record["n"]
+            end = start
+        return 0
+
+    def _parse(self, block: bytes, after: int) -> list[dict[str, Any]]:
+        records = []
+        for line in block.splitlines():
+            if _number(line) <= after:
+                continue
+            record = _record(line)
+            if record is None:
+                _log.warning("Skipped a damaged line of %s: %r.", self.path, line[:80])
+            elif record["n"] > after:
+                records.append(record)
+        return records
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file as a whole, on the disk when this returns; a crash leaves the old or the new one.
+
+    Raises:
+        OSError: there is no room; the old file is as it was.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _append_to(path: Path) -> int:
+    return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+
+
+def _claim(path: Path) -> int:
+    """A descriptor that makes this process the only writer of `path`, until it is closed or the process dies.
+
+    A POSIX record lock: unlike flock, it is not inherited by data-loading processes, which outlive a killed
+    parent by seconds. It stands on a file of its own, since closing any descriptor of a file ends it.
+    """
+    owner = os.open(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.lockf(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        holder = os.pread(owner, 32, 0).decode(errors="replace").strip() or "unknown"
+        os.close(owner)
+        raise DataError(
+            f"{path} is being written by another process (number {holder}). Wait until it ends, stop it, or "
+            "choose another run folder."
+        ) from None
+    except OSError as error:
+        _log.warning("%s: no locks on this file system (%s); let one process use it.", path, error.strerror)
+    os.ftruncate(owner, 0)
+    os.pwrite(owner, str(os.getpid()).encode(), 0)
+    return owner
+
+
+def _whole_lines(file: BinaryIO) -> bytes:
+    """The next block of about a mebibyte that ends with a line; empty where there is no whole one."""
+    block = file.read(_BLOCK)
+    if not block.endswith(b"\n"):
+        block += file.readline()
+    return block[: block.rfind(b"\n") + 1]
+
+
+def _number(line: bytes) -> int:
+    """A line's number without parsing the rest; a large one where it has none."""
+    digits = line[5 : line.find(b",", 5)] if line.startswith(b'{"n":') else b""
+    return int(digits) if digits.isdigit() else 1 << 62
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) and isinstance(record.get("n"), int) else None
+
+
+def _name_if_not_finite(value: float) -> float | str:
+    return value if value - value == 0 else str(value)

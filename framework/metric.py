@@ -1,0 +1,40 @@
+"""The contract of a metric: predictions in, named numbers out."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import torchmetrics
+from torch import Tensor
+
+from framework.prediction import Prediction
+
+
+class Metric(torchmetrics.Metric, ABC):
+    """A torchmetrics.Metric that reads predictions.
+
+    `full_state_update` is False. States are sums and counts (`dist_reduce_fx="sum"`), or lists of per-sample numbers
+    ("cat") where a sum does not suffice, as for a median; never angles, which do not add. Sums are float64.
+
+    A constructor's keyword-only parameters are the config; it may ask for `target: Target` before `*`. It costs
+    nothing when it is not asked for: whatever several metrics share (the log-likelihood, the point prediction) lives
+    in `Prediction` and is computed on first use.
+    """
+
+    group: ClassVar[str] = "metric"
+    bibtex: ClassVar[str]
+    """What to cite, as BibTeX."""
+    full_state_update = False
+    columns: ClassVar[dict[str, str]]
+    """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
+    A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own."""
+
+    @abstractmethod
+    def update(self, prediction: Prediction) -> None:
+        """Take in one batch."""
+
+    @abstractmethod
+    def compute(self) -> dict[str, Tensor]:
+        """Scalars by name, with the unit in the name where it is not 1 (`maad_deg`, `log_likelihood` is in nats).
+
+        NaN where nothing was seen.
+        """

@@ -1,0 +1,68 @@
+"""The model of the density road: encoders, one linear layer, a density head."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from framework.data import Batch
+from framework.density_head import DensityHead
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+
+
+class Predictor(nn.Module, ABC):
+    """Anything that turns inputs into a density and can be trained; a model or a wrapper around one."""
+
+    @abstractmethod
+    def forward(self, inputs: Tensor) -> Distribution:
+        """The density over the target for a batch of inputs, with batch_shape (batch,)."""
+
+    @abstractmethod
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """The training loss per sample, nats."""
+
+    @abstractmethod
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Fit what is not trained by gradient, on the validation set; called once after training."""
+
+
+@final
+class Model(Predictor):
+    """Encoders in a chain, a linear layer to the numbers the head reads, the head.
+
+    Raises:
+        ConfigError: the last encoder does not end in a vector.
+    """
+
+    def __init__(self, encoders: Sequence[Encoder], head: DensityHead) -> None:
+        super().__init__()
+        shape = encoders[-1].output_shape
+        if len(shape) != 1:
+            raise ConfigError(
+                f"The last encoder ends in features of shape {shape}; wanted a vector. "
+                "Append an encoder that flattens, such as `mlp`."
+            )
+        self.encoders = nn.Sequential(*encoders)
+        self.projection = nn.Linear(shape[0], head.size)
+        self.head = head
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        return self.head(self.raw(inputs))
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        return self.head.loss(self.raw(inputs), target)
+
+    def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
+        """What the head reads."""
+        return self.projection(self.encoders(inputs))
+
+    @torch.no_grad()
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
+        raws, targets = zip(*pairs, strict=True)
+        self.head.calibrate(torch.cat(raws), torch.cat(targets))

@@ -1,0 +1,54 @@
+"""What a command line can ask for; each mode is a module of its own, imported when it is chosen."""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from framework.composition import plain
+from framework.errors import ConfigError, did_you_mean
+from framework.settings import settings
+
+MODES = ("train", "test", "predict", "work_precision", "plugins", "sync")
+
+
+def run(config: DictConfig) -> float | None:
+    """Run the chosen mode on a composed config; the value, if any, is what a sweeper minimises.
+
+    Raises:
+        ConfigError: an unknown mode, or a fault in the config.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    values = plain(config)
+    hydra = HydraConfig.get()
+    folder, overrides = Path(hydra.runtime.output_dir), list(hydra.overrides.task)
+    if values.get("resume") not in ("auto", "never", None):
+        values, overrides = _stored(folder, overrides)
+    name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
+    if name not in MODES:
+        raise ConfigError(f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}.")
+    chosen = settings(values)
+    module = import_module(f"framework.modes.{name}")
+    return module.run(values, chosen, folder, overrides)
+
+
+def _stored(folder: Path, overrides: list[str]) -> tuple[dict[str, Any], list[str]]:
+    """The config and overrides the run in `folder` was started with: resuming changes neither."""
+    from framework.run import stored_config, stored_overrides
+    from framework.run_info import read_run_info
+
+    others = [item for item in overrides if not item.startswith("resume=")]
+    if others:
+        raise ConfigError(
+            f"resume={folder} goes on with that run's own config; {' '.join(others)} would change it. "
+            "Leave them out, or start a new run."
+        )
+    earlier = read_run_info(folder)
+    if earlier is not None and earlier.status == "FINISHED":
+        raise ConfigError(f"resume={folder}: that run has finished; there is nothing to go on with. Start a new run.")
+    values = stored_config(folder)
+    if not isinstance(values, dict):
+        raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
+    return values, stored_overrides(folder)

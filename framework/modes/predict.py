@@ -1,0 +1,81 @@
+"""mode=predict: a CSV of point predictions and uncertainties for a user's own files, or for the test split."""
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from framework.batches import as_batch, seed_step
+from framework.circular import wrap
+from framework.data import Data
+from framework.errors import DataError
+from framework.model import Predictor
+from framework.modes.test import loaded
+from framework.prediction import Prediction
+from framework.run import opened
+from framework.settings import Settings
+from framework.target import Target
+
+
+def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+    """Write predictions.csv into the run folder."""
+    with opened(folder, values, settings, overrides) as run:
+        predictor, data, _ = loaded(run)
+        wanted = values["mode"].get("files")
+        files = _files(Path(str(wanted)).expanduser()) if wanted else []
+        rows = predictions(predictor, data, files, settings)
+        path = run.folder / "predictions.csv"
+        with path.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+        run.tracker.log_artifact(path)
+        Console().print(f"{len(rows)} predictions in {path}", soft_wrap=True)
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.exists():
+        raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
+    found = [path] if path.is_file() else sorted(item for item in path.iterdir() if item.is_file())
+    if not found:
+        raise DataError(f"mode.files={path} is an empty folder. Give a folder that holds the files to predict for.")
+    return found
+
+
+@torch.no_grad()
+def predictions(
+    predictor: Predictor, data: Data, files: Sequence[Path], settings: Settings
+) -> list[dict[str, str]]:
+    """One row a sample: its name, the point prediction, and the entropy of the density in nats."""
+    dataset = data.read(files) if files else data.test()
+    loader = DataLoader(dataset, batch_size=settings.batch_size, collate_fn=as_batch)
+    names = [str(file) for file in files] if files else [f"test {i}" for i in range(len(loader.dataset))]  # type: ignore[arg-type]
+    rows: list[dict[str, str]] = []
+    for number, batch in enumerate(loader):
+        seed_step(settings.seed, number, "predict")
+        density = predictor(batch["input"])
+        prediction = Prediction(density, batch, settings.samples)
+        columns = _columns(data.target, prediction.point) | {"entropy_nats": density.entropy()}
+        for row in range(len(batch["index"])):
+            values = {key: _text(column[row]) for key, column in columns.items()}
+            rows.append({"sample": names[len(rows)], **values})
+    return rows
+
+
+def _columns(target: Target, point: Tensor) -> dict[str, Tensor]:
+    if target.kind == "class":
+        return {"class": point}
+    if target.kind == "angle":
+        degrees = wrap(point) * (180 / math.pi)
+        return {f"{name}_deg": degrees[:, i] for i, name in enumerate(target.names)}
+    return {name: point[:, i] for i, name in enumerate(target.names)}
+
+
+def _text(value: Tensor) -> str:
+    return f"{float(value):.6g}"

@@ -1,0 +1,65 @@
+"""mode=test: test a trained model again, on its own data or on other data."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from framework.assembly import build_data, build_metrics, citations
+from framework.batches import Batches
+from framework.data import Data
+from framework.errors import CheckpointError, ConfigError
+from framework.loading import load_with_description
+from framework.model import Predictor
+from framework.modes.train import describe_data, record_citations
+from framework.report import report_test
+from framework.run import Run, opened
+from framework.schema import resolve
+from framework.settings import Settings
+
+
+def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+    """Print the table row of `checkpoint`."""
+    with opened(folder, values, settings, overrides) as run:
+        predictor, data, described = loaded(run)
+        record_citations(run, citations(described["config"]))
+        batches = Batches(
+            data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed
+        )
+        metrics = build_metrics(described["config"], data.target)
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        report_test(run, predictor, data, batches, metrics, device, Console())
+
+
+def loaded(run: Run) -> tuple[Predictor, Data, dict[str, Any]]:
+    """The model of `checkpoint`, with the data named on the command line, or else the data it was trained on.
+
+    Raises:
+        ConfigError: no checkpoint is named.
+        CheckpointError: the data does not fit the model.
+    """
+    settings = run.settings
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    if settings.checkpoint is None:
+        raise ConfigError(
+            f"mode={run.values['mode']['name']} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
+        )
+    predictor, described = load_with_description(settings.checkpoint, uri=settings.logger.uri)
+    if run.values.get("data"):
+        described["config"]["data"] = resolve("data", run.values["data"])
+    if run.values.get("metric"):
+        chosen = run.values["metric"]
+        described["config"]["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
+    data = build_data({"data": resolve("data", described["config"]["data"])})
+    data.prepare()
+    describe_data(run, data)
+    wanted = (tuple(described["input_shape"]), described["target"]["kind"], tuple(described["target"]["names"]))
+    found = (data.input_shape, data.target.kind, data.target.names)
+    if wanted != found:
+        raise CheckpointError(
+            f"{settings.checkpoint} reads inputs of shape {wanted[0]} and predicts {wanted[1]} {wanted[2]}, but the "
+            f"data has inputs of shape {found[0]} and targets {found[1]} {found[2]}. Give the data it was trained on."
+        )
+    return predictor, data, described

@@ -1,0 +1,145 @@
+"""mode=train: fit, calibrate, test, report."""
+
+import inspect
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from rich.console import Console
+
+from framework.assembly import (
+    build_data,
+    build_metrics,
+    build_objectives,
+    build_predictor,
+    citations,
+    resolve_all,
+)
+from framework.batches import Batches, seed_step
+from framework.checkpoint import WholeCheckpoints, latest_good, read
+from framework.data import Data
+from framework.evaluation import on_device
+from framework.loading import PREFIX, description, fill, weights
+from framework.model import Predictor
+from framework.report import report_test, report_training
+from framework.run import Run, opened
+from framework.settings import TRAINER_OURS, Settings, check_trainer_keys
+from framework.training import KeepCheckpoints, Report, StopAtBatch, Training
+
+
+def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> float:
+    """Returns the best validation loss, nats: what a sweeper minimises."""
+    with opened(folder, values, settings, overrides) as run:
+        return _run(run)
+
+
+def _run(run: Run) -> float:
+    console = Console()
+    settings = run.settings
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    quiet()
+    check_trainer_keys(settings.trainer, set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"})
+    resolved = resolve_all(run.values)
+    console.print(f"run folder: {run.folder}")
+    data = build_data(resolved)
+    data.prepare()
+    describe_data(run, data)
+    record_citations(run, citations(resolved))
+
+    predictor = build_predictor(resolved, data.target, data.input_shape, settings.seed)
+    training = Training(
+        predictor,
+        build_objectives(resolved),
+        data,
+        settings.optimizer,
+        settings.seed,
+        description(resolved, data),
+    )
+    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
+    keep = KeepCheckpoints(run.checkpoints, settings.trainer.get("checkpoint_every_steps"))
+    trainer = _trainer(run, keep)
+    _fit(run, training, batches, trainer, console)
+
+    device = trainer.strategy.root_device
+    best = run.checkpoints / "best.ckpt"
+    fill(predictor, weights(read(best)), str(best))
+    predictor.eval().to(device)
+    seed_step(settings.seed, 0, "calibrate")
+    predictor.calibrate(on_device(batches.val_dataloader(), device))
+    save_model(run.checkpoints / "model.ckpt", predictor, training.description)
+    run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
+    report_training(run, best_epoch=keep.best_epoch, synthetic=data.synthetic)
+    report_test(run, predictor, data, batches, build_metrics(resolved, data.target), device, console)
+    return keep.best_loss
+
+
+def _fit(run: Run, training: Training, batches: Batches, trainer: pl.Trainer, console: Console) -> None:
+    resume = latest_good(run.checkpoints) if run.resumed else None
+    if run.resumed and resume is None:
+        console.print("nothing to resume from yet: starting from the beginning.")
+    if resume is not None:
+        step = int(read(resume)["global_step"])
+        run.tracker.drop_after(step)
+        console.print(f"resuming from {resume} (step {step}).")
+    batches.attach(trainer)
+    trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
+
+
+def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
+    chosen = dict(run.settings.trainer)
+    patience = chosen.get("patience")
+    callbacks: list[pl.Callback] = [
+        Report(run.tracker, chosen.get("log_every_steps") or 10),
+        keep,
+        StopAtBatch(run.stopper, keep),
+    ]
+    if patience:
+        callbacks.append(pl.callbacks.EarlyStopping("validation/loss", patience=patience, check_finite=True))
+    terminal = Console(stderr=True).is_terminal
+    if terminal:
+        callbacks.append(pl.callbacks.RichProgressBar())
+    arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
+    defaults = {"enable_progress_bar": terminal, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    return pl.Trainer(
+        **{**defaults, **arguments},
+        logger=False,
+        enable_checkpointing=False,
+        callbacks=callbacks,
+        plugins=[WholeCheckpoints()],
+        use_distributed_sampler=False,
+        default_root_dir=run.folder,
+    )
+
+
+def quiet() -> None:
+    """Lightning's notices about hardware it did not find, and a deprecation inside it, tell our user nothing."""
+    logging.getLogger("pytorch_lightning").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")
+    warnings.filterwarnings("ignore", message=".*does not have many workers", module="pytorch_lightning")
+    # ours is resumable, by another way than the one Lightning looks for
+    warnings.filterwarnings("ignore", message=".*your dataloader is not resumable", module="pytorch_lightning")
+
+
+def describe_data(run: Run, data: Data) -> None:
+    """Tag the run with what it was fed."""
+    run.tracker.set_tags(
+        {f"data.{key}": value for key, value in data.fingerprint().items()}
+        | {"data.synthetic": str(data.synthetic).lower(), "data.skipped": str(data.skipped)}
+    )
+
+
+def record_citations(run: Run, found: dict[str, str]) -> None:
+    """Write what to cite into the run folder and the store."""
+    path = run.folder / "citations.bib"
+    path.write_text("\n\n".join(dict.fromkeys(found.values())) + "\n", encoding="utf-8")
+    run.tracker.log_artifact(path)
+
+
+def save_model(path: Path, predictor: Predictor, described: dict[str, Any]) -> None:
+    """A checkpoint of weights and description alone, for `framework.load`."""
+    state = {f"{PREFIX}{key}": value.cpu() for key, value in predictor.state_dict().items()}
+    WholeCheckpoints().save_checkpoint({"framework": described, "state_dict": state}, path)

@@ -1,0 +1,51 @@
+"""What a model predicted for one batch; whatever is derived from it is computed on first use, once."""
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.data import Batch
+from framework.density import marginal, median
+
+
+class Prediction:
+    """A density over a batch, beside the batch.
+
+    Args:
+        density: with batch_shape (batch,).
+        batch: the fields of the batch, on the density's device.
+        samples: draws for a point prediction that has no closed form (S of eq. 3.24).
+    """
+
+    def __init__(self, density: Distribution, batch: Batch, samples: int = 1000) -> None:
+        self.density = density
+        self.batch = batch
+        self.samples = samples
+
+    @property
+    def target(self) -> Tensor:
+        return self.batch["target"]
+
+    @cached_property
+    def log_prob(self) -> Tensor:
+        """Log-likelihood of the targets, (batch,), nats."""
+        return self.density.log_prob(self.target)
+
+    @cached_property
+    def point(self) -> Tensor:
+        """The prediction of least expected absolute deviation (eq. 3.23-3.24), shaped like the target."""
+        return median(self.density, self.samples)
+
+    def marginal(self, index: int) -> Distribution:
+        """The density of one number of the target."""
+        return self._marginals.setdefault(index, marginal(self.density, index))
+
+    @cached_property
+    def _marginals(self) -> dict[int, Distribution]:
+        return {}
+
+    @property
+    def device(self) -> torch.device:
+        return self.target.device

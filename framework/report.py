@@ -1,0 +1,213 @@
+"""What a run says at its end: the result table, its numbers as JSON, the pictures, and where to look next."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from framework.batches import Batches
+from framework.circular import angular_distance
+from framework.cost import Cost
+from framework.data import Batch, Data
+from framework.density import circular_entropy, circular_grid
+from framework.evaluation import Evaluation, cost, evaluate, on_device
+from framework.metric import Metric
+from framework.model import Predictor
+from framework.prediction import Prediction
+from framework.run import Run
+from framework.table import results_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COST_COLUMNS = {"milliseconds_per_sample": "ms / sample", "parameters": "parameters"}
+PICTURED = 400
+"""How many test samples the gallery of predicted densities is chosen from."""
+
+
+def report_test(
+    run: Run,
+    predictor: Predictor,
+    data: Data,
+    batches: Batches,
+    metrics: Sequence[Metric],
+    device: torch.device,
+    console: Console,
+) -> None:
+    """Test, measure the cost, print the table, write results.json and the pictures, tell the tracker."""
+    loader = batches.test_dataloader()
+    settings = run.settings
+    found = evaluate(
+        predictor,
+        loader,
+        metrics,
+        groups=data.groups,
+        samples=settings.samples,
+        seed=settings.seed,
+        device=device,
+    )
+    spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
+    columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
+    results = _results(run, data, found, spent, columns)
+    path = run.folder / "results.json"
+    path.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    run.results.update(results)
+    step = 0
+    run.tracker.log_metrics({f"test/{key}": value for key, value in found.total.items()}, step, 0)
+    for name, numbers in found.groups.items():
+        run.tracker.log_metrics({f"test/{name}/{key}": value for key, value in numbers.items()}, step, 0)
+    run.tracker.log_metrics(
+        {f"cost/{key}": float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)},
+        step,
+        0,
+    )
+    run.tracker.log_artifact(path)
+    if data.target.kind == "angle":
+        picture(run, gallery(predictor, data, batches, device, settings.samples), "predicted_densities.png")
+    rows = [results, *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items())]
+    better: dict[str, Any] = {}
+    title = f"{results['experiment']} on {results['data']}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
+    console.print(results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better))
+    _next_steps(run, spent, console)
+
+
+def _results(
+    run: Run, data: Data, found: Evaluation, spent: Cost, columns: dict[str, str]
+) -> dict[str, Any]:
+    values = run.values
+    head = values.get("density_head") or {}
+    name = run.settings.experiment_name
+    method = name.rpartition("/")[2] if name else str(head.get("name", run.settings.checkpoint))
+    wrappers = [str(part["name"]) for part in (values.get("uncertainty") or {}).values()]
+    return {
+        "method": " + ".join([method, *wrappers]),
+        "experiment": name or "no experiment",
+        "data": ", ".join(data.groups),
+        "seed": run.settings.seed,
+        "synthetic": data.synthetic,
+        **{key: _plain(value) for key, value in found.total.items()},
+        "groups": {name: {k: _plain(v) for k, v in numbers.items()} for name, numbers in found.groups.items()},
+        **{key: _plain(value) for key, value in asdict(spent).items()},
+        "columns": columns,
+        "folder": str(run.folder),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: a number that could not be had is null, which tables print as "not available"."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def report_training(run: Run, *, best_epoch: int, synthetic: bool) -> None:
+    """The training curve, from the journal."""
+    from framework.pictures import training_curve
+
+    train: list[tuple[float, float]] = []
+    validation: list[tuple[float, float]] = []
+    steps_per_epoch = 1.0
+    for line in run.tracker.journal.lines():
+        if "train/loss" in line.values:
+            train.append((line.step, line.values["train/loss"]))
+        if "validation/loss" in line.values:
+            steps_per_epoch = line.step / (line.epoch + 1)
+            validation.append((line.epoch + 1, line.values["validation/loss"]))
+    figure = training_curve(
+        [step / steps_per_epoch for step, _ in train],
+        [loss for _, loss in train],
+        validation,
+        best_epoch=best_epoch + 1,
+        title=run.settings.experiment_name or "training",
+        synthetic=synthetic,
+    )
+    picture(run, figure, "training_curve.png")
+
+
+def picture(run: Run, figure: "Figure", name: str) -> Path:
+    """Save a figure into the run folder and send it to the store."""
+    path = run.folder / "figures" / name
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=110)
+    run.tracker.log_artifact(path, "figures")
+    return path
+
+
+@torch.no_grad()
+def gallery(
+    predictor: Predictor, data: Data, batches: Batches, device: torch.device, samples: int
+) -> "Figure":
+    """Predicted densities of the first angle on the viewing circle, over their images: certain, ambiguous, failed."""
+    from framework.pictures import choose, viewing_circles
+
+    images: list[np.ndarray] = []
+    columns: dict[str, list[np.ndarray]] = {"density": [], "truth": [], "point": [], "entropy": [], "error": [], "symmetry": []}
+    angles = np.zeros(0)
+    for batch in on_device(batches.test_dataloader(), device):
+        if len(images) >= PICTURED:
+            break
+        _collect(predictor, data, batch, samples, images, columns)
+        angles = circular_grid(Prediction(predictor(batch["input"][:1]), batch, samples).marginal(0))[0].cpu().numpy()
+    joined = {key: np.concatenate(value, axis=-1) for key, value in columns.items()}
+    chosen = choose(joined["entropy"], joined["error"], joined["density"])
+    order = [index for row in chosen.values() for index in row]
+    symmetry = joined["symmetry"][order]
+    return viewing_circles(
+        [images[index] for index in order],
+        joined["density"][:, order],
+        angles,
+        joined["truth"][order],
+        joined["point"][order],
+        [_caption(joined["entropy"][index], joined["error"][index], int(joined["symmetry"][index])) for index in order],
+        modes=[_modes(truth, int(fold)) for truth, fold in zip(joined["truth"][order], symmetry, strict=True)],
+        rows={name: len(row) for name, row in chosen.items()},
+        title=f"{', '.join(data.groups)}: predicted density of the {data.target.names[0]}",
+        synthetic=data.synthetic,
+    )
+
+
+def _caption(entropy: float, error: float, symmetry: int) -> str:
+    note = {0: ", no true direction", 1: ""}.get(symmetry, f", {symmetry}-fold symmetric")
+    return f"error {math.degrees(error):.0f}°, entropy {entropy:.2f} nats{note}"
+
+
+def _collect(
+    predictor: Predictor,
+    data: Data,
+    batch: Batch,
+    samples: int,
+    images: list[np.ndarray],
+    columns: dict[str, list[np.ndarray]],
+) -> None:
+    prediction = Prediction(predictor(batch["input"]), batch, samples)
+    first = prediction.marginal(0)
+    images.extend(data.picture(item) for item in batch["input"].cpu())
+    columns["density"].append(circular_grid(first)[1].cpu().numpy())
+    columns["entropy"].append(circular_entropy(first).cpu().numpy())
+    truth, point = batch["target"][:, 0], prediction.point[:, 0]
+    columns["truth"].append(truth.cpu().numpy())
+    columns["point"].append(point.cpu().numpy())
+    columns["error"].append(angular_distance(truth, point).cpu().numpy())
+    symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
+    columns["symmetry"].append(symmetry.cpu().numpy())
+
+
+def _modes(truth: float, symmetry: int) -> np.ndarray:
+    """Every angle that is as right as the annotated one; none marked where all angles are."""
+    return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
+
+
+def _next_steps(run: Run, spent: Cost, console: Console) -> None:
+    lines = [
+        f"measured on {spent.device}, {spent.threads} threads, batches of {spent.batch_size}; "
+        f"one sample alone takes {spent.latency_milliseconds:.2f} ms",
+        f"run folder:    {run.folder}   (figures/, results.json, citations.bib, checkpoints/model.ckpt)",
+        f"all runs:      {run.tracker.url}",
+        f"in a notebook: framework.load('{run.folder}')",
+        f"what to cite:  {run.folder / 'citations.bib'}",
+    ]
+    console.print("\n".join(lines), soft_wrap=True, highlight=False)

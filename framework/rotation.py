@@ -1,0 +1,43 @@
+"""Rotation matrices of viewpoints, and the geodesic distance between them."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def viewpoint_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation of the object seen at (azimuth a, elevation e, tilt t), radians: Rz(t) Rx(e - π/2) Rz(-a).
+
+    The Euler convention of PASCAL3D+ annotations (Xiang et al., WACV 2014), as used for viewpoint evaluation by
+    Tulsiani & Malik (CVPR 2015). The camera frame has x right, y up, z towards the viewer.
+    """
+    azimuth, elevation, tilt = angles.unbind(-1)
+    return _about_z(tilt) @ _about_x_elevation(elevation) @ _about_z(-azimuth)
+
+
+def geodesic_distance(
+    first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
+) -> Float[Tensor, "*batch"]:
+    """Angle of the rotation between two rotations, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
+
+    Computed as 2 asin(||R₁ - R₂||_F / (2√2)), which is exact near 0, where the arc cosine of the trace loses half
+    the digits; past 90° from the trace side: 2 acos(√(1 + tr(R₁ᵀR₂)) / 2), exact near π.
+    """
+    chord = torch.linalg.matrix_norm(first - second) / 8**0.5  # sin(angle / 2)
+    trace = (first * second).sum((-2, -1))
+    cosine = ((1 + trace).clamp(min=0) / 4).sqrt()  # cos(angle / 2)
+    return 2 * torch.atan2(chord, cosine)
+
+
+def _about_z(angle: Tensor) -> Tensor:
+    cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    rows = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1)
+    return rows.unflatten(-1, (3, 3))
+
+
+def _about_x_elevation(elevation: Tensor) -> Tensor:
+    # Rx(e - π/2) with cos(e - π/2) = sin e and sin(e - π/2) = -cos e, exact in any precision.
+    cos, sin = elevation.sin(), -elevation.cos()
+    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+    rows = torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], -1)
+    return rows.unflatten(-1, (3, 3))

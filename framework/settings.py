@@ -1,0 +1,104 @@
+"""The core's own part of the config: types, ranges and defaults; plugins check theirs by their constructors."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from framework.errors import ConfigError, did_you_mean
+from framework.registry import GROUPS
+from framework.schema import check, forbid_targets
+
+Positive = Annotated[int, Field(gt=0)]
+NotNegative = Annotated[int, Field(ge=0)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", protected_namespaces=())
+
+
+class OptimizerSettings(_Strict):
+    """An optimiser of torch.optim by its lower-case name, and a schedule per step."""
+
+    name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
+    weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    schedule: Literal["constant", "cosine"] = "constant"
+    warmup_steps: NotNegative = 0
+
+
+class LoggerSettings(_Strict):
+    """Where metrics go beside the local journal."""
+
+    name: Literal["mlflow", "none"] = "mlflow"
+    uri: str | None = None
+    experiment: str | None = None
+
+
+class Settings(_Strict):
+    """Everything of a composed config that is not a plugin's."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    threads: Positive | None = None
+    batch_size: Positive = 64
+    workers: NotNegative = 0
+    samples: Positive = 1000
+    checkpoint: str | None = None
+    resume: str | None = "auto"
+    experiment_name: str | None = None
+    optimizer: OptimizerSettings = OptimizerSettings()
+    logger: LoggerSettings = LoggerSettings()
+    trainer: dict[str, Any] = {}
+    mode: dict[str, Any] = {}
+
+
+TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps"}
+"""Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
+
+
+def settings(config: Mapping[str, Any]) -> Settings:
+    """The checked core settings of a composed config.
+
+    Raises:
+        ConfigError: `_target_` anywhere, an unknown key, or a value out of range.
+    """
+    forbid_targets(config)
+    own = {key: value for key, value in config.items() if key not in GROUPS}
+    for key in ("optimizer", "logger"):
+        model = {"optimizer": OptimizerSettings, "logger": LoggerSettings}[key]
+        if isinstance(own.get(key), Mapping):
+            own[key] = check(model, own[key], key)
+    values = check(Settings, own, "")
+    checked = Settings.model_validate(values)
+    _check_trainer(checked.trainer)
+    return checked
+
+
+def _check_trainer(trainer: Mapping[str, Any]) -> None:
+    numbers = {
+        "max_epochs": (int, 1),
+        "patience": (int, 1),
+        "checkpoint_every_steps": (int, 1),
+        "log_every_steps": (int, 1),
+        "num_nodes": (int, 1),
+        "gradient_clip_val": ((int, float), 0),
+    }
+    for key, (kind, least) in numbers.items():
+        value = trainer.get(key)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, kind) or not value >= least):
+            raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
+
+
+def check_trainer_keys(trainer: Mapping[str, Any], known: set[str]) -> None:
+    """Refuse a key that neither the framework nor Lightning's Trainer knows.
+
+    Raises:
+        ConfigError: with the nearest known key.
+    """
+    for key in trainer:
+        if key not in known | TRAINER_OURS:
+            raise ConfigError(
+                f"trainer.{key}: unknown key.{did_you_mean(key, known | TRAINER_OURS)} "
+                "Known: the arguments of pytorch_lightning.Trainer, "
+                f"and {', '.join(sorted(TRAINER_OURS))}."
+            )

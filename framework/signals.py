@@ -1,0 +1,50 @@
+"""Ctrl-C and SIGTERM: stop where it is safe, and say so in the exit code."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+
+class Stopped(SystemExit):
+    """The run was told to stop; exits with 128 + the signal's number, as shells do."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.signal = signal.Signals(number).name
+
+
+class Stopper:
+    """Turns SIGINT and SIGTERM into `Stopped`: at once, or, while `wait` is set, where the code calls `stop`.
+
+    A second signal never waits.
+    """
+
+    def __init__(self) -> None:
+        self.wait = False
+        self.received: int | None = None
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Handle both signals inside the block; the handlers before are restored after it."""
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        before = {number: signal.getsignal(number) for number in numbers}
+        for number in numbers:
+            signal.signal(number, self._handle)
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def stop(self) -> NoReturn:
+        """Stop now for the signal received."""
+        assert self.received is not None
+        raise Stopped(self.received)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        first = self.received is None
+        self.received = self.received or number
+        if not (self.wait and first):
+            raise Stopped(number)

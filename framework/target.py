@@ -1,0 +1,35 @@
+"""What is to be predicted: the kind of value, and the name of each number in it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from framework.errors import ConfigError
+
+Kind = Literal["angle", "real", "class"]
+
+
+@dataclass(frozen=True)
+class Target:
+    """The quantity a density head predicts.
+
+    Attributes:
+        kind: "angle": radians, read modulo 2π; "real": any real number; "class": one of several labels.
+        names: for angles and reals the name of each number, e.g. ("azimuth", "elevation", "tilt"), and a batch
+            of targets is a float tensor of shape (batch, len(names)); for classes the label names, and a batch
+            of targets is an int64 tensor of shape (batch,).
+    """
+
+    kind: Kind
+    names: tuple[str, ...]
+
+    def require(self, kind: Kind, by: str) -> None:
+        """Refuse a target that `by` cannot describe.
+
+        Raises:
+            ConfigError: the kinds differ.
+        """
+        if self.kind != kind:
+            raise ConfigError(
+                f"{by} describes targets of kind {kind!r}, but this data set's are {self.kind!r} "
+                f"({', '.join(self.names)}). Choose another density_head, or other data."
+            )

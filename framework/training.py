@@ -1,0 +1,210 @@
+"""The one LightningModule of the density road, and the callbacks that keep a run whole."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor, nn
+
+from framework.batches import Batches, seed_step
+from framework.data import Batch, Data
+from framework.errors import NonFiniteLoss
+from framework.model import Predictor
+from framework.objective import Objective
+from framework.settings import OptimizerSettings
+from framework.signals import Stopper
+from framework.tracking import Tracker
+
+OPTIMIZERS: dict[str, type[torch.optim.Optimizer]] = {
+    "adam": torch.optim.Adam,
+    "adamw": torch.optim.AdamW,
+    "sgd": torch.optim.SGD,
+    "nadam": torch.optim.NAdam,
+    "radam": torch.optim.RAdam,
+}
+
+
+class Training(pl.LightningModule):
+    """Minimises the predictor's mean loss plus the objectives.
+
+    Noise (dropout, latent draws, augmentation) is a function of (seed, step); a loss that is not finite stops the
+    run before the optimiser sees it.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        objectives: Sequence[Objective],
+        data: Data,
+        optimizer: OptimizerSettings,
+        seed: int,
+        description: dict[str, Any],
+    ) -> None:
+        super().__init__()
+        self.predictor = predictor
+        self.objectives = nn.ModuleList(objectives)
+        self.augment = data.augment
+        self.optimizer_settings = optimizer
+        self.seed = seed
+        self.description = description
+
+    def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        # by batches, not by optimiser steps: those stand still while gradients are accumulated
+        seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train", self.global_rank)
+        batch = self.augment(batch)
+        losses = self.predictor.loss(batch["input"], batch["target"])
+        loss = losses.mean()
+        for objective in self.objectives:
+            loss = loss + objective(self.predictor, batch)
+        if not math.isfinite(value := loss.item()):
+            raise NonFiniteLoss(self._blame(losses, batch, value))
+        self.last_loss = value
+        return loss
+
+    def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
+        seed_step(self.seed, batch_index, "validation")
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        loss = self.predictor.loss(batch["input"], batch["target"]).mean()
+        self.log("validation/loss", loss, on_epoch=True, batch_size=len(batch["target"]), sync_dist=True)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        chosen = self.optimizer_settings
+        optimizer = OPTIMIZERS[chosen.name](
+            self.parameters(), lr=chosen.learning_rate, weight_decay=chosen.weight_decay
+        )
+        total = max(1, int(self.trainer.estimated_stepping_batches))
+
+        def factor(step: int) -> float:
+            warm = min(1.0, (step + 1) / (chosen.warmup_steps + 1))
+            if chosen.schedule == "constant":
+                return warm
+            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["framework"] = self.description
+
+    def _blame(self, losses: Tensor, batch: Batch, value: float) -> str:
+        bad = (~losses.detach().isfinite()).nonzero().flatten().tolist()
+        rows = [int(batch["index"][row]) for row in bad]
+        who = f"samples {rows[:10]} of the training split" if rows else "an objective, not a sample"
+        return (
+            f"The training loss became {value} at step {self.global_step} (epoch {self.current_epoch}), through {who}. "
+            "The weights were not changed by this step and the last checkpoint is kept. Look at these samples, lower "
+            "optimizer.learning_rate, or set trainer.gradient_clip_val."
+        )
+
+
+class KeepCheckpoints(pl.Callback):
+    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and best.ckpt.
+
+    `last` is saved at every epoch's end and every `every_steps` steps; `best` whenever the validation loss is lower
+    than ever. Each write is whole or absent (framework.checkpoint).
+    """
+
+    def __init__(self, folder: Path, every_steps: int | None) -> None:
+        self.folder = folder
+        self.every_steps = every_steps
+        self.best_loss = math.inf
+        self.best_epoch = -1
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best_loss": self.best_loss, "best_epoch": self.best_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best_loss = state_dict["best_loss"]
+        self.best_epoch = state_dict["best_epoch"]
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self.every_steps and trainer.global_step % self.every_steps == 0:
+            self.save_last(trainer)
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if trainer.sanity_checking or trainer.state.fn != "fit":
+            return
+        loss = float(trainer.callback_metrics["validation/loss"])
+        if loss < self.best_loss:
+            self.best_loss, self.best_epoch = loss, trainer.current_epoch
+            trainer.save_checkpoint(self.folder / "best.ckpt")
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.save_last(trainer)
+
+    def save_last(self, trainer: pl.Trainer) -> None:
+        last = self.folder / "last.ckpt"
+        if last.exists() and trainer.is_global_zero:
+            last.replace(self.folder / "previous.ckpt")
+        trainer.save_checkpoint(last)
+
+
+class Report(pl.Callback):
+    """Sends losses and the learning rate to the tracker."""
+
+    def __init__(self, tracker: Tracker, every_steps: int) -> None:
+        self.tracker = tracker
+        self.every_steps = every_steps
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if trainer.global_step % self.every_steps == 0 and trainer.is_global_zero:
+            assert isinstance(pl_module, Training)
+            rate = trainer.optimizers[0].param_groups[0]["lr"]
+            self.tracker.log_metrics(
+                {"train/loss": pl_module.last_loss, "train/learning_rate": rate},
+                trainer.global_step,
+                trainer.current_epoch,
+            )
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if not trainer.sanity_checking and trainer.is_global_zero and trainer.state.fn == "fit":
+            loss = float(trainer.callback_metrics["validation/loss"])
+            self.tracker.log_metrics({"validation/loss": loss}, trainer.global_step, trainer.current_epoch)
+
+
+class StopAtBatch(pl.Callback):
+    """While fitting, a signal waits for the batch to end; then last.ckpt is saved and the run stops."""
+
+    def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:
+        self.stopper = stopper
+        self.keep = keep
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.stopper.wait = True
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.stopper.wait = False
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self.stopper.received is not None:
+            self.keep.save_last(trainer)
+            self.stopper.stop()
+
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        # The last checkpoint stands: one saved inside validation would skip the rest of it on resuming.
+        if self.stopper.received is not None:
+            self.stopper.stop()
+
+
+def fit(training: Training, batches: Batches, trainer: pl.Trainer, resume: Path | None) -> None:
+    """Train; from the state in `resume` where given."""
+    batches.attach(trainer)
+    trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)

@@ -1,0 +1,38 @@
+"""The contract of an uncertainty wrapper: a predictor in, a better calibrated predictor out."""
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.data import Batch
+from framework.model import Predictor
+
+
+class Uncertainty(Predictor):
+    """Wraps one predictor: ensemble, dropout at test time, temperature and the like.
+
+    A constructor asks for `model: Callable[[], Predictor]` before `*`, which builds a fresh, differently initialised
+    copy of what is wrapped at each call. The densities it returns are mixtures of densities (framework.density.Mixture),
+    never densities of averaged parameters; wrapping one member gives that member's numbers to the last bit. They
+    compose: `uncertainty=[ensemble,temperature]` puts temperature around the ensemble.
+    """
+
+    group: ClassVar[str] = "uncertainty"
+    bibtex: ClassVar[str]
+    """What to cite, as BibTeX."""
+
+    @abstractmethod
+    def forward(self, inputs: Tensor) -> Distribution:
+        """The density over the target for a batch of inputs."""
+
+    @abstractmethod
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """The training loss per sample, nats."""
+
+    @abstractmethod
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate what is wrapped, then itself, on the validation set; called once after training."""

@@ -1,0 +1,148 @@
+"""Hydra's way to `framework.sweep`. Hydra imports this at every start: nothing heavy here."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus, configure_log, filter_overrides, setup_globals
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+
+from framework import sweep
+
+_OF_THE_SWEEP = (
+    "hydra/launcher",
+    "hydra.launcher",
+    "hydra/sweeper",
+    "hydra.sweeper",
+    "hydra.sweep.",
+    "hydra.mode=",
+)
+
+
+class PoolLauncher(Launcher):
+    """Runs each job of a multirun as a process of its own, several at once; `framework.sweep` says how.
+
+    Args:
+        jobs: how many at once; None is half the cores.
+        retries: how often a job that was killed is started again (it resumes from its checkpoint).
+        devices: CUDA devices to hand out, one to each running job, e.g. [0, 1]; None shows all to all.
+    """
+
+    def __init__(
+        self, jobs: int | None = None, retries: int = 0, devices: Sequence[int | str] | None = None
+    ) -> None:
+        self.at_once = jobs or max(1, sweep.cores() // 2)
+        self.retries = retries
+        self.devices = [str(device) for device in devices or ()]
+        self.launched: list[list[str]] = []
+        self.parent: str | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        self.loader = hydra_context.config_loader
+        self.config = config
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        """Called once, or by some sweepers once for each batch of jobs."""
+        setup_globals()
+        hydra = self.config.hydra
+        configure_log(hydra.hydra_logging, hydra.verbose)
+        folder = Path(str(hydra.sweep.dir)).absolute()
+        folder.mkdir(parents=True, exist_ok=True)
+        configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
+        jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
+        if not self.launched:
+            self.parent = sweep.begin(folder, _plain(configs[0], folder))
+        self.launched += [job.overrides for job in jobs]
+        try:
+            sweep.run(
+                jobs, at_once=self.at_once, retries=self.retries, devices=self.devices, parent=self.parent
+            )
+        finally:
+            sweep.summarise(folder, self.launched)
+        failure = sweep.failure(jobs)
+        return [
+            JobReturn(
+                overrides=job.overrides,
+                working_dir=str(job.folder),
+                status=JobStatus.COMPLETED if job.completed else JobStatus.FAILED,
+                _return_value=job.value() if job.completed else failure,
+            )
+            for job in jobs
+        ]
+
+    def _jobs(
+        self, folder: Path, configs: Sequence[DictConfig], job_overrides: Sequence[Sequence[str]], first: int
+    ) -> list[sweep.Job]:
+        known = sweep.records(folder)
+        taken = {path for earlier in known.values() for path, _ in earlier}
+        jobs = []
+        for number, (config, given) in enumerate(zip(configs, job_overrides, strict=True), first):
+            overrides = list(filter_overrides(given))
+            key = sweep.hashed(*sorted(overrides))
+            if known.get(key):
+                path, record = known[key].pop(0)
+            else:
+                path = sweep.free_folder(
+                    lambda num, config=config: folder / _subfolder(config, num), number, taken
+                )
+                record = {}
+            taken.add(path)
+            jobs.append(
+                sweep.Job(
+                    number=number,
+                    overrides=overrides,
+                    arguments=[*self._passed_on(), *given, f"hydra.run.dir={_quoted(path)}"],
+                    folder=path,
+                    key=key,
+                    config=sweep.hashed(OmegaConf.to_yaml(_without_hydra(config))),
+                    record=record,
+                )
+            )
+        return jobs
+
+    def _passed_on(self) -> list[str]:
+        """What else of the sweep's command line a job needs, to compose the same config."""
+        hydra = self.config.hydra
+        given: Any = OmegaConf.to_container(hydra.overrides.hydra, resolve=False)
+        folders = [
+            source.path for source in hydra.runtime.config_sources if source.provider == "command-line"
+        ]
+        return [  # options first: Hydra takes overrides in one piece only
+            f"--config-name={hydra.job.config_name}",
+            *(f"--config-dir={folder}" for folder in folders),
+            *(override for override in given if not override.startswith(_OF_THE_SWEEP)),
+            "hydra.mode=RUN",
+        ]
+
+
+def _subfolder(config: DictConfig, number: int) -> str:
+    with read_write(config), open_dict(config):
+        config.hydra.job.num = number
+        config.hydra.job.id = str(number)
+    return str(config.hydra.sweep.subdir)
+
+
+def _without_hydra(config: DictConfig) -> DictConfig:
+    return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+
+
+def _plain(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """A job's config as values, as the job itself will see it but for its folder."""
+    with read_write(config), open_dict(config):
+        config.hydra.runtime.output_dir = str(folder)
+    before = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(config)
+    try:
+        values = OmegaConf.to_container(_without_hydra(config), resolve=True)
+    finally:
+        HydraConfig.instance().cfg = before
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+def _quoted(path: Path) -> str:
+    """As a value in Hydra's grammar, whatever letters it holds."""
+    return "'" + str(path).replace("'", "\\'") + "'"

@@ -1,0 +1,1 @@
+"""The methods: one self-contained folder each, found by entry points, never imported by the core."""

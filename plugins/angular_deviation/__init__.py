@@ -1,0 +1,1 @@
+"""Mean absolute angular deviation of the point prediction."""

@@ -1,0 +1,1 @@
+"""The six-convolution network of Biternion nets, for small images."""

@@ -1,0 +1,129 @@
+"""The conditional variational autoencoder head."""
+
+from typing import Annotated, cast
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.density_head import DensityHead
+from framework.errors import ConfigError
+from framework.target import Target
+from plugins.cvae.density import CVAEDensity, Gaussian, Networks, evidence_bound
+
+LARGEST_LOG_SCALE = 7.0
+"""Standard deviations of z stay within e^±7, so that no ratio of two of them overflows."""
+
+
+class CVAEHead(DensityHead):
+    """Infinite mixture over a latent z with learned prior p(z|x), encoder q(z|x,φ), decoder p(φ|x,z) (eq. 3.12).
+
+    Trains by the evidence lower bound (eq. 3.17-3.18); the density's log_prob is the importance-weighted bound
+    (eq. 3.19). It reads 3 × hidden numbers: the framework's linear layer is the part of each network's first layer
+    that sees the features, and so is computed once per item and not once per z.
+
+    Args:
+        latent: dimensions of z.
+        hidden: width of each of the three networks.
+        training_samples: S of the training loss.
+        samples: S in evaluation, of the bound and of the mixture it is drawn as; may be set at any time.
+        component: the head whose densities are mixed.
+    """
+
+    knobs = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
+    bibtex = """@inproceedings{sohn2015learning,
+  title = {Learning Structured Output Representation using Deep Conditional Generative Models},
+  author = {Sohn, Kihyuk and Lee, Honglak and Yan, Xinchen},
+  booktitle = {Advances in Neural Information Processing Systems (NIPS)},
+  year = {2015}
+}
+@inproceedings{burda2016importance,
+  title = {Importance Weighted Autoencoders},
+  author = {Burda, Yuri and Grosse, Roger and Salakhutdinov, Ruslan},
+  booktitle = {International Conference on Learning Representations (ICLR)},
+  year = {2016}
+}"""
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        latent: Annotated[int, Field(ge=1)] = 8,
+        hidden: Annotated[int, Field(ge=1)] = 128,
+        training_samples: Annotated[int, Field(ge=1)] = 10,
+        samples: Annotated[int, Field(ge=1)] = 500,
+        component: DensityHead = cast(DensityHead, "von_mises"),
+    ) -> None:
+        super().__init__()
+        fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
+        if fitted:
+            raise ConfigError(
+                f"density_head.component fits {', '.join(sorted(fitted))} after training, which a component of a "
+                "mixture cannot; choose one that predicts it, such as concentration=predicted."
+            )
+        self.target = target
+        self.size = 3 * hidden
+        self.hidden = hidden
+        self.training_samples = training_samples
+        self.samples = samples
+        self.component = component
+        self.prior = _rest(hidden, 2 * latent)
+        self.from_value = nn.Linear(
+            len(target.names) * (2 if target.kind == "angle" else 1), hidden, bias=False
+        )
+        self.posterior = _rest(hidden, 2 * latent)
+        self.from_latent = nn.Linear(latent, hidden, bias=False)
+        self.decoder = _rest(hidden, component.size)
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> CVAEDensity:
+        return CVAEDensity(self.networks(raw), self.training_samples if self.training else self.samples)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -evidence_bound(self.networks(raw), target, self.training_samples)
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        pass  # everything is trained
+
+    def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
+        """Prior, encoder and decoder, given the features."""
+        if raw.shape[-1] != self.size:
+            raise ValueError(
+                f"raw numbers of shape {tuple(raw.shape)}; wanted {self.size} in the last dimension."
+            )
+        bad = ~raw.isfinite().all(-1)
+        if bad.any():
+            row = tuple(bad.nonzero()[0].tolist())
+            raise ValueError(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
+        kind = self.from_value.weight.dtype
+        # past 1e30 the layers behind would overflow; nothing is learned there
+        for_prior, for_posterior, for_decoder = raw.to(kind).clamp(-1e30, 1e30).chunk(3, -1)
+        return Networks(
+            prior=_gaussian(self.prior(for_prior)),
+            posterior=lambda value: _gaussian(
+                self.posterior(for_posterior + self.from_value(self.encode(value).to(kind)))
+            ),
+            decode=lambda z: self.decoder(for_decoder + self.from_latent(z)),
+            component=self.component,
+            width=self.hidden,
+        )
+
+    def encode(self, value: Tensor) -> Tensor:
+        """What the encoder sees of a target: angles as biternions, labels one-hot, reals as they are."""
+        if self.target.kind == "angle":
+            return torch.cat([value.cos(), value.sin()], -1)
+        if self.target.kind == "class":
+            return nn.functional.one_hot(value, len(self.target.names))
+        return value
+
+
+def _rest(hidden: int, numbers: int) -> nn.Sequential:
+    """A network behind its linear first layer."""
+    return nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, numbers))
+
+
+def _gaussian(number: Tensor) -> Gaussian:
+    if number.dtype in (torch.float16, torch.bfloat16):  # under autocast
+        number = number.float()
+    mean, log_scale = number.chunk(2, -1)
+    return Gaussian(mean, LARGEST_LOG_SCALE * torch.tanh(log_scale / LARGEST_LOG_SCALE))

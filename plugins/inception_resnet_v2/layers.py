@@ -1,0 +1,131 @@
+"""The blocks of Inception-ResNet-v2 (Szegedy et al. 2017), named as weight files name them."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class ConvNorm(nn.Module):
+    """Convolution without bias, batch norm, ReLU.
+
+    Args:
+        kernel: height and width, or both.
+        padding: "same" keeps height and width; "valid" pads nothing.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        kernel: int | tuple[int, int] = 1,
+        *,
+        stride: int = 1,
+        padding: Literal["same", "valid"] = "same",
+    ) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False)
+        self.bn = nn.BatchNorm2d(outputs, eps=1e-3)
+
+    def forward(self, inputs: Float[Tensor, "batch planes height width"]) -> Float[Tensor, "batch _ _ _"]:
+        return self.bn(self.conv(inputs)).relu_()
+
+
+class Branches(nn.Module):
+    """Layers side by side that read the same input; their outputs are joined along the channels."""
+
+    def __init__(self, *branches: nn.Module) -> None:
+        super().__init__()
+        for number, branch in enumerate(branches):
+            self.add_module(f"branch{number}", branch)
+
+    def forward(self, inputs: Float[Tensor, "batch planes height width"]) -> Float[Tensor, "batch _ _ _"]:
+        return torch.cat([branch(inputs) for branch in self.children()], 1)
+
+
+class Residual(nn.Module):
+    """ReLU(x + scale · conv(branches(x))), the scaled Inception-ResNet block of Szegedy et al. 2017.
+
+    Args:
+        relu: whether the sum is rectified; the last block's is not.
+    """
+
+    def __init__(
+        self, planes: int, joined: int, *branches: nn.Module, scale: float, relu: bool = True
+    ) -> None:
+        super().__init__()
+        self.count, self.scale, self.relu = len(branches), scale, relu
+        for number, branch in enumerate(branches):
+            self.add_module(f"branch{number}", branch)
+        self.conv2d = nn.Conv2d(joined, planes, kernel_size=1)
+
+    def forward(
+        self, inputs: Float[Tensor, "batch planes height width"]
+    ) -> Float[Tensor, "batch planes height width"]:
+        joined = torch.cat([self.get_submodule(f"branch{number}")(inputs) for number in range(self.count)], 1)
+        total = torch.add(inputs, self.conv2d(joined), alpha=self.scale)
+        return total.relu_() if self.relu else total
+
+
+def mixed_5b() -> Branches:
+    return Branches(
+        ConvNorm(192, 96),
+        nn.Sequential(ConvNorm(192, 48), ConvNorm(48, 64, 5)),
+        nn.Sequential(ConvNorm(192, 64), ConvNorm(64, 96, 3), ConvNorm(96, 96, 3)),
+        # padding is left out of the mean, as in the TensorFlow code the published weights come from
+        nn.Sequential(nn.AvgPool2d(3, stride=1, padding=1, count_include_pad=False), ConvNorm(192, 64)),
+    )
+
+
+def block35() -> Residual:
+    return Residual(
+        320,
+        128,
+        ConvNorm(320, 32),
+        nn.Sequential(ConvNorm(320, 32), ConvNorm(32, 32, 3)),
+        nn.Sequential(ConvNorm(320, 32), ConvNorm(32, 48, 3), ConvNorm(48, 64, 3)),
+        scale=0.17,
+    )
+
+
+def mixed_6a() -> Branches:
+    return Branches(
+        ConvNorm(320, 384, 3, stride=2, padding="valid"),
+        nn.Sequential(
+            ConvNorm(320, 256), ConvNorm(256, 256, 3), ConvNorm(256, 384, 3, stride=2, padding="valid")
+        ),
+        nn.MaxPool2d(3, stride=2),
+    )
+
+
+def block17() -> Residual:
+    return Residual(
+        1088,
+        384,
+        ConvNorm(1088, 192),
+        nn.Sequential(ConvNorm(1088, 128), ConvNorm(128, 160, (1, 7)), ConvNorm(160, 192, (7, 1))),
+        scale=0.10,
+    )
+
+
+def mixed_7a() -> Branches:
+    return Branches(
+        nn.Sequential(ConvNorm(1088, 256), ConvNorm(256, 384, 3, stride=2, padding="valid")),
+        nn.Sequential(ConvNorm(1088, 256), ConvNorm(256, 288, 3, stride=2, padding="valid")),
+        nn.Sequential(
+            ConvNorm(1088, 256), ConvNorm(256, 288, 3), ConvNorm(288, 320, 3, stride=2, padding="valid")
+        ),
+        nn.MaxPool2d(3, stride=2),
+    )
+
+
+def block8(*, scale: float = 0.20, relu: bool = True) -> Residual:
+    return Residual(
+        2080,
+        448,
+        ConvNorm(2080, 192),
+        nn.Sequential(ConvNorm(2080, 192), ConvNorm(192, 224, (1, 3)), ConvNorm(224, 256, (3, 1))),
+        scale=scale,
+        relu=relu,
+    )

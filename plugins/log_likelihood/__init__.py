@@ -1,0 +1,1 @@
+"""Mean log-likelihood of the targets."""

@@ -1,0 +1,72 @@
+"""Mean log-likelihood and its standard error, from a running mean and a running sum of squared deviations."""
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.metric import Metric
+from framework.prediction import Prediction
+
+
+class LogLikelihood(Metric):
+    """Mean log-likelihood of the targets, nats, with its standard error (thesis Tables 3.1 to 3.3).
+
+    A target the density rules out has log-likelihood -inf; the mean is then -inf and the error NaN.
+    """
+
+    bibtex = """@article{gneiting2007strictly,
+  author  = {Gneiting, Tilmann and Raftery, Adrian E.},
+  title   = {Strictly Proper Scoring Rules, Prediction, and Estimation},
+  journal = {Journal of the American Statistical Association},
+  volume  = {102},
+  number  = {477},
+  pages   = {359--378},
+  year    = {2007}
+}"""
+    columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood"}
+    moments: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        # One state, not three: count, mean and squared deviations can only be merged together.
+        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
+
+    def update(self, prediction: Prediction) -> None:
+        self.moments = merged_moments(torch.stack([self.moments, moments_of(prediction.log_prob)]))
+
+    def compute(self) -> dict[str, Tensor]:
+        count, mean, squares = self.moments
+        seen = count > 0
+        return {
+            "log_likelihood": torch.where(seen, mean, torch.nan),
+            # σ/√n with the sample deviation σ² = Σ(x - x̄)² / (n - 1); one sample has none: 0/0
+            "log_likelihood_sem": torch.where(seen, (squares / (count - 1) / count).sqrt(), torch.nan),
+        }
+
+
+def moments_of(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
+    """(n, mean, Σ(x - mean)²) in float64; zeros of nothing."""
+    values = values.detach().double()
+    count = values.new_tensor(len(values))
+    if len(values) == 0:
+        return values.new_zeros(3)
+    mean = values.mean()
+    return torch.stack([count, mean, (values - mean).square().sum()])
+
+
+def merged_moments(parts: Float[Tensor, "parts 3"]) -> Float[Tensor, "3"]:
+    """The moments of all samples from those of disjoint parts (Chan, Golub & LeVeque 1983, eq. 2.1).
+
+    Exact where a sum of squares loses the variance: when the mean is large against it.
+    """
+    parts = parts[parts[:, 0] > 0]
+    count, mean, squares = parts.unbind(-1)
+    total = count.sum()
+    if total == 0:
+        return parts.new_zeros(3)
+    # a weighted mean, not mean + correction: of -inf and a number it is -inf, not NaN
+    middle = (count * mean).sum() / total
+    between = (count * (mean - middle).square()).sum()
+    return torch.stack([total, middle, squares.sum() + between])

@@ -1,0 +1,132 @@
+import copy
+import statistics
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm, sem
+from torch.distributions import Distribution, Independent, Normal
+
+from framework.prediction import Prediction
+from framework.schema import build, resolve
+from plugins.log_likelihood.metric import LogLikelihood, merged_moments, moments_of
+
+
+class Known(Distribution):
+    """A density whose log-likelihoods are given."""
+
+    arg_constraints = {}  # noqa: RUF012 - as torch has it
+
+    def __init__(self, log_prob):
+        self.values = log_prob
+        super().__init__(log_prob.shape, torch.Size((1,)), validate_args=False)
+
+    def log_prob(self, value):
+        return self.values
+
+
+def prediction(values, dtype=torch.float64):
+    log_prob = torch.as_tensor(values, dtype=dtype)
+    return Prediction(Known(log_prob), {"target": torch.zeros(len(log_prob), 1)})
+
+
+def measured(*batches, dtype=torch.float64):
+    metric = LogLikelihood()
+    for batch in batches:
+        metric.update(prediction(batch, dtype))
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
+def test_mean_and_standard_error_are_scipys(dtype, tolerance):
+    generator = np.random.default_rng(0)
+    target, loc, scale = generator.normal(size=(3, 200, 1))
+    scale = np.exp(scale)
+    expected = norm(loc, scale).logpdf(target)[:, 0]
+    density = Independent(Normal(torch.tensor(loc, dtype=dtype), torch.tensor(scale, dtype=dtype)), 1)
+    metric = build("metric", resolve("metric", "log_likelihood"))
+    metric.update(Prediction(density, {"target": torch.tensor(target, dtype=dtype)}))
+    found = metric.compute()
+    assert found["log_likelihood"].dtype == torch.float64
+    assert found["log_likelihood"].item() == pytest.approx(expected.mean(), rel=tolerance)
+    assert found["log_likelihood_sem"].item() == pytest.approx(sem(expected), rel=tolerance * 10)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.lists(st.floats(-1e6, 1e3, allow_subnormal=False), max_size=5), min_size=1, max_size=6
+    ).filter(lambda batches: sum(map(len, batches)) > 1)
+)
+def test_any_batches_give_the_numbers_of_the_whole(batches):
+    values = [value for batch in batches for value in batch]
+    found = measured(*batches)
+    assert found["log_likelihood"] == pytest.approx(statistics.fmean(values), rel=1e-12, abs=1e-9)
+    error = statistics.stdev(values) / len(values) ** 0.5  # statistics computes in exact fractions
+    assert found["log_likelihood_sem"] == pytest.approx(error, rel=1e-9, abs=1e-9)
+
+
+def test_a_large_mean_does_not_hide_a_small_spread():
+    values = [-1e9 + offset for offset in (0.0, 0.25, 0.5, 0.75)] * 25
+    error = statistics.stdev(values) / 10
+    assert measured(values[:3], values[3:50], values[50:])["log_likelihood_sem"] == pytest.approx(
+        error, rel=1e-6
+    )
+
+
+def test_nothing_seen_is_nan_and_one_sample_has_no_error():
+    assert all(np.isnan(value) for value in measured([]).values())
+    one = measured([], [-2.5], [])
+    assert one["log_likelihood"] == -2.5
+    assert np.isnan(one["log_likelihood_sem"])
+
+
+def test_an_impossible_target_makes_the_mean_minus_infinity():
+    assert measured([-1.0, -np.inf], [-2.0], [-np.inf])["log_likelihood"] == -np.inf
+    assert np.isnan(measured([-1.0], [np.nan], [-2.0])["log_likelihood"])
+
+
+def halves():
+    generator = torch.Generator().manual_seed(1)
+    values = torch.randn(37, generator=generator, dtype=torch.float64) * 3 - 1e5
+    first, second, whole = LogLikelihood(), LogLikelihood(), LogLikelihood()
+    first.update(prediction(values[:11]))
+    second.update(prediction(values[11:]))
+    whole.update(prediction(values))
+    return first, second, whole.compute()
+
+
+def test_merged_halves_are_the_whole():
+    first, second, whole = halves()
+    first.merge_state(second)
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
+
+
+def test_two_processes_are_the_whole():
+    first, second, whole = halves()
+    idle = LogLikelihood()  # a process that saw no sample
+
+    def gather(state, group=None):
+        return [state, second.moments, idle.moments]
+
+    first.dist_sync_fn, first.distributed_available_fn = gather, lambda: True
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
+
+
+def test_reset_forgets_and_a_copy_keeps():
+    metric = LogLikelihood()
+    metric.update(prediction([1.0, 2.0]))
+    kept = copy.deepcopy(metric)
+    metric.reset()
+    metric.update(prediction([5.0, 7.0]))
+    assert metric.compute()["log_likelihood"] == 6.0
+    assert kept.compute()["log_likelihood"] == 1.5
+
+
+def test_moments_of_parts_in_any_order():
+    parts = torch.stack([moments_of(torch.randn(size, dtype=torch.float64)) for size in (3, 0, 1, 20)])
+    torch.testing.assert_close(merged_moments(parts), merged_moments(parts.flip(0)))

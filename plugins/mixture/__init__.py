@@ -1,0 +1,1 @@
+"""Finite mixture of any density head (thesis §3.5.1)."""

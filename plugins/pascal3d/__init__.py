@@ -1,0 +1,1 @@
+"""PASCAL3D+ viewpoints: the official layout, and a generator that writes it."""

@@ -1,0 +1,73 @@
+"""What surrounds an object: textures, a horizon, clutter, and things that stand in the way."""
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+Picture = NDArray[np.float32]
+"""Values 0…1; (height, width, 3) unless said otherwise."""
+
+
+def texture(random: Generator, height: int, width: int) -> Picture:
+    """Smooth noise on three scales between two random colours."""
+    noise = np.zeros((height, width), np.float32)
+    for cells, weight in ((3, 1.0), (9, 0.5), (30, 0.3)):
+        grid = random.random((cells, cells), dtype=np.float32) - np.float32(0.5)
+        noise += weight * np.asarray(Image.fromarray(grid).resize((width, height), Image.Resampling.BICUBIC))
+    share = np.clip(noise + np.float32(0.5), 0, 1)[..., None]
+    first = muted(random)
+    second = np.clip(first + random.normal(0, 0.2, 3).astype(np.float32), 0, 1)
+    return np.asarray(first + share * (second - first), dtype=np.float32)
+
+
+def muted(random: Generator) -> Picture:
+    """A colour (3,) of any brightness and little saturation, as most surroundings have."""
+    grey = random.uniform(0.12, 0.9)
+    return np.clip(grey + random.normal(0, 0.1, 3), 0, 1).astype(np.float32)
+
+
+def background(
+    random: Generator, height: int, width: int, horizon: tuple[float, float], tilt: float
+) -> Picture:
+    """A texture, or ground and sky that meet at the horizon, with clutter.
+
+    Args:
+        horizon: a point of the horizon (x, y), pixels.
+        tilt: by how much the horizon leans, radians, counter-clockwise in the image.
+    """
+    ground = texture(random, height, width)
+    if random.random() < 0.5:
+        sky = 0.5 * texture(random, height, width) + np.float32(0.45)
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        above = (y - horizon[1]) * math.cos(tilt) + (x - horizon[0]) * math.sin(tilt)
+        share = np.clip(above / 2 + 0.5, 0, 1)[..., None]
+        ground = sky + share * (ground - sky)
+    for _ in range(int(random.integers(0, 5))):
+        mask = blob(random, height, width, (random.uniform(0, width), random.uniform(0, height)), 0.5 * width)
+        ground += 0.85 * mask[..., None] * (muted(random) - ground)
+    return ground
+
+
+def blob(
+    random: Generator, height: int, width: int, center: tuple[float, float], size: float
+) -> NDArray[np.float32]:
+    """The mask of a random ellipse, quadrangle or pole near `center`, at most about `size` pixels across."""
+    canvas = Image.new("L", (width, height))
+    draw = ImageDraw.Draw(canvas)
+    x, y = center
+    across, along = random.uniform(0.1, 0.5, 2) * size
+    kind = random.random()
+    if kind < 0.35:
+        draw.ellipse((x - across, y - along, x + across, y + along), fill=255)
+    elif kind < 0.75:
+        turn = random.uniform(0, math.pi)
+        corners = [(-across, -along), (across, -along), (across, along), (-across, along)]
+        cos, sin = math.cos(turn), math.sin(turn)
+        draw.polygon([(x + u * cos - v * sin, y + u * sin + v * cos) for u, v in corners], fill=255)
+    else:
+        thick = 0.06 * size
+        draw.rectangle((x - thick, 0, x + thick, height), fill=255)
+    return np.asarray(canvas, dtype=np.float32) / np.float32(255)

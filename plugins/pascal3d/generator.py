@@ -1,0 +1,226 @@
+"""Generated pictures in the layout of PASCAL3D+: annotation files, lists and images, and `synthetic.json`.
+
+A root is a function of class, number of images, seed and renderer, to the byte: each picture has its own
+random stream, whichever thread draws it. It is written beside its place and renamed when whole.
+"""
+
+import fcntl
+import io
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import scipy.io
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+
+from framework.errors import DataError
+from framework.renderer import Renderer
+from plugins.pascal3d.families import FAMILIES
+from plugins.pascal3d.layout import VOC_LISTS
+from plugins.pascal3d.scene import Shot, Thing, shoot
+
+VERSION = 1
+"""Of the generator; a change in what it draws or writes takes a new number, and with it a new folder."""
+MARK = "synthetic.json"
+PAINTERS = 2
+"""Threads that draw at once."""
+SHARES = {"imagenet_train": 0.4, "imagenet_val": 0.2, "pascal_train": 0.2, "pascal_val": 0.2}
+HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)  # SciPy's holds the date
+
+
+def generated(parent: Path, category: str, images: int, seed: int, renderer: Renderer) -> Path:
+    """The root of a generated class; drawn now unless it is there.
+
+    Raises:
+        DataError: the cache cannot be written, or holds something else in its place.
+    """
+    drawn_by = f"{type(renderer).__module__}.{type(renderer).__qualname__}"
+    mark = {
+        "generator_version": VERSION,
+        "seed": seed,
+        "images": images,
+        "symmetry": {category: FAMILIES[category].symmetry},
+        "renderer": drawn_by,
+    }
+    folder = parent / f"v{VERSION}-{drawn_by}-seed{seed}-images{images}"
+    root = folder / category
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not root.exists():
+            with _alone(folder / f".{category}.lock"):
+                if not root.exists():  # another process may have drawn it while this one waited
+                    _write(root, category, mark, renderer)
+    except OSError as error:
+        raise DataError(
+            f"The synthetic default of {category!r} cannot be written to {folder} ({error}). "
+            "Free space there, or set FRAMEWORK_CACHE to another folder."
+        ) from error
+    if read_mark(root) != mark:
+        raise DataError(
+            f"{root / MARK} does not describe {mark}; it was changed. Delete {root}: it is drawn anew."
+        )
+    return root
+
+
+def read_mark(root: Path) -> dict[str, Any] | None:
+    """What `synthetic.json` says of a root; None where there is none: the data are real.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    try:
+        return json.loads((root / MARK).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"{root / MARK}: cannot be read ({error}). Delete {root}: it is drawn anew."
+        ) from error
+
+
+@contextmanager
+def _alone(file: Path) -> Iterator[None]:
+    """Hold a lock that ends with the process, whatever ends it."""
+    with file.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _write(root: Path, category: str, mark: dict[str, Any], renderer: Renderer) -> None:
+    part = root.with_name(f".{category}.part")
+    shutil.rmtree(part, ignore_errors=True)  # of a process that was killed: the lock is ours
+    try:
+        _draw_all(part, category, mark["images"], mark["seed"], renderer)
+        (part / MARK).write_text(json.dumps(mark, indent=2) + "\n", encoding="utf-8")
+        part.rename(root)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Renderer) -> None:
+    names = list(_names(images))
+    for source in ("pascal", "imagenet"):
+        for top in ("Annotations", "Images"):
+            (part / top / f"{category}_{source}").mkdir(parents=True)
+    one_at_a_time = Lock()  # a renderer may keep buffers between calls
+
+    def render(*arguments: Any) -> Any:
+        with one_at_a_time:
+            return renderer(*arguments)
+
+    def draw(number: int) -> bool:
+        split, name = names[number]
+        random = np.random.default_rng([seed, sorted(FAMILIES).index(category), number])
+        shot = shoot(category, random, render)
+        _save(part, f"{category}_{split.partition('_')[0]}", name, shot)
+        bar.advance(task)
+        return any(thing.category == category and not thing.difficult for thing in shot.things)
+
+    console = Console(stderr=True)
+    with (
+        Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bar,
+        ThreadPoolExecutor(PAINTERS) as painters,
+    ):
+        task = bar.add_task(f"Drawing the synthetic {category} images", total=images)
+        try:
+            flags = list(painters.map(draw, range(images)))
+        except BaseException:
+            painters.shutdown(cancel_futures=True)
+            raise
+    _save_lists(part, category, names, flags)
+
+
+def _names(images: int) -> Iterator[tuple[str, str]]:
+    """List and name of every picture."""
+    ends = np.round(np.cumsum([0.0, *SHARES.values()]) * images).astype(int)
+    for split, first, last in zip(SHARES, ends, ends[1:], strict=False):
+        for number in range(first, last):
+            yield split, f"synthetic_{number:06d}"
+
+
+def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
+    suffix = ".jpg" if folder.endswith("_pascal") else ".JPEG"
+    image = part / "Images" / folder / f"{name}{suffix}"
+    Image.fromarray(shot.pixels).save(image, "JPEG", quality=90)
+    height, width, depth = shot.pixels.shape
+    record = {
+        "folder": folder,
+        "filename": image.name,
+        "size": {"width": float(width), "height": float(height), "depth": float(depth)},
+        "imgsize": np.array([[width, height, depth]], dtype=np.float64),
+        "database": "synthetic",
+        "objects": _objects(shot),
+    }
+    content = io.BytesIO()
+    scipy.io.savemat(content, {"record": record})
+    (part / "Annotations" / folder / f"{name}.mat").write_bytes(HEADER + content.getvalue()[len(HEADER) :])
+
+
+def _objects(shot: Shot) -> np.ndarray:
+    """The struct array `record.objects`; `symmetry` and `blur` are not in the official files."""
+    entries = [
+        {
+            "class": thing.category,
+            "view": "",
+            "truncated": float(thing.truncated),
+            "occluded": float(thing.occluded),
+            "difficult": float(thing.difficult),
+            "bbox": np.array([thing.box], dtype=np.float64) + 1,  # counted from 1
+            "cad_index": 1.0,
+            "viewpoint": _viewpoint(thing),
+            "symmetry": float(thing.symmetry),
+            "blur": float(shot.blur),
+        }
+        for thing in shot.things
+    ]
+    array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])
+    for index, entry in enumerate(entries):
+        array[0, index] = tuple(entry.values())
+    return array
+
+
+def _viewpoint(thing: Thing) -> dict[str, float]:
+    """The official fields; `focal` × `viewport` is the focal length, (px, py) the principal point, pixels."""
+    view = thing.view
+    coarse = {
+        "azimuth_coarse": float(45 * round(view.azimuth / 45) % 360),
+        "elevation_coarse": float(15 * round(view.elevation / 15)),
+    }
+    fine = {"azimuth": view.azimuth, "elevation": view.elevation, "theta": view.tilt} if thing.fine else {}
+    return {
+        **coarse,
+        **fine,
+        "distance": view.distance if thing.fine else 0.0,
+        "focal": 1.0,
+        "viewport": view.focal,
+        "px": view.principal[0] + 1,
+        "py": view.principal[1] + 1,
+    }
+
+
+def _save_lists(part: Path, category: str, names: Sequence[tuple[str, str]], easy: Sequence[bool]) -> None:
+    """VOC lists flag an image 1, or 0 where its only objects of the class are difficult."""
+    (part / "Image_sets").mkdir()
+    (part / VOC_LISTS).mkdir(parents=True)
+    for split in SHARES:
+        source, _, half = split.partition("_")
+        lines = [
+            f"{name} {1 if flag else 0:2d}" if source == "pascal" else name
+            for (owner, name), flag in zip(names, easy, strict=True)
+            if owner == split
+        ]
+        file = (
+            VOC_LISTS / f"{category}_{half}.txt"
+            if source == "pascal"
+            else Path("Image_sets", f"{category}_{split}.txt")
+        )
+        (part / file).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

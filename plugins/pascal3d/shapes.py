@@ -1,0 +1,250 @@
+"""Closed solids from which the object families are built: boxes, lofts, lathes, rings and plates.
+
+Object coordinates are those of PASCAL3D+ models: the front faces -y, z is up, x is the object's left.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A closed surface; vertices that two facets share are shaded smoothly across them.
+
+    Attributes:
+        vertices: (vertices, 3).
+        faces: (faces, 3), all seen one way round from outside; which way, `Body.mesh` finds out.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A coloured object, centred, the diagonal of its bounding box 1.
+
+    Attributes:
+        vertices: (vertices, 3).
+        faces: (faces, 3), counter-clockwise seen from outside.
+        colors: (vertices, 3), reflectance in [0, 1].
+        normals: (vertices, 3), unit length, outward.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    colors: Array
+    normals: Array
+
+
+class Body:
+    """Collects coloured solids into one mesh."""
+
+    def __init__(self) -> None:
+        self._solids: list[Solid] = []
+        self._colors: list[Color] = []
+
+    def add(self, solid: Solid, color: Color) -> None:
+        self._solids.append(solid)
+        self._colors.append(color)
+
+    def pair(self, solid: Solid, color: Color) -> None:
+        """Add a solid and its mirror image in x."""
+        self.add(solid, color)
+        self.add(transformed(solid, scale=(-1.0, 1.0, 1.0)), color)
+
+    def turned(self, *angles: float) -> "Body":
+        """One copy of this body for each angle (radians), turned by it about the vertical."""
+        whole = Body()
+        for angle in angles:
+            cos, sin = np.cos(angle), np.sin(angle)
+            turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+            for solid, color in zip(self._solids, self._colors, strict=True):
+                whole.add(Solid(solid.vertices @ turn.T, solid.faces), color)
+        return whole
+
+    def mesh(self) -> Mesh:
+        counts = [len(solid.vertices) for solid in self._solids]
+        starts = np.cumsum([0, *counts[:-1]])
+        vertices = np.concatenate([solid.vertices for solid in self._solids])
+        faces = np.concatenate([s.faces + start for s, start in zip(self._solids, starts, strict=True)])
+        colors = np.repeat(np.array(self._colors), counts, axis=0)
+        low, high = vertices.min(0), vertices.max(0)
+        vertices = (vertices - (low + high) / 2) / np.linalg.norm(high - low)
+
+        first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+        normal = np.cross(second - first, third - first)  # length: twice the area
+        # A closed surface whose faces run clockwise has a negative volume (divergence theorem).
+        owner = np.repeat(np.arange(len(counts)), [len(solid.faces) for solid in self._solids])
+        volume = np.bincount(owner, (normal * first).sum(1))
+        outward = np.sign(volume)[owner]
+        faces = np.where(outward[:, None] < 0, faces[:, ::-1], faces)
+        normal *= outward[:, None]
+
+        index = faces.ravel()
+        summed = np.stack(
+            [np.bincount(index, np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
+        )
+        return Mesh(
+            vertices, faces, colors, summed / np.maximum(np.linalg.norm(summed, axis=1)[:, None], 1e-12)
+        )
+
+
+def transformed(solid: Solid, *, scale: ArrayLike = 1.0, shift: ArrayLike = 0.0) -> Solid:
+    """Scaled per axis, then shifted."""
+    return Solid(solid.vertices * np.asarray(scale) + np.asarray(shift), solid.faces)
+
+
+def off(point: ArrayLike, x: float, y: float, z: float) -> Array:
+    """The point that far from another."""
+    return np.asarray(point) + np.array([x, y, z])
+
+
+def box(size: ArrayLike, center: ArrayLike) -> Solid:
+    """An upright box: (width in x, length in y, height in z)."""
+    return transformed(_unit_box(), scale=size, shift=center)
+
+
+@cache
+def _unit_box() -> Solid:
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+    return loft([np.insert(square, 2, height, axis=1) for height in (-0.5, 0.5)])
+
+
+def loft(rings: ArrayLike, *, smooth: bool = False) -> Solid:
+    """The hull of a stack of rings (rings, points, 3), closed by a flat cap at either end.
+
+    A ring may shrink to a point. `smooth` shades across the ring's points, but not over the rim of a cap.
+    """
+    stack = np.asarray(rings, dtype=np.float64)
+    layers, points, _ = stack.shape
+    if smooth:
+        side = stack
+    else:
+        after = np.roll(stack, -1, axis=1)
+        side = np.stack([stack[:-1], after[:-1], after[1:], stack[1:]], axis=2)
+    vertices = np.concatenate([side.reshape(-1, 3), stack[0], stack[-1]])
+    return Solid(vertices, _loft_faces(layers, points, smooth))
+
+
+@cache
+def _loft_faces(layers: int, points: int, smooth: bool) -> NDArray[np.int64]:
+    if smooth:
+        quads, side = _quads(layers, points, closed=False), layers * points
+    else:
+        quads = np.arange(4 * (layers - 1) * points).reshape(-1, 4)
+        side = quads.size
+    fan = np.stack([np.zeros(points - 2, int), np.arange(1, points - 1), np.arange(2, points)], axis=1)
+    caps = [fan[:, ::-1] + side, fan + side + points]
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], *caps])
+
+
+def _quads(layers: int, points: int, *, closed: bool) -> NDArray[np.int64]:
+    """Corner indices of the quadrangles between rings; `closed` joins the last ring to the first."""
+    layer, point = np.meshgrid(np.arange(layers if closed else layers - 1), np.arange(points), indexing="ij")
+    above, after = (layer + 1) % layers, (point + 1) % points
+    corners = [layer * points + point, layer * points + after, above * points + after, above * points + point]
+    return np.stack(corners, axis=-1).reshape(-1, 4)
+
+
+@cache
+def _circle(sides: int) -> Array:
+    angle = 2 * np.pi * np.arange(sides) / sides
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Solid:
+    """A body of revolution about z: (radius, height) pairs from the bottom up."""
+    rings = np.empty((len(profile), sides, 3))
+    for layer, (radius, height) in enumerate(profile):
+        rings[layer, :, :2] = radius * _circle(sides)
+        rings[layer, :, 2] = height
+    return loft(rings, smooth=True)
+
+
+def rod(
+    start: ArrayLike, end: ArrayLike, radius: float, end_radius: float | None = None, sides: int = 6
+) -> Solid:
+    """A straight round bar, or a cone."""
+    first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    x, y, z = (last - first).tolist()
+    length, flat = math.hypot(x, y, z), math.hypot(y, z)
+    # two unit vectors across the bar; one of them lies in the plane x = 0 unless the bar runs along x
+    across = (0.0, z / flat, -y / flat) if flat > 1e-9 * length else (0.0, 1.0, 0.0)
+    upward = (
+        (y * across[2] - z * across[1]) / length,
+        (z * across[0] - x * across[2]) / length,
+        (x * across[1] - y * across[0]) / length,
+    )
+    circle = _circle(sides) @ np.array([across, upward])
+    radii = (radius, radius if end_radius is None else end_radius)
+    return loft([first + radii[0] * circle, last + radii[1] * circle], smooth=sides > 6)
+
+
+def wheel(center: ArrayLike, radius: float, width: float, sides: int = 16) -> Solid:
+    """A disc that turns about x."""
+    middle = np.asarray(center, dtype=np.float64)
+    half = np.array([width / 2, 0, 0])
+    return rod(middle - half, middle + half, radius, sides=sides)
+
+
+def ring(center: ArrayLike, radius: float, thickness: float, sides: int = 20, around: int = 5) -> Solid:
+    """A torus that turns about x: `radius` to the middle of a tyre of `thickness` (its diameter)."""
+    out, along = _circle(sides), _circle(around)
+    reach = radius + thickness / 2 * along[:, 0]
+    vertices = np.empty((sides, around, 3))
+    vertices[..., 0] = thickness / 2 * along[:, 1]
+    vertices[..., 1] = reach * out[:, :1]
+    vertices[..., 2] = reach * out[:, 1:]
+    return Solid(vertices.reshape(-1, 3) + np.asarray(center), _ring_faces(sides, around))
+
+
+@cache
+def _ring_faces(sides: int, around: int) -> NDArray[np.int64]:
+    quads = _quads(sides, around, closed=True)
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def ellipsoid(center: ArrayLike, radii: ArrayLike, sides: int = 14, layers: int = 9) -> Solid:
+    angle = np.linspace(-np.pi / 2, np.pi / 2, layers)
+    unit = lathe([(float(np.cos(a)), float(np.sin(a))) for a in angle], sides)
+    return transformed(unit, scale=radii, shift=center)
+
+
+def plate(outline: ArrayLike, offset: ArrayLike) -> Solid:
+    """A convex plane outline (points, 3), thickened by the vector `offset` to both sides."""
+    points, half = np.asarray(outline, dtype=np.float64), np.asarray(offset, dtype=np.float64) / 2
+    return loft([points - half, points + half])
+
+
+def side_plate(outline: Sequence[tuple[float, float]], x: float, thickness: float) -> Solid:
+    """A convex outline of (y, z) pairs, thick in x, its middle at `x`."""
+    return plate([(x, y, z) for y, z in outline], (thickness, 0, 0))
+
+
+def tapered(levels: Sequence[tuple[float, float, float, float]], middle: float = 0.0) -> Solid:
+    """A stack of level rectangles (half width, y in front, y behind, height) about x = `middle`."""
+    rings = [
+        [(middle + half, near, z), (middle + half, far, z), (middle - half, far, z), (middle - half, near, z)]
+        for half, near, far, z in levels
+    ]
+    return loft(rings)
+
+
+def rounded(width: float, low: float, high: float, y: float, bevel: float = 0.25) -> Array:
+    """A ring of eight points across y: a rectangle, its corners cut by `bevel` of the shorter half side."""
+    half, middle, tall = width / 2, (low + high) / 2, (high - low) / 2
+    cut = bevel * min(half, tall)
+    plan = [
+        (half - cut, -tall), (half, -tall + cut), (half, tall - cut), (half - cut, tall),
+        (-half + cut, tall), (-half, tall - cut), (-half, -tall + cut), (-half + cut, -tall),
+    ]  # fmt: skip
+    return np.array([(x, y, middle + z) for x, z in plan])

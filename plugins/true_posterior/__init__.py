@@ -1,0 +1,1 @@
+"""The predicted azimuth density against the known symmetry of the object."""

@@ -1,0 +1,1 @@
+"""Viewpoint accuracy and median error on the rotation of the object."""

@@ -1,0 +1,1 @@
+"""The von Mises density of angles, its mathematics and its head (thesis §3.4)."""

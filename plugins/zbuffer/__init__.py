@@ -1,0 +1,1 @@
+"""Triangle meshes drawn on one CPU core."""

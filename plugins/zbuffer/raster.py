@@ -1,0 +1,287 @@
+"""From triangles to pixels on one CPU core: project, rasterise, shade; compiled functions on NumPy arrays.
+
+Corners are rounded to 1/256 pixel, and edge functions that are exact on those whole numbers (Pineda 1988)
+decide with the top-left rule which pixels a triangle covers: a pixel centre on the edge between two triangles
+belongs to exactly one of them. A visible face and its pixel give back the barycentric weights (`weights`),
+which is what a backward pass needs beside `screen`.
+
+Arrays:
+    screen: (vertices, 3) float64: column and row in 1/256 pixel, whole numbers, and 1 / depth in 1/metre; the
+        last is 0 where a vertex cannot be drawn.
+    depth, face, mask: (height, width) float32, int32, bool; of size 0 where nobody reads them.
+    box: first row, past-the-last row, first column, past-the-last column of what may have been drawn.
+
+`no_type_check` keeps the type checks that tests switch on from wrapping a kernel before it is compiled.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+SUBPIXELS = 256.0
+EXACT = 2.0**25
+"""In 1/256 pixel; up to here edge functions stay under 2^53: int64 and float64 give the same whole number."""
+LARGEST = 1e100  # 1/256 pixel; a product of two coordinates and an inverse depth stays finite in float64
+NEAREST = 1e-100  # metres; likewise
+FARTHEST = 3e38  # metres; a depth that float32 holds
+
+# Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
+compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+
+@compiled
+@no_type_check
+def largest_index(indices):
+    """The largest of whole numbers read as unsigned: a negative one counts as larger than any array."""
+    largest = indices.dtype.type(0)
+    for index in indices:
+        largest = max(largest, index)
+    return largest
+
+
+@compiled
+@no_type_check
+def out_of_view(vertices, rotation, translation, focal, principal, near, height, width):
+    """Whether the box around all vertices lies wholly outside one plane of the view.
+
+    The planes stand one pixel outside the image, so that no rounding can hide a visible pixel. NaN enters no
+    comparison; an infinite coordinate makes the box infinite and the answer no.
+    """
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
+    for vertex in range(vertices.shape[0]):
+        for axis in range(3):
+            value = np.float64(vertices[vertex, axis])
+            if value < low[axis]:
+                low[axis] = value
+            if value > high[axis]:
+                high[axis] = value
+    for plane in range(5):
+        # Each plane as weights of the camera coordinates (x, y, z) and an offset; seen points give >= 0.
+        x = y = offset = 0.0
+        if plane == 0:
+            z, offset = 1.0, -near
+        elif plane == 1:
+            x, z = focal[0], principal[0] + 1
+        elif plane == 2:
+            x, z = -focal[0], width - principal[0]
+        elif plane == 3:
+            y, z = focal[1], principal[1] + 1
+        else:
+            y, z = -focal[1], height - principal[1]
+        most = offset + x * translation[0] + y * translation[1] + z * translation[2]
+        size = abs(offset) + abs(x * translation[0]) + abs(y * translation[1]) + abs(z * translation[2])
+        for axis in range(3):
+            along_x, along_y, along_z = x * rotation[0, axis], y * rotation[1, axis], z * rotation[2, axis]
+            slope = along_x + along_y + along_z
+            most += max(slope * low[axis], slope * high[axis])
+            size += (abs(along_x) + abs(along_y) + abs(along_z)) * max(abs(low[axis]), abs(high[axis]))
+        if most < -1e-12 * size:  # the rounding of the sums above is far smaller
+            return True
+    return False
+
+
+@compiled
+@no_type_check
+def project(vertices, rotation, translation, focal, principal, near, screen):
+    """Fill `screen` from world coordinates, in float64."""
+    for vertex in range(vertices.shape[0]):
+        a = np.float64(vertices[vertex, 0])
+        b = np.float64(vertices[vertex, 1])
+        c = np.float64(vertices[vertex, 2])
+        x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c + translation[0]
+        y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + translation[1]
+        z = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + translation[2]
+        inverse = 1.0 / z
+        column = np.rint((focal[0] * x * inverse + principal[0]) * SUBPIXELS)
+        row = np.rint((focal[1] * y * inverse + principal[1]) * SUBPIXELS)
+        # Tested as floats and before any cast; NaN fails every comparison.
+        if z >= near and z <= FARTHEST and abs(column) <= LARGEST and abs(row) <= LARGEST:
+            screen[vertex, 0] = column
+            screen[vertex, 1] = row
+            screen[vertex, 2] = inverse
+        else:
+            screen[vertex, :] = 0.0
+
+
+@compiled
+@no_type_check
+def owned(along_column, along_row):
+    """Top-left rule: whether pixels exactly on an edge are the triangle's, by the edge function's slope."""
+    return along_column > 0 or (along_column == 0 and along_row > 0)
+
+
+@compiled
+@no_type_check
+def before(x, y, other_x, other_y):
+    """Whether one point comes before another, row by row."""
+    return y < other_y or (y == other_y and x < other_x)
+
+
+@compiled
+@no_type_check
+def rasterise(screen, faces, cull, height, width, depth, face, mask):
+    """Draw the faces, each pixel the nearest, among equal float32 depths the first. Returns the box.
+
+    `cull` leaves out faces seen from behind. With `depth` of size 0 only `mask` is drawn, without depths; one
+    of the two is needed. `mask` comes cleared; `depth` and `face` are cleared here.
+    """
+    want_depth = depth.size > 0
+    want_face = face.size > 0
+    depth[:] = np.float32(np.inf)
+    face[:] = -1
+    last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
+    box_top, box_bottom, box_left, box_right = height, 0, width, 0
+    for index in range(faces.shape[0]):
+        a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+        near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
+        if near0 == 0 or near1 == 0 or near2 == 0:
+            continue
+        ax, ay = screen[a, 0], screen[a, 1]
+        bx, by = screen[b, 0], screen[b, 1]
+        cx, cy = screen[c, 0], screen[c, 1]
+        left, right = min(ax, bx, cx), max(ax, bx, cx)
+        top, bottom = min(ay, by, cy), max(ay, by, cy)
+        if right < 0 or bottom < 0 or left > last_x or top > last_y:
+            continue
+        # The pixel centres in the bounding box; clamped as floats, so that the casts are safe.
+        first_column = np.int64(np.ceil(max(left, 0.0) / SUBPIXELS))
+        last_column = np.int64(np.floor(min(right, last_x) / SUBPIXELS))
+        first_row = np.int64(np.ceil(max(top, 0.0) / SUBPIXELS))
+        last_row = np.int64(np.floor(min(bottom, last_y) / SUBPIXELS))
+        if first_column > last_column or first_row > last_row:
+            continue
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)  # exact up to EXACT
+        # Counter-clockwise from outside has negative area where rows run downwards.
+        if area == 0 or (cull and area > 0):
+            continue
+        if area < 0:
+            area = -area
+            bx, by, near1, cx, cy, near2 = cx, cy, near2, bx, by, near1
+        # The topmost, then leftmost corner first: the rounding of a depth then does not depend on the order
+        # in which a face names its corners, and two faces with the same corners are equally far.
+        if before(bx, by, ax, ay) and before(bx, by, cx, cy):
+            ax, ay, near0, bx, by, near1, cx, cy, near2 = bx, by, near1, cx, cy, near2, ax, ay, near0
+        elif before(cx, cy, ax, ay):
+            ax, ay, near0, bx, by, near1, cx, cy, near2 = cx, cy, near2, ax, ay, near0, bx, by, near1
+        box_top, box_bottom = min(box_top, first_row), max(box_bottom, last_row + 1)
+        box_left, box_right = min(box_left, first_column), max(box_right, last_column + 1)
+        if left < -EXACT or right > EXACT or top < -EXACT or bottom > EXACT:
+            corners = (ax, ay, near0, bx, by, near1, cx, cy, near2)
+            pixels = (first_row, last_row, first_column, last_column)
+            _draw_far(corners, pixels, index, depth, face, mask)
+            continue
+        x0, y0, x1, y1 = np.int64(ax), np.int64(ay), np.int64(bx), np.int64(by)
+        x2, y2 = np.int64(cx), np.int64(cy)
+        # Edge functions, each opposite its corner and positive inside (Pineda 1988): their gradients.
+        column0, row0 = y1 - y2, x2 - x1
+        column1, row1 = y2 - y0, x0 - x2
+        column2, row2 = y0 - y1, x1 - x0
+        bias0 = 0 if owned(column0, row0) else 1
+        bias1 = 0 if owned(column1, row1) else 1
+        bias2 = 0 if owned(column2, row2) else 1
+        x, y = first_column << 8, first_row << 8
+        start0 = column0 * (x - x1) + row0 * (y - y1) - bias0
+        start1 = column1 * (x - x2) + row1 * (y - y2) - bias1
+        start2 = column2 * (x - x0) + row2 * (y - y0) - bias2
+        column0, column1, column2 = column0 << 8, column1 << 8, column2 << 8
+        row0, row1, row2 = row0 << 8, row1 << 8, row2 << 8
+        scale0, scale1, scale2 = near0 / area, near1 / area, near2 / area
+        least, most = min(near0, near1, near2), max(near0, near1, near2)
+        for row in range(first_row, last_row + 1):
+            edge0, edge1, edge2 = start0, start1, start2
+            for column in range(first_column, last_column + 1):
+                if (edge0 | edge1 | edge2) >= 0:
+                    if want_depth:
+                        # 1 / depth is affine on the screen; clamped, it cannot leave the corners' range.
+                        inverse = (
+                            (edge0 + bias0) * scale0 + (edge1 + bias1) * scale1 + (edge2 + bias2) * scale2
+                        )
+                        distance = np.float32(1.0 / min(max(inverse, least), most))
+                        if distance < depth[row, column]:
+                            depth[row, column] = distance
+                            if want_face:
+                                face[row, column] = index
+                    else:
+                        mask[row, column] = True
+                edge0 += column0
+                edge1 += column1
+                edge2 += column2
+            start0 += row0
+            start1 += row1
+            start2 += row2
+    if want_depth and mask.size > 0:
+        for row in range(box_top, box_bottom):
+            for column in range(box_left, box_right):
+                mask[row, column] = depth[row, column] < np.inf
+    return box_top, box_bottom, box_left, box_right
+
+
+@compiled
+@no_type_check
+def _draw_far(corners, pixels, index, depth, face, mask):
+    """Draw a face that reaches past `EXACT`, with edge functions in float64, anew at each pixel.
+
+    Even rounded, they change exactly their sign with an edge's direction (`edges`), so that neighbours share
+    no pixel and leave none out; between corners within `EXACT` they are the whole numbers of `rasterise`.
+    """
+    ax, ay, near0, bx, by, near1, cx, cy, near2 = corners
+    first_row, last_row, first_column, last_column = pixels
+    owned0, owned1, owned2 = owned(by - cy, cx - bx), owned(cy - ay, ax - cx), owned(ay - by, bx - ax)
+    least, most = min(near0, near1, near2), max(near0, near1, near2)
+    for row in range(first_row, last_row + 1):
+        for column in range(first_column, last_column + 1):
+            edge0, edge1, edge2 = edges(ax, ay, bx, by, cx, cy, row, column)
+            inside = edge0 > 0 or (edge0 == 0 and owned0)
+            inside = inside and (edge1 > 0 or (edge1 == 0 and owned1))
+            inside = inside and (edge2 > 0 or (edge2 == 0 and owned2)) and edge0 + edge1 + edge2 > 0
+            if inside and depth.size > 0:
+                inverse = (edge0 * near0 + edge1 * near1 + edge2 * near2) / (edge0 + edge1 + edge2)
+                distance = np.float32(1.0 / min(max(inverse, least), most))
+                if distance < depth[row, column]:
+                    depth[row, column] = distance
+                    if face.size > 0:
+                        face[row, column] = index
+            elif inside:
+                mask[row, column] = True
+
+
+@compiled
+@no_type_check
+def edges(ax, ay, bx, by, cx, cy, row, column):
+    """A triangle's edge functions at a pixel, each opposite its corner: x1 y2 - x2 y1 seen from the pixel."""
+    x, y = column * SUBPIXELS, row * SUBPIXELS
+    ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
+    return bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay
+
+
+@compiled
+@no_type_check
+def weights(screen, a, b, c, row, column):
+    """Perspective-correct barycentric weights of a face at a pixel inside it: (w / z) / Σ (w / z)."""
+    edge0, edge1, edge2 = edges(
+        screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1], row, column
+    )
+    part0, part1, part2 = edge0 * screen[a, 2], edge1 * screen[b, 2], edge2 * screen[c, 2]
+    scale = 1.0 / (part0 + part1 + part2)
+    return part0 * scale, part1 * scale, part2 * scale
+
+
+@compiled
+@no_type_check
+def shade(screen, faces, colors, face, box, color):
+    """Fill `color` (height, width, 3) with interpolated colours where `face` shows a face."""
+    top, bottom, left, right = box
+    for row in range(top, bottom):
+        for column in range(left, right):
+            index = face[row, column]
+            if index >= 0:
+                a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+                weight0, weight1, weight2 = weights(screen, a, b, c, row, column)
+                for channel in range(3):
+                    color[row, column, channel] = (
+                        weight0 * colors[a, channel]
+                        + weight1 * colors[b, channel]
+                        + weight2 * colors[c, channel]
+                    )

@@ -1,0 +1,73 @@
+"""A density head on the circle that the framework does not ship."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.density import circular, median
+from framework.density_head import DensityHead
+from framework.target import Target
+
+
+class WrappedCauchy(Distribution):
+    """Independent wrapped Cauchy densities (Mardia & Jupp 2000, eq. 3.5.66) over the last dimension."""
+
+    arg_constraints: ClassVar = {}
+    support = circular
+
+    def __init__(self, mean: Tensor, length: Tensor) -> None:
+        self.location = mean
+        self.length = length
+        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        square = self.length**2
+        near = 1 + square - 2 * self.length * (value - self.location).cos()
+        return (torch.log1p(-square) - near.log() - math.log(2 * math.pi)).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        uniform = torch.rand(*sample_shape, *self.location.shape)
+        scale = (1 - self.length) / (1 + self.length)
+        return self.location + 2 * torch.atan(scale * torch.tan(math.pi * (uniform - 0.5)))
+
+    def entropy(self) -> Tensor:
+        return (math.log(2 * math.pi) + torch.log1p(-(self.length**2))).sum(-1)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.location
+
+
+@median.register
+def _(density: WrappedCauchy, samples: int) -> Tensor:
+    return density.location
+
+
+class WrappedCauchyHead(DensityHead):
+    """One wrapped Cauchy density per angle."""
+
+    bibtex = """@book{mardia2000directional, author={Mardia, K. V. and Jupp, P. E.},
+title={Directional Statistics}, year={2000}}"""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+
+    def __init__(self, target: Target, *, largest: Annotated[float, Field(gt=0, lt=1)] = 0.999) -> None:
+        super().__init__()
+        target.require("angle", by="wrapped_cauchy")
+        self.angles = len(target.names)
+        self.size = 3 * self.angles
+        self.largest = largest
+
+    def forward(self, raw: Tensor) -> WrappedCauchy:
+        cos, sin, spread = raw.unflatten(-1, (self.angles, 3)).unbind(-1)
+        return WrappedCauchy(torch.atan2(sin, cos + 1e-12), self.largest * torch.sigmoid(spread))
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        pass

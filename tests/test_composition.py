@@ -1,0 +1,131 @@
+"""Composed configs: every experiment composes, and Hydra's errors become sentences."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from framework.app import _with_resumed_folder
+from framework.composition import folder, plain, refuse_logging_overrides, register, sentence
+from framework.errors import ConfigError
+from framework.settings import check_trainer_keys, settings
+
+EXPERIMENTS = sorted(
+    str(path.relative_to(folder() / "experiment").with_suffix(""))
+    for path in (folder() / "experiment").rglob("*.yaml")
+    if path.stem != "base"
+)
+
+
+def composed(*overrides: str) -> DictConfig:
+    register()
+    with initialize_config_dir(str(folder()), version_base="1.3"):
+        # without hydra.main there are no runtime choices to interpolate
+        return compose("config", overrides=["experiment_name=test", *overrides])
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
+    from framework.assembly import resolve_all
+
+    values = plain(composed(f"experiment={name}"))
+    settings(values)
+    resolved = resolve_all(values)
+    assert resolved["metric"], "an experiment reports something"
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_is_its_differences(name: str) -> None:
+    lines = (folder() / "experiment" / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 30
+    assert f"python -m framework experiment={name}" in lines[1]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["experiment=pascal3d/scva"],
+            r"No configuration 'experiment/pascal3d/scva'\. Did you mean 'pascal3d/scvae'\?",
+        ),
+        (["density_head=mixtur"], r"Did you mean 'mixture'\?"),
+        (["trainer.max_epoch=3"], r"trainer\.max_epoch: unknown key\. Did you mean 'max_epochs'\?"),
+        (["sed=3"], r"sed: unknown key\. Did you mean 'seed'\?"),
+        (["a=b=[", "x"], "."),
+    ],
+)
+def test_a_mistake_becomes_a_sentence(overrides: list[str], message: str) -> None:
+    with pytest.raises(Exception) as caught:  # noqa: PT011  Hydra raises what it likes
+        composed(*overrides)
+    said = sentence(caught.value)
+    assert said is not None
+    assert re.search(message, said), said
+
+
+def test_an_error_of_ours_is_not_taken_for_a_mistake() -> None:
+    assert sentence(RuntimeError("a bug")) is None
+
+
+def test_what_a_replaced_choice_leaves_is_dropped() -> None:
+    values = plain(composed("encoder=[mlp]", "+encoder.other.width=3"))
+    assert list(values["encoder"]) == ["mlp"]
+
+
+def test_plural_groups_keep_their_order() -> None:
+    values = plain(composed("metric=[viewpoint,log_likelihood,angular_deviation]"))
+    assert list(values["metric"]) == ["viewpoint", "log_likelihood", "angular_deviation"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["seed=-1"], "seed = -1"),
+        (["optimizer.learning_rate=nan"], r"optimizer\.learning_rate = nan"),
+        (["optimizer.name=adamm"], r"Did you mean 'adamw'\?|Did you mean 'adam'\?"),
+        (["trainer.max_epochs=0"], r"trainer\.max_epochs = 0"),
+        (["+typo=1"], "typo: unknown key"),
+        (["+data._target_=os.system"], "must not be able to run code"),
+    ],
+)
+def test_core_settings_are_checked(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        settings(plain(composed("data=pascal3d", *overrides)))
+
+
+def test_an_unknown_trainer_argument_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"Did you mean 'max_steps'\?"):
+        check_trainer_keys({"max_step": 3}, {"max_steps", "devices"})
+
+
+@pytest.mark.parametrize(
+    "argument",
+    ["hydra/job_logging=evil", "+hydra.job_logging.root=1", "hydra.hydra_logging.x=3", "~hydra/callbacks=x"],
+)
+def test_hydra_logging_cannot_be_changed(argument: str) -> None:
+    with pytest.raises(ConfigError, match="can run code"):
+        refuse_logging_overrides(["seed=1", argument])
+
+
+def test_resume_names_a_run_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="does not exist"):
+        _with_resumed_folder([f"resume={tmp_path}"])
+    (tmp_path / "config.yaml").write_text("seed: 1")
+    assert _with_resumed_folder([f"resume={tmp_path}"])[-1] == f"hydra.run.dir={tmp_path}"
+    assert _with_resumed_folder(["resume=auto"]) == ["resume=auto"]
+
+
+def test_a_shadowed_plugins_package_is_named(tmp_path: Path) -> None:
+    (tmp_path / "plugins.py").write_text("")
+    done = subprocess.run(
+        [sys.executable, "-m", "framework", "mode=plugins"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert "hides it" in done.stderr

@@ -1,0 +1,421 @@
+"""What figures show: scales, words, and how many of each thing, read from the artists."""
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+from matplotlib.text import Annotation, Text
+from scipy.special import logsumexp
+from scipy.stats import vonmises
+
+from framework.pictures import (
+    RING,
+    choose,
+    comparison,
+    peaks,
+    training_curve,
+    viewing_circles,
+    work_precision,
+)
+from framework.work_precision import Point
+
+ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
+
+
+def bumps(*parts: tuple[float, float, float]) -> np.ndarray:
+    """Log-density on the grid of a mixture of (weight, mean, concentration)."""
+    logs = [math.log(weight) + vonmises.logpdf(ANGLES, sharp, loc=mean) for weight, mean, sharp in parts]
+    return logsumexp(logs, axis=0)
+
+
+def words(figure: Figure) -> str:
+    found = [text.get_text() for text in figure.findobj(Text)]
+    return "\n".join(found).replace("\n", " ")
+
+
+def drawn(figure: Figure, folder: Path) -> None:
+    """Rendering raises what only rendering finds: missing glyphs, a layout that does not fit."""
+    figure.savefig(folder / "figure.png", dpi=60)
+    assert (folder / "figure.png").stat().st_size > 2000
+
+
+# choosing samples
+
+
+def test_peaks_are_counted_around_the_circle() -> None:
+    densities = [
+        bumps((1, 0, 5)),
+        bumps((1, math.pi, 50)),  # across the end of the grid
+        bumps((0.5, 0, 20), (0.5, math.pi, 20)),
+        bumps((0.9, 0, 20), (0.1, math.pi, 20)),  # a ninth of the height does not count
+        bumps((0.3, -2, 30), (0.3, 0, 30), (0.4, 2, 30)),
+        np.full(720, -math.log(2 * math.pi)),
+        np.where(np.arange(720) == 7, 3.0, -math.inf),
+    ]
+    assert peaks(np.array(densities).T).tolist() == [1, 1, 2, 1, 3, 1, 1]
+
+
+def test_rows_are_the_certain_the_ambiguous_and_the_confident_mistakes() -> None:
+    one, two = bumps((1, 0, 50)), bumps((0.5, 0, 50), (0.5, math.pi, 50))
+    entropy = np.array([-1.0, -2.0, 1.8, -1.5, 0.5, 0.1, 1.7, 1.6])
+    error = np.radians([5.0, 3.0, 2.0, 170.0, 4.0, 90.0, 100.0, 31.0])
+    log_density = np.array([one, one, one, one, two, two, one, one]).T
+    assert choose(entropy, error, log_density) == {"certain": [1, 0], "ambiguous": [5, 4], "failed": [3]}
+    assert choose(entropy, error, log_density, count=1) == {"certain": [1], "ambiguous": [5], "failed": [3]}
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 40), st.integers(1, 6), st.integers(0, 2**32 - 1))
+def test_chosen_samples_are_few_distinct_and_the_same_again(samples: int, count: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    entropy = generator.integers(-3, 3, samples).astype(float)  # many ties
+    error = generator.uniform(0, math.pi, samples)
+    log_density = generator.normal(0, 2, (24, samples))
+    found = choose(entropy, error, log_density, count)
+    everything = [index for row in found.values() for index in row]
+    assert list(found) == ["certain", "ambiguous", "failed"]
+    assert len(set(everything)) == len(everything)
+    assert all(len(row) <= count for row in found.values())
+    assert all(error[index] <= math.pi / 6 for index in found["certain"])
+    assert all(error[index] > math.pi / 6 for index in found["failed"])
+    assert choose(entropy, error, log_density, count) == found
+
+
+def test_samples_that_cannot_be_compared_are_refused() -> None:
+    one = bumps((1, 0, 5))[:, None]
+    with pytest.raises(ValueError, match="NaN"):
+        choose(np.array([math.nan]), np.zeros(1), one)
+
+
+# viewing circles
+
+
+def circles(densities: list[np.ndarray], **changed) -> Figure:
+    count = len(densities)
+    arguments = {
+        "images": [np.full((12, 20 + index, 3), 90, np.uint8) for index in range(count)],
+        "log_density": np.array(densities).T,
+        "angles": ANGLES,
+        "truths": np.linspace(0, 3, count),
+        "predictions": np.linspace(0.1, 2, count),
+        "captions": [f"sample {index}" for index in range(count)],
+        "rows": {"certain": count, "failed": 0},
+        "title": "Densities",
+        "synthetic": True,
+    }
+    return viewing_circles(**(arguments | changed))
+
+
+def band(figure: Figure, panel: int = 0) -> np.ndarray:
+    """Corners of the density's band."""
+    (polygon,) = [patch for patch in figure.axes[panel].patches if isinstance(patch, Polygon)]
+    return polygon.get_xy()
+
+
+def test_each_sample_has_its_image_band_truth_and_prediction(tmp_path: Path) -> None:
+    figure = circles([bumps((1, 0, 5))] * 4)
+    filled = [axes for axes in figure.axes if axes.images]
+    assert len(filled) == 4
+    assert [axes.get_xlabel() for axes in filled] == [f"sample {index}" for index in range(4)]
+    text = words(figure)
+    for word in ("front", "right", "back", "left", "certain", "failed", "no such sample"):
+        assert word in text
+    for word in ("predicted density", "truth", "point prediction", "uniform density", "counter-clockwise"):
+        assert text.count(word) == 1  # the legend stands once
+    assert "equally true" not in text
+    assert "Densities (synthetic data)" in text
+    drawn(figure, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("angle", "place"), [(0.0, (0, -1)), (math.pi / 2, (1, 0)), (math.pi, (0, 1)), (-math.pi / 2, (-1, 0))]
+)
+def test_angle_zero_is_at_the_bottom_and_angles_grow_counter_clockwise(
+    angle: float, place: tuple[float, float]
+) -> None:
+    figure = circles([bumps((1, angle, 2))], truths=np.array([angle]), predictions=np.array([angle]))
+    corners = band(figure)
+    farthest = corners[np.hypot(*corners.T).argmax()]
+    assert farthest / np.hypot(*farthest) == pytest.approx(place, abs=0.01)
+    marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) <= 2]
+    for mark in marks:  # truth and prediction
+        end = np.array([mark.get_xdata()[-1], mark.get_ydata()[-1]])
+        assert end / np.hypot(*end) == pytest.approx(place, abs=1e-6)
+    assert len(marks) == 2
+
+
+def test_words_stand_where_their_angles_are() -> None:
+    axes = circles([bumps((1, 0, 5))]).axes[0]
+    where = {text.get_text(): text.get_position() for text in axes.texts}
+    assert where["front"][1] < -0.5 and where["back"][1] > 0.5
+    assert where["right"][0] > 0.5 and where["left"][0] < -0.5
+
+
+def test_thickness_is_the_density_to_one_scale_and_cut_at_the_outer_circle() -> None:
+    soft, sharp = bumps((1, 1, 4)), bumps((1, 1, 400))
+    figure = circles([soft, sharp], outer=1.5)
+    soft_radius, sharp_radius = (np.hypot(*band(figure, panel).T) for panel in (0, 1))
+    peak = vonmises.pdf(0, 4)
+    assert soft_radius.max() == pytest.approx(1 + RING * peak / 1.5, rel=1e-3)
+    assert sharp_radius.max() == pytest.approx(1 + RING)
+    assert min(soft_radius.min(), sharp_radius.min()) == pytest.approx(1)
+    thick = [[line for line in axes.lines if line.get_linewidth() == 3] for axes in figure.axes[:2]]
+    shares = [np.isfinite(lines[0].get_xdata()).mean() for lines in thick]
+    assert shares[0] == 0  # nothing is cut, nothing is thick
+    over = vonmises.pdf(ANGLES, 400, loc=1) > 1.5
+    assert shares[1] == pytest.approx(over.mean(), abs=4 / 720)
+    assert "above 1.5 per radian" in words(figure)
+
+
+def test_every_equally_true_angle_is_marked(tmp_path: Path) -> None:
+    modes = [np.array([0.0, 2.0, 4.0]), np.array([])]
+    figure = circles([bumps((1, 0, 5))] * 2, modes=modes)
+    triangles = [sum(isinstance(line.get_marker(), tuple) for line in axes.lines) for axes in figure.axes[:2]]
+    assert triangles == [4, 1]  # and the truth
+    assert "equally true" in words(figure)
+    drawn(figure, tmp_path)
+
+
+def test_a_density_at_one_angle_is_cut_visibly(tmp_path: Path) -> None:
+    figure = circles([np.where(np.arange(720) == 3, 800.0, -math.inf)])
+    (thick,) = [line for line in figure.axes[0].lines if line.get_linewidth() == 3]
+    assert np.isfinite(thick.get_xdata()).sum() == 3
+    drawn(figure, tmp_path)
+
+
+def test_wild_captions_are_printed_as_they_are(tmp_path: Path) -> None:
+    figure = circles(
+        [bumps((1, 0, 5))], captions=["$cost$_{x} \\frac\nsecond line"], title="$title$", synthetic=False
+    )
+    assert "$cost$_{x} \\frac second line" in words(figure)
+    assert "synthetic" not in words(figure)
+    drawn(figure, tmp_path)
+
+
+def test_no_samples_at_all_still_make_a_figure(tmp_path: Path) -> None:
+    empty = {"log_density": np.zeros((720, 0)), "truths": np.zeros(0), "predictions": np.zeros(0)}
+    drawn(circles([], **empty, rows={"certain": 0, "ambiguous": 0, "failed": 0}), tmp_path)
+
+
+def test_wrong_numbers_of_samples_and_nan_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"\(1, 1, 1, 2\)"):
+        circles([bumps((1, 0, 5))], captions=["one", "two"])
+    with pytest.raises(ValueError, match="NaN"):
+        circles([np.full(720, math.nan)])
+
+
+# training curves
+
+
+def test_training_curve_shows_both_losses_and_the_kept_epoch(tmp_path: Path) -> None:
+    figure = training_curve(
+        [0.5, 1.0, 1.5], [3.0, 2.0, 1.0], [(1, 2.5), (2, 2.0)], best_epoch=2, title="run", synthetic=True
+    )
+    (axes,) = figure.axes
+    train, validation, best = axes.lines
+    assert train.get_xydata().tolist() == [[0.5, 3], [1, 2], [1.5, 1]]
+    assert validation.get_xydata().tolist() == [[1, 2.5], [2, 2]]
+    assert best.get_xdata() == [2, 2]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("epoch", "loss (nats per sample)")
+    assert "run (synthetic data)" in words(figure) and "epoch 2" in words(figure)
+    assert axes.get_yscale() == "linear"
+    drawn(figure, tmp_path)
+
+
+def test_one_wild_loss_does_not_flatten_the_others(tmp_path: Path) -> None:
+    losses = [1.0] * 50 + [1e6] + [-1.0] * 50
+    figure = training_curve(
+        range(101), losses, [(100, math.nan)], best_epoch=None, title="run", synthetic=False
+    )
+    assert figure.axes[0].get_yscale() == "symlog"
+    assert len(figure.axes[0].lines) == 2
+    drawn(figure, tmp_path)
+
+
+def test_nothing_recorded_is_an_empty_training_curve(tmp_path: Path) -> None:
+    drawn(training_curve([], [], [], best_epoch=None, title="run", synthetic=False), tmp_path)
+
+
+# work-precision diagrams
+
+CURVES = {
+    "first": [Point("samples", value, 0.5 / value, 0.1 / value, 1 + 0.01 * value) for value in (1, 10, 100)],
+    "second": [Point("tolerance", 1e-3, 0.4, math.nan, 3.0), Point("tolerance", 1e-6, 0.0, 0.0, 9.0)],
+    "third": [Point("members", 4, math.inf, math.nan, 0.5)],
+}
+
+
+def lines_with(figure: Figure, **wanted) -> list[Line2D]:
+    return [
+        line
+        for line in figure.axes[0].lines
+        if all(getattr(line, f"get_{k}")() == v for k, v in wanted.items())
+    ]
+
+
+def test_the_diagram_is_logarithmic_with_units_bars_and_knob_values(tmp_path: Path) -> None:
+    figure = work_precision(CURVES, title="Diagram", synthetic=True, reference_error=0.004)
+    (axes,) = figure.axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    assert "ms per sample" in axes.get_xlabel() and "nats" in axes.get_ylabel()
+    assert len(axes.containers) == 3
+    assert axes.containers[0].lines[0].get_xydata() == pytest.approx(
+        np.array([(point.milliseconds, point.error) for point in CURVES["first"]])
+    )
+    notes = [text.get_text() for text in axes.texts if isinstance(text, Annotation)]
+    assert notes == ["1", "10", "100", "0.001", "1e-06: error 0"]
+    text = words(figure)
+    assert "first (samples)" in text and "second (tolerance)" in text
+    assert "below 0.004 nats the reference itself is uncertain" in text
+    assert "not drawn for want of a finite error and run time: 1" in text
+    assert "Diagram (synthetic data)" in text
+    drawn(figure, tmp_path)
+
+
+def test_rings_mark_the_pareto_points_of_all_methods() -> None:
+    (rings,) = lines_with(work_precision(CURVES, title="", synthetic=False), markersize=13)
+    best = [*CURVES["first"], CURVES["second"][1]]
+    assert rings.get_xdata() == pytest.approx([point.milliseconds for point in best])
+
+
+def test_everything_drawn_stands_inside_the_axes_and_bars_show_standard_errors() -> None:
+    figure = work_precision({"first": CURVES["first"]}, title="", synthetic=False, reference_error=1e-3)
+    axes = figure.axes[0]
+    (bars,) = axes.containers[0].lines[2]
+    for point, (low, high) in zip(CURVES["first"], bars.get_segments(), strict=True):
+        assert high[1] - low[1] == pytest.approx(2 * point.error_sem)
+    bottom, top = axes.get_ylim()
+    assert bottom < 1e-3 < top
+    assert bottom < min(point.error for point in CURVES["first"])
+
+
+def test_knob_values_do_not_cover_each_other() -> None:
+    crowded = [
+        Point("samples", value, 0.1 * (1 + 0.02 * value), 0.001, 1 + 0.002 * value) for value in range(1, 7)
+    ]
+    figure = work_precision({"first": crowded, "second": CURVES["first"]}, title="", synthetic=False)
+    boxes = [text.get_window_extent() for text in figure.axes[0].texts if isinstance(text, Annotation)]
+    assert len(boxes) == 9
+    assert not any(box.overlaps(other) for index, box in enumerate(boxes) for other in boxes[:index])
+
+
+@pytest.mark.parametrize(
+    "curves",
+    [
+        {},
+        {"nothing": []},
+        {"exact": [Point("members", 1, 0.0, 0.0, 1.0)]},
+        {"lost": [Point("members", 1, math.inf, math.nan, 1.0)]},
+        {"wide": [Point("samples", 10**n, 10.0**-n, 0.0, 10.0**n) for n in range(9)]},
+        {"equal": [Point("samples", n, 0.5, 0.0, 2.0) for n in range(3)]},
+    ],
+)
+def test_odd_diagrams_are_drawn(curves: dict[str, list[Point]], tmp_path: Path) -> None:
+    figure = work_precision(curves, title="odd", synthetic=False)
+    drawn(figure, tmp_path)
+    assert all(re.fullmatch(r"[\d.e+-]*", label.get_text()) for label in figure.axes[0].get_xticklabels())
+
+
+def test_a_narrow_range_of_times_still_has_ticks() -> None:
+    points = [Point("samples", n, 0.5 / n, 0.0, 1.1 + 0.01 * n) for n in (1, 2, 3)]
+    axes = work_precision({"first": points}, title="", synthetic=False).axes[0]
+    low, high = axes.get_xlim()
+    assert sum(low <= tick <= high for tick in axes.get_xticks()) >= 2
+
+
+# comparisons
+
+ROWS = [
+    {"method": method, "class": name, "error": error, "error_std": 0.5, "ms": time}
+    for method, name, error, time in [
+        ("a", "car", 5.0, 1.0),
+        ("b", "car", 4.0, 2.0),
+        ("c", "car", 6.0, 3.0),
+        ("a", "bus", 9.0, 1.0),
+        ("b", "bus", 9.5, 2.0),
+    ]
+]
+LABELS = {"x_label": "run time (ms)", "y_label": "error (°)", "title": "Comparison"}
+
+
+def test_comparison_gives_methods_colours_and_groups_markers(tmp_path: Path) -> None:
+    rows = [*ROWS, {"method": "broken", "class": "car", "error": None, "ms": 1.0}]
+    figure = comparison(rows, "error", "ms", group="class", synthetic=True, **LABELS)
+    (axes,) = figure.axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    points = [container.lines[0] for container in axes.containers]
+    assert len(points) == 5
+    assert all(container.has_yerr for container in axes.containers)
+    assert len({point.get_color() for point in points}) == 3
+    assert len({point.get_marker() for point in points}) == 2
+    assert points[0].get_color() == points[3].get_color() and points[0].get_marker() == points[1].get_marker()
+    text = words(figure)
+    for word in (
+        "a",
+        "b",
+        "c",
+        "car",
+        "bus",
+        "not beaten in its class",
+        "finite error and run time: 1",
+        "(synthetic data)",
+    ):
+        assert word in text
+    assert "broken" not in text
+    drawn(figure, tmp_path)
+
+
+def test_comparison_rings_the_front_of_each_group() -> None:
+    figure = comparison(ROWS, "error", "ms", group="class", synthetic=False, **LABELS)
+    rings = [line.get_xydata().tolist() for line in lines_with(figure, markersize=13)]
+    assert rings == [[[1, 5], [2, 4]], [[1, 9]]]
+    together = comparison(ROWS, "error", "ms", synthetic=False, **LABELS)
+    assert [line.get_xydata().tolist() for line in lines_with(together, markersize=13)] == [[[1, 5], [2, 4]]]
+
+
+def test_higher_is_better_turns_the_front_and_keeps_a_linear_axis() -> None:
+    figure = comparison(ROWS, "error", "ms", group="class", synthetic=False, better="higher", **LABELS)
+    assert figure.axes[0].get_yscale() == "linear"
+    rings = [line.get_xydata().tolist() for line in lines_with(figure, markersize=13)]
+    assert rings == [[[1, 5], [3, 6]], [[1, 9], [2, 9.5]]]
+
+
+@pytest.mark.parametrize(
+    "rows", [[], ROWS[:1], [{"method": "a", "error": -1.0, "ms": 2.0, "error_sem": math.nan}]]
+)
+def test_odd_comparisons_are_drawn(rows: list[dict], tmp_path: Path) -> None:
+    drawn(comparison(rows, "error", "ms", synthetic=False, **LABELS), tmp_path)
+
+
+def test_many_methods_and_classes_stay_apart(tmp_path: Path) -> None:
+    rows = [
+        {"method": f"method {m}", "class": f"class {c}", "error": 1.0 + m + c, "ms": 1.0 + m}
+        for m in range(9)
+        for c in range(12)
+    ]
+    figure = comparison(rows, "error", "ms", group="class", synthetic=False, **LABELS)
+    looks = {
+        (point.get_color(), point.get_markerfacecolor(), point.get_marker())
+        for point in (container.lines[0] for container in figure.axes[0].containers)
+    }
+    assert len(looks) == 9 * 12
+    drawn(figure, tmp_path)
+
+
+def test_tables_import_no_torch_costs_no_matplotlib_and_pictures_no_pyplot() -> None:
+    code = (
+        "import sys, framework.table; assert not {'torch', 'matplotlib'} & set(sys.modules)\n"
+        "import framework.cost; assert 'matplotlib' not in sys.modules\n"
+        "import framework.pictures; assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,378 @@
+"""A sweep goes on, keeps right records and can be resumed, whatever happens to its jobs or to itself."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from framework import sweep
+from framework.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# The sweep: a Hydra app as small as can be. Its jobs are another script, its hooks write down their calls.
+APP = """
+import json, os, sys, types
+from pathlib import Path
+import hydra
+from framework import sweep
+
+HERE = Path(__file__).parent
+
+def begin(folder, config):
+    with (HERE / "begun.jsonl").open("a") as file:
+        file.write(json.dumps([str(folder), config]) + "\\n")
+    return "parent-run"
+
+def summarise(folder, overrides):
+    (HERE / "summarised.json").write_text(json.dumps([str(folder), overrides]))
+
+sys.modules["framework.comparison"] = types.SimpleNamespace(begin=begin, summarise=summarise)
+sweep.COMMAND = json.loads(os.environ["JOB"])
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+def run(config):
+    from hydra.core.hydra_config import HydraConfig
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    (folder / "seen.json").write_text(json.dumps([config.what, config.x, dict(config.get("extra") or {})]))
+
+run()
+"""
+
+# A job: what it does is named on its command line.
+JOB = """
+import json, os, signal, sys, time
+from pathlib import Path
+
+given = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
+folder = Path(given["hydra.run.dir"][1:-1])
+here = Path(__file__).parent
+with (folder / "started").open("a") as file:
+    file.write("x")
+tries = len((folder / "started").read_text())
+
+def wait_for(path):
+    while not path.exists():
+        time.sleep(0.005)
+
+def fail():
+    raise ValueError("this job is bad")
+
+what = given.get("what", "ok")
+print("hello from", what)
+if what == "raise":
+    fail()
+elif what == "exit":
+    sys.exit(7)
+elif what == "kill" or what == "once" and tries == 1:
+    os.kill(os.getpid(), signal.SIGKILL)
+elif what == "environment":
+    (folder / "environment.json").write_text(json.dumps(dict(os.environ)))
+elif what == "meet":
+    (here / f"met{given['x']}").touch()
+    while len(list(here.glob("met*"))) < 2:
+        time.sleep(0.005)
+elif what == "hold":
+    def close(number, frame):
+        (folder / f"closed {signal.Signals(number).name}").touch()
+        sys.exit(128 + number)
+    signal.signal(signal.SIGINT, close)
+    signal.signal(signal.SIGTERM, close)
+    (folder / "ready").touch()
+    wait_for(here / "release")
+elif what == "stubborn":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    (folder / "ready").touch()
+    wait_for(here / "release")
+"""
+
+CONFIG = """
+defaults:
+  - extra: null
+  - experiment: null
+  - _self_
+what: ok
+x: 0
+value: 1
+experiment_name: ${hydra:runtime.choices.experiment}
+hydra:
+  output_subdir: null
+  sweep:
+    dir: sweep
+  job_logging:
+    root: {handlers: [console]}
+"""
+
+
+class App:
+    """The app above in a folder, and its sweep's folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.sweep = folder / "sweep"
+        (folder / "app.py").write_text(APP)
+        (folder / "job.py").write_text(JOB)
+        for path, text in {
+            "config.yaml": CONFIG,
+            "experiment/pooled.yaml": "# @package _global_\ndefaults:\n  - override /hydra/launcher: pool\n",
+        }.items():
+            (folder / "conf" / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "conf" / path).write_text(text)
+        shutil.copytree(ROOT / "conf" / "hydra" / "launcher", folder / "conf" / "hydra" / "launcher")
+        self.environment = {
+            **{
+                key: value
+                for key, value in os.environ.items()
+                if key not in ("OMP_NUM_THREADS", "PYTHONPATH")
+            },
+            "JOB": json.dumps([sys.executable, "-S", str(folder / "job.py")]),
+            "HYDRA_FULL_ERROR": "1",
+        }
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "app.py", *arguments],
+            cwd=self.folder,
+            env=self.environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+
+    def __call__(self, *arguments: str) -> tuple[int, str]:
+        """Exit code and output of a multirun under the pool."""
+        process = self.start("-m", "hydra/launcher=pool", *arguments)
+        output, _ = process.communicate(timeout=120)
+        return process.returncode, output
+
+    def record(self, number: int) -> dict[str, Any]:
+        return json.loads((self.sweep / str(number) / "job.json").read_text())
+
+    def tries(self, number: int) -> int:
+        return len((self.sweep / str(number) / "started").read_text())
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+    def until_ready(self, *numbers: int) -> None:
+        self.until(lambda: all((self.sweep / str(number) / "ready").exists() for number in numbers))
+
+
+@pytest.fixture
+def app(tmp_path: Path) -> App:
+    return App(tmp_path)
+
+
+def test_the_others_go_on_when_a_job_fails_or_is_killed(app: App) -> None:
+    code, output = app("what=raise,kill,ok,exit", "hydra.launcher.jobs=2")
+    assert code == 1
+    records = [app.record(number) for number in range(4)]
+    assert [record["status"] for record in records] == ["failed", "died", "completed", "failed"]
+    assert [record["error"] for record in records] == [
+        "ValueError: this job is bad",
+        "killed by SIGKILL, as the system does when memory runs out",
+        None,
+        "hello from exit",
+    ]
+    assert all(record["tries"] == 1 and record["ended"] >= record["started"] for record in records)
+    console = (app.sweep / "0" / "console.log").read_text()
+    assert console.startswith("hello from raise\nTraceback")
+    assert "in fail\n" in console
+    assert (app.sweep / "1" / "console.log").read_text() == "hello from kill\n", (
+        "printed before it was killed"
+    )
+    assert "3 of 4 jobs did not complete" in output
+    for number in (0, 1, 3):
+        assert f"({app.sweep / str(number) / 'console.log'})" in output.rpartition("did not complete")[2]
+    overrides = [[f"what={what}"] for what in ("raise", "kill", "ok", "exit")]
+    assert [record["overrides"] for record in records] == overrides
+    assert json.loads((app.folder / "summarised.json").read_text()) == [str(app.sweep), overrides]
+    [begun] = [json.loads(line) for line in (app.folder / "begun.jsonl").read_text().splitlines()]
+    assert begun[0] == str(app.sweep)
+    assert begun[1] == {"what": "raise", "x": 0, "value": 1, "experiment_name": None}
+
+
+def test_the_same_sweep_again_runs_what_did_not_complete(app: App) -> None:
+    assert app("what=ok,once,raise", "x=1")[0] == 1
+    assert [app.record(number)["status"] for number in range(3)] == ["completed", "died", "failed"]
+    code, output = app("what=ok,once", "x=1")
+    assert (code, [app.tries(number) for number in range(3)]) == (0, [1, 2, 1])
+    assert "2 jobs, 1 of them completed earlier" in output
+    assert app.record(1)["status"] == "completed"
+    assert app.record(1)["tries"] == 2
+    assert (app.sweep / "1" / "console.log").read_text() == "hello from once\n" * 2
+
+
+def test_a_sweep_can_grow_and_repeat_itself(app: App) -> None:
+    assert app("x=5,6,6")[0] == 0
+    assert app("x=4,5,6,6")[0] == 0
+    assert [app.record(number)["overrides"] for number in range(4)] == [["x=5"], ["x=6"], ["x=6"], ["x=4"]]
+    assert [app.tries(number) for number in range(4)] == [1, 1, 1, 1]
+
+
+def test_a_completed_job_whose_config_changed_runs_again(app: App) -> None:
+    assert app("x=1,2")[0] == 0
+    config = app.folder / "conf" / "config.yaml"
+    config.write_text(config.read_text().replace("value: 1", "value: 2"))
+    assert app("x=1,2")[0] == 0
+    assert [app.tries(number) for number in range(2)] == [2, 2]
+
+
+def test_a_job_that_was_killed_is_started_again_when_asked(app: App) -> None:
+    code, _ = app("what=once,kill,raise", "hydra.launcher.retries=1")
+    assert code == 1
+    assert [app.tries(number) for number in range(3)] == [2, 2, 1]
+    assert [app.record(number)["status"] for number in range(3)] == ["completed", "died", "failed"]
+
+
+def test_as_many_at_once_as_asked_for(app: App) -> None:
+    app.environment["JOB"] = json.dumps([sys.executable, "-S", str(app.folder / "job.py")])
+    assert app("what=meet", "x=1,2", "hydra.launcher.jobs=2")[0] == 0, "each waits for the other"
+    first, second = (app.record(number) for number in range(2))
+    assert first["started"] < second["ended"]
+    assert second["started"] < first["ended"]
+    assert app("x=3,4,5", "hydra.launcher.jobs=1", "hydra.sweep.dir=one")[0] == 0
+    app.sweep = app.folder / "one"
+    times = [(record["started"], record["ended"]) for record in map(app.record, range(3))]
+    assert all(ended <= started for (_, ended), (started, _) in pairwise(times))
+
+
+def test_what_a_job_is_told(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
+    cores = sweep.cores()
+    assert app("what=environment", "x=0,1,2", "hydra.launcher.jobs=1", "hydra.launcher.devices=[4,5]")[0] == 0
+    told = [json.loads((app.sweep / str(number) / "environment.json").read_text()) for number in range(3)]
+    assert {one["OMP_NUM_THREADS"] for one in told} == {str(cores)}
+    assert {one["FRAMEWORK_SWEEP_PARENT"] for one in told} == {"parent-run"}
+    assert {one["CUDA_VISIBLE_DEVICES"] for one in told} == {"4"}
+    assert not any("MLFLOW_RUN_ID" in one for one in told)
+    app.environment["OMP_NUM_THREADS"] = "3"
+    assert app("what=environment", "x=3", "hydra.launcher.jobs=1")[0] == 0
+    told = json.loads((app.sweep / "3" / "environment.json").read_text())
+    assert told["OMP_NUM_THREADS"] == "3", "what the user set stands"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_the_jobs_close_and_the_sweep_be_resumed(number: signal.Signals, app: App) -> None:
+    arguments = ["what=hold", "x=0,1,2", "hydra.launcher.jobs=2"]
+    process = app.start("-m", "hydra/launcher=pool", *arguments)
+    app.until_ready(0, 1)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, output
+    records = [app.record(job) for job in range(3)]
+    assert [record["status"] for record in records] == ["died", "died", "queued"]
+    assert [record["error"] for record in records] == [f"stopped by {number.name}"] * 2 + [None]
+    assert all((app.sweep / str(job) / f"closed {number.name}").exists() for job in (0, 1))
+    assert (app.folder / "summarised.json").exists()
+    (app.folder / "release").touch()
+    assert app(*arguments)[0] == 0
+    assert [app.record(job)["tries"] for job in range(3)] == [2, 2, 1]
+
+
+def test_ctrl_c_at_the_terminal_reaches_each_job_once(app: App) -> None:
+    # A terminal signals its whole foreground group; a job signalled twice would not wait for its batch's end.
+    process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=2")
+    app.until_ready(0, 1)
+    assert os.getsid(app.record(0)["pid"]) == app.record(0)["pid"]
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 130
+
+
+def test_a_third_signal_kills(app: App) -> None:
+    process = app.start("-m", "hydra/launcher=pool", "what=stubborn")
+    app.until_ready(0)
+    assert process.stdout is not None
+    for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM):
+        process.send_signal(number)
+        while "told to stop" not in process.stdout.readline():
+            assert process.poll() is None
+    process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert app.record(0)["error"].startswith("killed by SIGKILL")
+
+
+def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App) -> None:
+    arguments = ["what=hold,stubborn", "hydra.launcher.jobs=2"]
+    process = app.start("-m", "hydra/launcher=pool", *arguments)
+    app.until_ready(0, 1)
+    process.kill()
+    process.communicate(timeout=60)
+    if sys.platform == "linux":
+        app.until((app.sweep / "0" / "closed SIGTERM").exists)
+    again = app.start("-m", "hydra/launcher=pool", *arguments)
+    assert again.stdout is not None
+    while "#1 waits" not in again.stdout.readline():
+        assert again.poll() is None
+    assert app.tries(1) == 1, "two processes in one folder would mix their checkpoints"
+    (app.folder / "release").touch()
+    again.communicate(timeout=60)
+    assert again.returncode == 0
+    assert [app.record(job)["tries"] for job in range(2)] == [2, 2]
+
+
+def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
+    # Jobs that are Hydra apps themselves, in a folder with every awkward letter, from a second config folder;
+    # the launcher named by an experiment, the mode by the config.
+    app.environment["JOB"] = json.dumps([sys.executable, str(app.folder / "app.py")])
+    (app.folder / "more" / "extra").mkdir(parents=True)
+    (app.folder / "more" / "extra" / "deep.yaml").write_text("depth: 3\n")
+    name = "a b='c',{d}: é"
+    process = app.start(
+        "--config-dir=more",
+        "hydra.mode=MULTIRUN",
+        "experiment=pooled",
+        "what=p,q",
+        "x='quoted, text'",
+        "extra=deep",
+        f"hydra.sweep.dir='{name.replace(chr(39), chr(92) + chr(39))}'",
+        "hydra.sweep.subdir=${hydra.job.override_dirname}/${hydra.job.num}",
+    )
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, output
+    seen = sorted((app.folder / name).rglob("seen.json"))
+    assert [json.loads(path.read_text()) for path in seen] == [
+        [what, "quoted, text", {"depth": 3}] for what in ("p", "q")
+    ]
+
+
+def test_two_jobs_in_one_folder_are_refused(app: App) -> None:
+    code, output = app("x=1,2", "hydra.sweep.subdir=same")
+    assert code == 1
+    assert "ConfigError: hydra.sweep.subdir gives two jobs the folder" in output
+
+
+def test_free_folder() -> None:
+    taken = {Path("0"), Path("1"), Path("3")}
+    assert sweep.free_folder(lambda number: Path(str(number)), 0, taken) == Path("2")
+    assert sweep.free_folder(lambda number: Path(str(number)), 4, taken) == Path("4")
+    with pytest.raises(ConfigError, match="two jobs the folder 1"):
+        sweep.free_folder(lambda number: Path("1"), 4, taken)
+
+
+def test_what_a_job_leaves_for_an_optimising_sweeper(tmp_path: Path) -> None:
+    job = sweep.Job(0, [], [], tmp_path, "key", "config")
+    assert job.value() is None
+    sweep.leave_value(tmp_path, 0.25)
+    assert job.value() == 0.25
+    assert [path.name for path in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_the_launcher_costs_other_commands_nothing() -> None:
+    heavy = {"torch", "numpy", "pytorch_lightning", "mlflow", "pandas", "matplotlib", "framework.comparison"}
+    script = "import sys, hydra_plugins.framework_pool; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert not heavy & set(done.stdout.split())

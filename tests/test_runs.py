@@ -1,0 +1,243 @@
+"""Runs that end well, badly or not at all: nothing is lost, and the next run goes on from where it was."""
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.checkpoint import WholeCheckpoints
+from tests.conftest import TINY, Done, Framework, listed
+
+QUIET = [*TINY, "logger=none"]
+
+
+def status(done: Done) -> str:
+    return json.loads((done.folder / "run.json").read_text(encoding="utf-8"))["status"]
+
+
+def store_of(done: Done) -> Path:
+    """The MLflow store a run went to."""
+    uri = json.loads((done.folder / "run.json").read_text(encoding="utf-8"))["uri"]
+    return Path(uri.removeprefix("sqlite:///"))
+
+
+def stored_statuses(done: Done) -> list[str]:
+    """Status of every run in that store."""
+    with closing(sqlite3.connect(store_of(done))) as store:
+        return [status for (status,) in store.execute("select status from runs")]
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(
+    framework: Framework, whole: Done
+) -> None:
+    again = framework(*QUIET, "workers=2", folder="again")
+    other = framework(*QUIET, "seed=1", folder="other")
+    assert again.code == 0, again.out
+    assert again.losses() == whole.losses()
+    assert len(again.losses()) == 27
+    assert again.losses() != other.losses()
+    results = [json.loads((done.folder / "results.json").read_text()) for done in (again, whole)]
+    assert results[0]["log_likelihood"] == results[1]["log_likelihood"]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("at", [14, 18], ids=["mid-epoch", "last-batch"])
+def test_a_killed_run_goes_on_with_the_same_bits(
+    framework: Framework, whole: Done, tmp_path: Path, workers: int, at: int
+) -> None:
+    arguments = [
+        *QUIET,
+        f"workers={workers}",
+        "trainer.checkpoint_every_steps=4",
+        f"+data.signal_at={at}",
+        f"+data.signal_marker={tmp_path / 'marker'}",
+    ]
+    killed = framework(*arguments)
+    assert killed.code == -signal.SIGKILL
+    assert status(killed) == "RUNNING"
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert "resuming from" in resumed.out
+    assert killed.losses() == whole.losses()  # one journal holds both lives of the run
+    assert status(killed) == "FINISHED"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_saves_and_says_so(
+    framework: Framework, whole: Done, tmp_path: Path, number: int, code: int
+) -> None:
+    arguments = [
+        *QUIET,
+        "+data.signal_at=14",
+        f"+data.signal_number={int(number)}",
+        f"+data.signal_marker={tmp_path / 'm'}",
+    ]
+    stopped = framework(*arguments)
+    assert stopped.code == code, stopped.out
+    assert status(stopped) == "KILLED"
+    assert "resume=" in stopped.out
+    content = torch.load(stopped.folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert content["global_step"] == 14, "the batch in hand was finished and saved"
+    again = framework(*arguments)
+    assert again.code == 0, again.out
+    assert stopped.losses() == whole.losses()
+
+
+def test_a_nan_label_stops_before_the_weights_are_touched(framework: Framework) -> None:
+    done = framework(*TINY, "+data.bad_label=40")
+    assert done.code == 1
+    assert "The training loss became nan" in done.out
+    assert "[40]" in done.out
+    assert "Traceback" not in done.out
+    assert stored_statuses(done) == ["FAILED"]
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(
+    framework: Framework, whole: Done, tmp_path: Path
+) -> None:
+    arguments = [
+        *QUIET,
+        "trainer.checkpoint_every_steps=4",
+        "+data.signal_at=14",
+        f"+data.signal_marker={tmp_path / 'm'}",
+    ]
+    killed = framework(*arguments)
+    last = killed.folder / "checkpoints" / "last.ckpt"
+    content = bytearray(last.read_bytes())
+    content[len(content) // 2] ^= 4
+    last.write_bytes(content)
+    tested = framework("mode=test", f"checkpoint={last}", "logger=none", folder="tested")
+    assert tested.code == 1
+    assert str(last) in tested.out
+    assert "Traceback" not in tested.out
+    resumed = framework(*arguments)
+    assert resumed.code == 0, resumed.out
+    assert "previous.ckpt" in resumed.out
+    assert killed.losses() == whole.losses()
+
+
+def test_a_checkpoint_of_another_model_is_refused(framework: Framework, whole: Done, tmp_path: Path) -> None:
+    content = torch.load(whole.folder / "checkpoints" / "model.ckpt", weights_only=True)
+    content["framework"]["config"]["encoder"][0]["widths"] = [32]
+    changed = tmp_path / "changed.ckpt"
+    WholeCheckpoints().save_checkpoint(content, changed)
+    tested = framework("mode=test", f"checkpoint={changed}", "logger=none", folder="tested")
+    assert tested.code == 1
+    assert "belongs to another model" in tested.out
+    assert "(16, wanted 32)" in tested.out
+
+
+def test_a_stored_config_cannot_run_code(framework: Framework, whole: Done, tmp_path: Path) -> None:
+    content = torch.load(whole.folder / "checkpoints" / "model.ckpt", weights_only=True)
+    content["framework"]["config"]["density_head"]["_target_"] = "os.system"
+    changed = tmp_path / "changed.ckpt"
+    WholeCheckpoints().save_checkpoint(content, changed)
+    tested = framework("mode=test", f"checkpoint={changed}", "logger=none", folder="tested")
+    assert tested.code == 2
+    assert "must not be able to run code" in tested.out
+
+
+def test_test_and_predict_repeat_what_training_reported(framework: Framework, whole: Done) -> None:
+    wanted = json.loads((whole.folder / "results.json").read_text())["log_likelihood"]
+    tested = framework(
+        "mode=test", f"checkpoint={whole.folder}", "logger=none", "batch_size=16", folder="tested"
+    )
+    assert tested.code == 0, tested.out
+    assert json.loads((tested.folder / "results.json").read_text())["log_likelihood"] == wanted
+    predicted = framework("mode=predict", f"checkpoint={whole.folder}", "logger=none", folder="predicted")
+    assert predicted.code == 0, predicted.out
+    rows = (predicted.folder / "predictions.csv").read_text().splitlines()
+    assert rows[0] == "sample,needle_deg,entropy_nats"
+    assert len(rows) == 49
+
+
+def test_a_notebook_loads_a_run_without_hydra(whole: Done, stranger_site: Path) -> None:
+    code = f"""
+import sys, torch, framework
+model = framework.load({str(whole.folder)!r})
+density = model(torch.zeros(3, 2))
+print(tuple(density.batch_shape), model.training, "hydra" in sys.modules, "mlflow" in sys.modules)
+"""
+    printed = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "PYTHONPATH": str(stranger_site)},
+    )
+    assert printed.stdout.split("\n")[-2] == "(3,) False False False", printed.stdout + printed.stderr
+
+
+def test_a_run_imports_only_what_it_names(stranger_site: Path, tmp_path: Path) -> None:
+    run = f"hydra.run.dir={tmp_path / 'run'}"
+    done = listed(*QUIET, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
+    assert done.code == 0, done.out
+    plugins = {name.split(".")[1] for name in done.modules if name.startswith("plugins.")}
+    assert plugins == {"mlp", "log_likelihood", "angular_deviation"}
+    assert not {"mlflow", "numba", "trimesh", "sklearn", "kornia"} & {
+        name.split(".")[0] for name in done.modules
+    }
+
+
+def test_a_finished_run_is_in_the_store_with_all_it_needs_to_be_repeated(framework: Framework) -> None:
+    done = framework(*TINY)
+    assert done.code == 0, done.out
+    assert stored_statuses(done) == ["FINISHED"]
+    with closing(sqlite3.connect(store_of(done))) as store:
+        steps = store.execute("select count(*) from metrics where key = 'train/loss'").fetchone()[0]
+        tags = dict(store.execute("select key, value from tags").fetchall())
+        parameters = dict(store.execute("select key, value from params").fetchall())
+    assert steps == 27
+    assert tags["data.synthetic"] == "true"
+    assert tags["version.torch"] == torch.__version__
+    assert tags["overrides"].startswith("data=dial")
+    assert parameters["density_head.name"] == "wrapped_cauchy"
+
+
+def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> None:
+    first = framework(*TINY, "trainer.max_epochs=1", folder="first")
+    assert first.code == 0, first.out
+    store = sqlite3.connect(store_of(first), check_same_thread=False, isolation_level=None)
+    store.execute("begin exclusive")
+    released = threading.Timer(40, lambda: store.execute("rollback"))
+    released.start()
+    try:
+        second = framework(*TINY, folder="second")
+    finally:
+        released.join()
+        store.close()
+    assert second.code == 0, second.out
+    with closing(sqlite3.connect(store_of(first))) as found:
+        stored = found.execute(
+            "select metrics.step, metrics.value from metrics join runs using (run_uuid) "
+            "where metrics.key = 'train/loss' and runs.status = 'FINISHED' and runs.artifact_uri not like ?",
+            (f"%{json.loads((first.folder / 'run.json').read_text())['run_id']}%",),
+        ).fetchall()
+    assert dict(stored) == second.losses()
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("encoder.mlp.widths=[0]", "encoder.mlp.widths.0 = 0"),
+        ("+density_head.larges=0.5", "Did you mean 'largest'?"),
+        ("density_head.largest=1.5", "density_head.largest = 1.5"),
+        ("+trainer.max_step=3", "Did you mean 'max_steps'?"),
+    ],
+)
+def test_a_wrong_key_or_value_is_said_before_any_data_is_read(
+    framework: Framework, argument: str, message: str
+) -> None:
+    done = framework(*QUIET, argument)
+    assert done.code == 2, done.out
+    assert message in done.out
+    assert "Traceback" not in done.out
+    assert status(done) == "FAILED"

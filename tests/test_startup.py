@@ -1,0 +1,34 @@
+"""What a command does not need, it does not import; seen in fresh processes."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import listed
+
+HEAVY = {
+    "torch",
+    "pytorch_lightning",
+    "mlflow",
+    "numba",
+    "scipy",
+    "matplotlib",
+    "trimesh",
+    "sklearn",
+    "kornia",
+}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--help",), ("experiment=pascal3d/scvae", "--cfg", "job"), ("mode=plugins",)],
+    ids=["help", "cfg", "plugins"],
+)
+def test_asking_imports_nothing_heavy_and_no_plugin(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    done = listed(*arguments, folder=tmp_path)
+    assert done.code == 0, done.out
+    modules = done.modules
+    assert "framework.app" in modules
+    assert not HEAVY & {name.partition(".")[0] for name in modules}
+    assert not [name for name in modules if name.startswith("plugins.")]
+    assert list(tmp_path.iterdir()) == [], "asking leaves nothing behind"

@@ -1,0 +1,1075 @@
+"""Tracking: whatever happens to the store or to the process, each number is stored once and nobody waits."""
+
+import json
+import logging
+import math
+import os
+import shutil
+import socket
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.machinery import PathFinder
+from pathlib import Path
+
+import pytest
+import sqlalchemy
+from werkzeug.serving import make_server
+
+from framework import sender, tracking
+from framework.errors import CheckpointError, ConfigError, DataError, UserError
+from framework.journal import Journal
+from framework.run_info import RunInfo, Sidecar, default_uri, read_run_info, store_uri, without_password
+from framework.sender import Record, Sender, Store, batches
+from framework.tracking import MlflowTracker, NoTracker, mark_dead, sync
+
+
+@contextmanager
+def metadata_read_as_before() -> Iterator[None]:
+    """Undoes that importlib_metadata, which MLflow imports, takes the place of the standard library's reader.
+
+    Other tests of this process read entry points, and expect the standard library's.
+    """
+    finders, reader = list(sys.meta_path), PathFinder.__dict__["find_distributions"]
+    yield
+    sys.meta_path[:] = finders
+    PathFinder.find_distributions = reader
+
+
+with metadata_read_as_before():
+    from mlflow import MlflowClient
+
+    from framework import mlflow_store
+    from framework.mlflow_store import run_folder
+
+
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An SQLite store, which takes MLflow seconds to make."""
+    folder = tmp_path_factory.mktemp("store") / "outputs" / "run"
+    tracker = build(folder, experiment="made with the store")
+    tracker.open()
+    tracker.close("FINISHED")
+    return folder.parent / "mlflow.db"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, empty_store: Path) -> Path:
+    """A run folder to be, with a store beside it."""
+    (tmp_path / "outputs").mkdir()
+    shutil.copy(empty_store, tmp_path / "outputs" / "mlflow.db")
+    return tmp_path / "outputs" / "some experiment" / "run"
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, seconds in {"_SECONDS": 0.1, "_PAUSE": 0.02, "_FIRST_RETRY": 0.05, "_LAST_RETRY": 0.2}.items():
+        monkeypatch.setattr(sender, name, seconds)
+
+
+def build(folder: Path, run_id: str | None = None, **changes: object) -> MlflowTracker:
+    arguments = {"uri": None, "experiment": "some/experiment", "run_name": "some run", "parent": None}
+    return MlflowTracker(folder, run_id=run_id, **{**arguments, **changes})
+
+
+def client(folder: Path) -> MlflowClient:
+    return MlflowClient(default_uri(folder))
+
+
+def identity(folder: Path) -> str:
+    info = read_run_info(folder)
+    assert info is not None
+    assert info.run_id is not None
+    return info.run_id
+
+
+def history(folder: Path, key: str = "loss") -> list[tuple[int, float]]:
+    return [(point.step, point.value) for point in client(folder).get_metric_history(identity(folder), key)]
+
+
+def status(folder: Path) -> str:
+    return client(folder).get_run(identity(folder)).info.status
+
+
+def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.01)
+
+
+def losses(steps: Sequence[int]) -> list[tuple[int, float]]:
+    return [(step, step / 7) for step in steps]
+
+
+def log(tracker: MlflowTracker | NoTracker, steps: Sequence[int]) -> None:
+    for step in steps:
+        tracker.log_metrics({"loss": step / 7}, step, 0)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """The store of `folder` is held by somebody else, as by a backup."""
+    connection = sqlite3.connect(folder.parents[1] / "mlflow.db", isolation_level=None)
+    connection.execute("BEGIN EXCLUSIVE")
+    try:
+        yield
+    finally:
+        connection.execute("ROLLBACK")
+        connection.close()
+
+
+@pytest.fixture
+def short_locks() -> Iterator[None]:
+    """MLflow waits 0.1 s for a locked SQLite store, not its 20 s."""
+
+    def shorten(connection, cursor, statement, parameters, context, many):
+        return statement.replace("busy_timeout = 20000", "busy_timeout = 100"), parameters
+
+    sqlalchemy.event.listen(sqlalchemy.Engine, "before_cursor_execute", shorten, retval=True)
+    yield
+    sqlalchemy.event.remove(sqlalchemy.Engine, "before_cursor_execute", shorten)
+
+
+# What a run leaves in the store
+
+
+def test_a_run_from_open_to_close(folder: Path, tmp_path: Path) -> None:
+    tracker = build(folder, parent="0123456789abcdef0123456789abcdef")
+    assert tracker.run_id is None
+    tracker.open()
+    assert tracker.run_id == identity(folder)
+    assert status(folder) == "RUNNING"
+    tracker.log_params({"seed": 0, "head.sizes": [1, 2], "none": None})
+    tracker.set_tags({"git.commit": "abc"})
+    tracker.log_metrics({"loss": 1.5, "validation/loss": 2.5}, 10, 1)
+    tracker.log_metrics({"loss": math.nan, "rate": math.inf}, 20, 2)
+    (folder / "config.yaml").write_text("seed: 0")
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "curve.png").write_text("picture")
+    tracker.log_artifact(folder / "config.yaml")
+    tracker.log_artifact(tmp_path / "figures" / "curve.png", "pictures")
+    tracker.log_artifact(tmp_path / "figures")
+    tracker.close("FINISHED")
+
+    run = client(folder).get_run(identity(folder))
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == "some run"
+    assert run.info.end_time >= run.info.start_time
+    assert run.data.params == {"seed": "0", "head.sizes": "[1, 2]", "none": "None"}
+    assert run.data.tags["git.commit"] == "abc"
+    assert run.data.tags["mlflow.parentRunId"] == "0123456789abcdef0123456789abcdef"
+    assert run.data.metrics["validation/loss"] == 2.5
+    first, second = client(folder).get_metric_history(identity(folder), "loss")
+    assert (first.step, first.value, second.step) == (10, 1.5, 20)
+    assert math.isnan(second.value)
+    assert abs(first.timestamp / 1000 - time.time()) < 60
+    assert run.data.metrics["rate"] > 1e308  # the store has no infinity; the journal does
+    assert [line.values.get("rate") for line in tracker.journal.lines()] == [None, math.inf]
+    files = folder.parents[1] / "artifacts" / identity(folder) / "artifacts"
+    assert sorted(str(file.relative_to(files)) for file in files.rglob("*.*")) == [
+        "config.yaml",
+        "figures/curve.png",
+        "pictures/curve.png",
+    ]
+    assert client(folder).get_experiment(run.info.experiment_id).name == "some/experiment"
+    info = read_run_info(folder)
+    assert info is not None
+    assert (info.status, info.owed, info.sent) == ("FINISHED", (), tracker.journal.last)
+    assert sync(folder) == 0
+
+
+@pytest.mark.parametrize("end", ["FAILED", "KILLED"])
+def test_other_ends(folder: Path, end: str) -> None:
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, [1])
+    tracker.close(end)
+    tracker.close("FINISHED")  # too late
+    assert status(folder) == end
+    assert history(folder) == losses([1])
+
+
+def test_long_parameters_are_shortened_visibly_and_kept_whole(folder: Path) -> None:
+    tracker = build(folder)
+    tracker.open()
+    fits, long, longer = "x" * 250, "y" * 251, "z" * 10_000
+    tracker.log_params({"fits": fits, "long": long})
+    tracker.log_params({"longer": longer})
+    tracker.close("FINISHED")
+    params = client(folder).get_run(identity(folder)).data.params
+    assert params == {"fits": fits, "long": "y" * 249 + "…", "longer": "z" * 249 + "…"}
+    (artifact,) = client(folder).list_artifacts(identity(folder))
+    stored = folder.parents[1] / "artifacts" / identity(folder) / "artifacts" / artifact.path
+    assert json.loads(stored.read_text()) == {"long": long, "longer": longer}
+
+
+def test_long_parameters_on_a_full_disk_stop_nobody(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder)
+    tracker.open()
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tracking, "write_atomically", full)
+    tracker.log_params({"long": "y" * 251})
+    tracker.close("FINISHED")
+    assert client(folder).get_run(identity(folder)).data.params == {"long": "y" * 249 + "…"}
+    assert "No space left" in caplog.text
+
+
+def test_many_parameters(folder: Path) -> None:
+    params = {f"group.key{i}": i for i in range(350)}  # the store takes 100 at once
+    tracker = build(folder)
+    tracker.open()
+    tracker.log_params(params)
+    tracker.close("FINISHED")
+    assert client(folder).get_run(identity(folder)).data.params == {key: str(i) for key, i in params.items()}
+
+
+def test_names_the_store_does_not_take(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = build(folder)
+    tracker.open()
+    for step in range(3):
+        tracker.log_metrics({"deviation [°]": 1.0, "/a//../b": 2.0, "": 3.0, "n" * 300: 4.0}, step, 0)
+    tracker.log_params({"x=y": 1})
+    tracker.set_tags({"x=y": "1"})
+    tracker.close("FINISHED")
+    run = client(folder).get_run(identity(folder))
+    assert run.data.metrics == {
+        "deviation [°]".replace("[°]", "___"): 1.0,
+        "a/b": 2.0,
+        "_": 3.0,
+        "n" * 250: 4.0,
+    }
+    assert run.data.params == {"x_y": "1"}
+    assert run.data.tags["x_y"] == "1"
+    assert caplog.text.count("MLflow takes no name like") == 5  # each name once
+
+
+def test_an_entry_the_store_refuses_holds_up_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("MLFLOW_TRUNCATE_LONG_VALUES", "false")
+    tracker = build(folder)
+    tracker.open()
+    tracker.set_tags({"good": "1", "bad": "x" * 10_000})
+    log(tracker, [1, 2])
+    tracker.set_tags({"bad": "x" * 10_000})
+    tracker.close("FINISHED")
+    assert history(folder) == losses([1, 2])
+    assert client(folder).get_run(identity(folder)).data.tags["good"] == "1"
+    assert status(folder) == "FINISHED"
+    assert "MLflow refuses an entry" in caplog.text
+
+
+def test_a_file_that_is_gone_holds_up_nothing(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = build(folder)
+    tracker.open()
+    tracker.log_artifact(folder / "missing.png")
+    log(tracker, [1])
+    tracker.close("FINISHED")
+    assert status(folder) == "FINISHED"
+    assert "missing.png is gone" in caplog.text
+
+
+# Few calls, in order
+
+
+class ListStore(Store):
+    """A store that keeps what it gets; its first calls fail."""
+
+    def __init__(self, failures: int = 0) -> None:
+        self.failures = failures
+        self.identity = {"run_id": "1"}
+        self.replay_after = None
+        self.got: list[Record] = []
+        self.files: list[str] = []
+        self.calls = 0
+
+    def send(self, batch: Sequence[Record]) -> None:
+        self.calls += 1
+        if self.calls <= self.failures:
+            raise ConnectionError("away")
+        self.got.extend(batch)
+
+    def send_file(self, path: str, place: str) -> None:
+        self.files.append(path)
+
+
+def test_ten_thousand_metrics_take_few_calls(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.jsonl")
+    store = ListStore()
+    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info, running: store)
+    carrier.start()
+    for step in range(10_000):
+        journal.write({"loss": 1.0}, step, 0)
+        carrier.notice()
+    assert carrier.finish(60.0)
+    assert [record["step"] for record in store.got] == list(range(10_000))
+    assert store.calls <= 10_000 / 50
+    journal.close()
+
+
+def test_what_waited_goes_in_the_largest_batches(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.jsonl")
+    for step in range(10_000):
+        journal.write({"loss": 1.0, "rate": 2.0}, step, 0)
+    store = ListStore()
+    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    assert sender.send_all(tmp_path, journal, sidecar, lambda folder, info, running: store) == 10_000
+    assert 20 <= store.calls <= 22  # 1000 values each; a block that was read may end with fewer
+    journal.close()
+
+
+def test_a_store_that_fails_again_and_again_gets_everything_once_and_in_order(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    journal = Journal(tmp_path / "journal.jsonl")
+    store = ListStore(failures=7)
+    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info, running: store)
+    carrier.start()
+    for step in range(500):
+        journal.write({"loss": 1.0}, step, 0)
+        carrier.notice()
+    assert carrier.finish(60.0)
+    assert [record["step"] for record in store.got] == list(range(500))
+    assert caplog.text.count("cannot be reached or written (away)") == 1
+    assert caplog.text.count("is back after") == 1
+    journal.close()
+
+
+def test_batches_keep_order_and_bounds() -> None:
+    records: list[Record] = [
+        {"n": 1, "values": {"a": 1.0}},
+        {"n": 2, "params": {"b": "c"}},
+        {"n": 3, "artifact": "d"},
+    ]
+    records += [{"n": 4, "tags": {"e": "f"}}, {"n": 5, "status": "FINISHED"}, {"n": 6, "resumed_after": 1}]
+    records += [{"n": 7 + i, "values": {str(j): 1.0 for j in range(300)}} for i in range(7)]
+    records += [{"n": 14, "values": {str(j): 1.0 for j in range(1500)}}]
+    found = [[record["n"] for record in batch] for batch in batches(records)]
+    assert found == [[1, 2], [3], [4], [5], [6], [7, 8, 9], [10, 11, 12], [13], [14]]
+    assert list(batches([])) == []
+
+
+# A store that is locked, full or away
+
+
+@pytest.mark.usefixtures("short_locks")
+def test_a_store_locked_for_longer_than_mlflow_waits(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, range(100))
+    with locked(folder):
+        # One thread holds the lock and logs: it would never come to release it if logging waited.
+        log(tracker, range(100, 200))
+        until(lambda: "database is locked" in caplog.text)
+        log(tracker, range(200, 300))
+    log(tracker, range(300, 400))
+    tracker.close("FINISHED")
+    assert history(folder) == losses(range(400))
+    assert status(folder) == "FINISHED"
+    assert caplog.text.count("cannot be reached or written") == 1
+    assert "is back after" in caplog.text
+
+
+@pytest.mark.usefixtures("short_locks")
+def test_a_store_locked_at_the_start(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    uri = default_uri(folder) + "?timeout=0.1"
+    tracker = build(folder, uri=uri)
+    with locked(folder):
+        tracker.open()
+        assert tracker.run_id is None
+        assert "The run goes on" in caplog.text
+        log(tracker, range(10))
+    until(lambda: tracker.run_id is not None)
+    tracker.close("FINISHED")
+    assert history(folder) == losses(range(10))
+
+
+@pytest.mark.usefixtures("short_locks")
+def test_a_store_locked_until_after_the_end(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = build(folder, patience=0.3)
+    tracker.open()
+    with locked(folder):
+        log(tracker, range(10))
+        tracker.close("FAILED")
+        command = f"`python -m framework mode=sync mode.run='{folder}'`"
+        assert command in caplog.text  # quoted: the path has a space
+        assert str(folder / "journal.jsonl") in caplog.text
+        with pytest.raises(UserError, match=r"database is locked.*try again"):
+            sync(folder)
+    assert sync(folder) > 10
+    assert history(folder) == losses(range(10))
+    assert status(folder) == "FAILED"
+    assert sync(folder) == 0
+
+
+def test_a_full_disk_under_the_store(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    database = sqlite3.connect(default_uri(folder).removeprefix("sqlite:///"))
+    pages = database.execute("PRAGMA page_count").fetchone()[0]
+    database.close()
+
+    def nearly_full(connection, record) -> None:
+        connection.execute(f"PRAGMA max_page_count = {pages + 20}")
+
+    sqlalchemy.event.listen(sqlalchemy.Engine, "connect", nearly_full)
+    tracker = build(folder)
+    tracker.open()
+    for step in range(500):
+        tracker.log_metrics({f"metric {i}": float(step) for i in range(10)}, step, 0)
+    until(lambda: "database or disk is full" in caplog.text)
+    sqlalchemy.event.remove(sqlalchemy.Engine, "connect", nearly_full)
+    mlflow_store.SqlAlchemyStore._engine_map[default_uri(folder)].dispose()
+    tracker.close("FINISHED")
+    assert history(folder, "metric 7") == [(step, float(step)) for step in range(500)]
+
+
+def test_a_place_for_files_that_is_away_holds_up_no_number(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder)
+    tracker.open()
+    names = ["a.txt", "b.txt", "c.txt"]
+    for name in names:
+        (folder / name).write_text(name)
+    sent: list[str] = []
+    send_file = mlflow_store.MlflowStore.send_file
+    away = threading.Event()
+    away.set()
+
+    def fails(self: mlflow_store.MlflowStore, path: str, place: str) -> None:
+        if away.is_set():
+            raise PermissionError(13, "Permission denied")
+        sent.append(path)
+        send_file(self, path, place)
+
+    monkeypatch.setattr(mlflow_store.MlflowStore, "send_file", fails)
+    for step, name in enumerate(names):
+        tracker.log_artifact(folder / name)
+        log(tracker, [step])
+    until(lambda: len(history(folder)) == 3)
+    until(lambda: "Permission denied" in caplog.text)
+    info = read_run_info(folder)
+    assert info is not None
+    assert [path for path, _ in info.owed] == names
+    away.clear()
+    tracker.close("FINISHED")
+    assert sent == names
+    assert [file.path for file in client(folder).list_artifacts(identity(folder))] == names
+
+
+def test_a_run_deleted_in_the_store_goes_on_and_is_whole_when_restored(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, [1])
+    until(lambda: history(folder))
+    client(folder).delete_run(identity(folder))
+    log(tracker, [2, 3])
+    until(lambda: "must be in the 'active' state" in caplog.text)
+    client(folder).restore_run(identity(folder))
+    tracker.close("FINISHED")
+    assert history(folder) == losses([1, 2, 3])
+
+
+def test_a_deleted_experiment_is_said(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    experiment = client(folder).create_experiment("some/experiment")
+    client(folder).delete_experiment(experiment)
+    tracker = build(folder, patience=0.0)
+    tracker.open()
+    log(tracker, [1])
+    tracker.close("FINISHED")
+    assert "'some/experiment' was deleted there; restore it, or choose another name" in caplog.text
+    client(folder).restore_experiment(experiment)
+    sync(folder)
+    assert history(folder) == losses([1])
+
+
+@pytest.mark.filterwarnings("ignore:starlette.middleware.wsgi")  # of MLflow's server
+def test_a_server_away_from_start_to_end_and_then_back(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    uri = f"http://user:secret@127.0.0.1:{port}"
+    tracker = build(folder, uri=uri, patience=0.0)
+    tracker.open()
+    tracker.log_params({"seed": 3})
+    log(tracker, range(30))
+    (folder / "note.txt").write_text("a note")
+    tracker.log_artifact(folder / "note.txt")
+    tracker.close("FINISHED")
+    assert tracker.run_id is None
+    assert tracker.url == f"http://127.0.0.1:{port}"
+    with pytest.raises(UserError, match="did not take everything"):
+        sync(folder)
+    assert "secret" not in caplog.text
+
+    monkeypatch.setenv("_MLFLOW_SERVER_FILE_STORE", default_uri(folder))
+    monkeypatch.setenv("_MLFLOW_SERVER_ARTIFACT_ROOT", str(folder.parents[1] / "artifacts"))
+    monkeypatch.setenv("MLFLOW_SERVER_ENABLE_JOB_EXECUTION", "false")
+    from mlflow.server import app
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = make_server("127.0.0.1", port, app)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        assert sync(folder) == 34  # with parameters, the file and two changes of status
+        assert sync(folder) == 0
+        info = read_run_info(folder)
+        assert info is not None
+        Sidecar(folder, info).update(sent=0)  # as if the process had died before it noted down anything
+        assert sync(folder) == 34
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert history(folder) == losses(range(30))
+    run = client(folder).get_run(identity(folder))
+    assert (run.info.status, run.data.params) == ("FINISHED", {"seed": "3"})
+    assert [file.path for file in client(folder).list_artifacts(identity(folder))] == ["note.txt"]
+
+
+def test_a_store_that_does_not_answer_does_not_hold_up_the_start(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    answer = threading.Event()
+    opened = mlflow_store._opened
+
+    def hangs(info: RunInfo) -> tuple[MlflowClient, str]:
+        assert answer.wait(60)
+        return opened(info)
+
+    monkeypatch.setattr(mlflow_store, "_opened", hangs)
+    tracker = build(folder, opening_patience=0.0)
+    tracker.open()
+    assert "no answer yet" in caplog.text
+    log(tracker, range(5))
+    answer.set()
+    tracker.close("FINISHED")
+    assert history(folder) == losses(range(5))
+
+
+# A process that dies, and one that goes on
+
+
+DYING = """
+import os, signal, sys, time
+from pathlib import Path
+from framework import run_info
+from framework.tracking import MlflowTracker
+
+tracker = MlflowTracker(
+    Path(sys.argv[1]), uri=None, experiment="some/experiment", run_name="r", parent=None, run_id=None
+)
+tracker.open()
+for step in range(100):
+    tracker.log_metrics({"loss": step / 7}, step, 0)
+while tracker._sidecar.info.sent < 101:
+    time.sleep(0.01)
+
+def die(self, **changes):
+    # The store has taken a batch, and the process dies before it can note that down.
+    for step in range(150, 160):
+        tracker.journal.write({"loss": step / 7}, step, 0)
+    os.write(tracker.journal._file, b'{"n":1')
+    os.kill(os.getpid(), signal.SIGKILL)
+
+run_info.Sidecar.update = die
+for step in range(100, 150):
+    tracker.log_metrics({"loss": step / 7}, step, 0)
+time.sleep(60)
+"""
+
+
+@pytest.fixture(scope="session")
+def died(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> Path:
+    """A run folder whose process was killed at the worst moment."""
+    folder = tmp_path_factory.mktemp("died") / "outputs" / "some experiment" / "run"
+    folder.mkdir(parents=True)
+    shutil.copy(empty_store, folder.parents[1] / "mlflow.db")
+    done = subprocess.run([sys.executable, "-c", DYING, folder], timeout=120, check=False)
+    assert done.returncode == -9
+    return folder
+
+
+@pytest.fixture
+def killed(died: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    shutil.copytree(died.parents[1], tmp_path / "outputs")
+    folder = tmp_path / "outputs" / "some experiment" / "run"
+    sidecar = folder / "run.json"
+    sidecar.write_text(sidecar.read_text().replace(str(died.parents[2]), str(tmp_path)))
+    assert status(folder) == "RUNNING"
+    assert len(history(folder)) == 150
+    info = read_run_info(folder)
+    assert info is not None
+    assert info.sent == 101  # less than what the store has
+    return folder
+
+
+def test_a_killed_run_is_closed_by_others_and_lost_nothing(
+    killed: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert mark_dead(killed)
+    assert status(killed) == "KILLED"
+    assert history(killed) == losses(range(160))
+    assert "Cut off" in caplog.text
+    assert not mark_dead(killed)
+    info = read_run_info(killed)
+    assert info is not None
+    assert info.status == "KILLED"
+
+
+def test_a_killed_run_is_synced(killed: Path) -> None:
+    sync(killed)
+    assert history(killed) == losses(range(160))
+
+
+@pytest.mark.usefixtures("short_locks")
+def test_a_killed_run_whose_store_is_away_is_closed_later(
+    killed: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with locked(killed):
+        assert mark_dead(killed, "FAILED")
+    assert "did not take everything" in caplog.text
+    sync(killed)
+    assert status(killed) == "FAILED"
+
+
+@pytest.mark.parametrize("checkpoint", [0, 99, 120, 149, 155, 159])
+def test_a_killed_run_is_resumed_and_each_step_is_stored_once(killed: Path, checkpoint: int) -> None:
+    tracker = build(killed, run_id=identity(killed))
+    tracker.open()
+    assert status(killed) == "RUNNING"
+    tracker.drop_after(checkpoint)
+    log(tracker, range(checkpoint + 1, 200))
+    tracker.log_metrics({"test/loss": 1.0}, 199, 0)
+    tracker.close("FINISHED")
+    assert history(killed) == losses(range(200))
+    assert history(killed, "test/loss") == [(199, 1.0)]
+    assert status(killed) == "FINISHED"
+    assert [line.step for line in tracker.journal.lines()] == [*range(200), 199]
+
+
+def test_a_run_resumed_before_it_is_opened_and_resumed_again(killed: Path) -> None:
+    Journal(killed / "journal.jsonl").drop_after(50)
+    first = build(killed, run_id=identity(killed))
+    first.open()
+    log(first, range(51, 101))
+    first.leave_open()
+    assert status(killed) == "RUNNING"
+    second = build(killed, run_id=identity(killed))
+    second.open()
+    second.drop_after(80)
+    log(second, range(81, 180))
+    second.close("FINISHED")
+    assert history(killed) == losses(range(180))
+
+
+def test_repeating_a_step_without_a_resumption_keeps_both_numbers(folder: Path) -> None:
+    tracker = build(folder)
+    tracker.open()
+    tracker.log_metrics({"test/loss": 1.0}, 5, 0)
+    tracker.close("FINISHED")
+    again = build(folder, run_id=tracker.run_id)
+    again.open()
+    again.log_metrics({"test/loss": 2.0}, 5, 0)
+    again.close("FINISHED")
+    assert history(folder, "test/loss") == [(5, 1.0), (5, 2.0)]
+
+
+def test_what_a_power_cut_took_from_the_journal_is_not_missed(folder: Path) -> None:
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, range(50))
+    tracker.leave_open()
+    path = tracker.journal.path
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:20]))
+    again = build(folder, run_id=tracker.run_id)
+    again.open()
+    again.drop_after(10)
+    log(again, range(11, 60))
+    again.close("FINISHED")
+    assert history(folder) == losses(range(60))
+
+
+def test_changed_parameters_of_a_resumed_run_become_tags(folder: Path) -> None:
+    tracker = build(folder)
+    tracker.open()
+    tracker.log_params({"epochs": 3, "seed": 0})
+    tracker.leave_open()
+    again = build(folder, run_id=tracker.run_id)
+    again.open()
+    again.log_params({"epochs": 5, "seed": 0})
+    again.close("FINISHED")
+    run = client(folder).get_run(identity(folder))
+    assert run.data.params == {"epochs": "3", "seed": "0"}
+    assert run.data.tags["changed.epochs"] == "5"
+    assert "changed.seed" not in run.data.tags
+
+
+def test_a_creation_that_was_cut_short_is_found_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    created = mlflow_store.MlflowStore._created
+    calls = 0
+
+    def cut_short(self, info, experiment_id):
+        nonlocal calls
+        calls += 1
+        created(self, info, experiment_id)
+        raise ConnectionError("the answer was lost")
+
+    monkeypatch.setattr(mlflow_store.MlflowStore, "_created", cut_short)
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, [1])
+    tracker.close("FINISHED")
+    assert calls == 1
+    experiment = client(folder).get_experiment_by_name("some/experiment")
+    assert experiment is not None
+    assert len(client(folder).search_runs([experiment.experiment_id])) == 1
+    assert history(folder) == losses([1])
+
+
+def test_a_store_that_lost_the_run_gets_it_anew(
+    folder: Path, empty_store: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, range(5))
+    tracker.leave_open()
+    moved = f"sqlite:///{folder.parents[1] / 'other.db'}"
+    shutil.copy(empty_store, folder.parents[1] / "other.db")
+    again = build(folder, uri=moved, run_id=tracker.run_id)
+    again.open()
+    log(again, range(5, 8))
+    again.close("FINISHED")
+    assert again.run_id != tracker.run_id
+    points = MlflowClient(moved).get_metric_history(str(again.run_id), "loss")
+    assert [(point.step, point.value) for point in points] == losses(range(8))
+    assert "the run is stored there anew" in caplog.text
+
+
+def test_a_new_run_in_a_used_folder_sets_the_old_one_aside(folder: Path) -> None:
+    first = build(folder)
+    first.open()
+    log(first, range(3))
+    first.close("FAILED")
+    second = build(folder)
+    second.open()
+    log(second, range(5))
+    second.close("FINISHED")
+    assert second.run_id != first.run_id
+    assert history(folder) == losses(range(5))
+    assert len(list(Journal(folder / "journal.1.jsonl").lines())) == 3
+    old = json.loads((folder / "run.1.json").read_text())
+    assert (old["run_id"], old["status"]) == (first.run_id, "FAILED")
+    third = build(folder)
+    third.open()
+    third.close("FINISHED")
+    assert (folder / "journal.2.jsonl").exists()
+    assert third.run_id not in (first.run_id, second.run_id)
+
+
+def test_a_run_that_never_reached_its_store_goes_on_as_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+
+        def away(info: RunInfo) -> None:
+            raise ConnectionError("away")
+
+        patched.setattr(mlflow_store, "_opened", away)
+        tracker = build(folder, patience=0.0)
+        tracker.open()
+        log(tracker, range(10))
+        tracker.leave_open()
+    assert tracker.run_id is None
+    for resumed, expected in ((None, range(20)), (False, range(5))):
+        again = build(folder, resumed=resumed)
+        again.open()
+        if resumed is None:
+            again.drop_after(4)
+        log(again, range(5, 20) if resumed is None else range(5))
+        again.close("FINISHED")
+        assert history(folder) == losses(expected)
+
+
+def test_four_processes_begin_at_once_where_there_is_no_store(tmp_path: Path) -> None:
+    program = """
+import os, sys
+from pathlib import Path
+import framework.mlflow_store
+from framework.tracking import MlflowTracker, read_run_info
+
+children = []
+for number in range(4):
+    child = os.fork()
+    if child == 0:
+        folder = Path(sys.argv[1]) / str(number)
+        tracker = MlflowTracker(
+            folder, uri=None, experiment="new/experiment", run_name=str(number), parent=None, run_id=None,
+            opening_patience=300.0, patience=300.0,
+        )
+        tracker.open()
+        reached = tracker.run_id is not None and not tracker._sender._away_since
+        tracker.log_metrics({"loss": number / 7}, number, 0)
+        tracker.close("FINISHED")
+        os._exit(0 if reached and read_run_info(folder).sent == tracker.journal.last else 1)
+    children.append(child)
+sys.exit(sum(os.waitpid(child, 0)[1] != 0 for child in children))
+"""
+    outputs = tmp_path / "outputs"
+    done = subprocess.run(
+        [sys.executable, "-c", program, outputs], timeout=600, check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [history(outputs / str(number)) for number in range(4)] == [losses([n]) for n in range(4)]
+    assert Counter(status(outputs / str(number)) for number in range(4)) == {"FINISHED": 4}
+    names = {experiment.name for experiment in client(outputs / "0").search_experiments()}
+    assert names == {"new/experiment", "Default"}
+    assert not list(outputs.glob(".*partial*"))
+
+
+def test_a_store_whose_making_was_cut_short_is_made_again(
+    tmp_path: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "mlflow.db"
+    info = RunInfo(None, f"sqlite:///{path}", "e", "r", None, str(tmp_path), "key", 0.0, "RUNNING")
+
+    class Killed(BaseException):
+        pass
+
+    class CutShort:
+        def __init__(self, uri: str, artifacts: str) -> None:
+            file = Path(uri.removeprefix("sqlite:///"))
+            assert file != path
+            file.write_bytes(b"half a store")
+            raise Killed
+
+    class Whole:
+        def __init__(self, uri: str, artifacts: str) -> None:
+            file = Path(uri.removeprefix("sqlite:///"))
+            assert not file.exists()
+            shutil.copy(empty_store, file)
+            self.engine = sqlalchemy.create_engine(uri)
+
+    monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", CutShort)
+    with pytest.raises(Killed):
+        mlflow_store._opened(info)
+    assert not path.exists()
+    monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", Whole)
+    _, experiment = mlflow_store._opened(info)
+    assert MlflowClient(info.uri).get_experiment(experiment).name == "e"
+
+
+# One process to a folder
+
+
+def test_nobody_else_touches_a_living_run(folder: Path) -> None:
+    program = """
+import sys
+from pathlib import Path
+from framework import tracking
+
+for act in (
+    tracking.sync,
+    tracking.mark_dead,
+    lambda folder: tracking.NoTracker(folder).open(),
+):
+    try:
+        act(Path(sys.argv[1]))
+    except tracking.DataError as error:
+        assert "another process" in str(error), error
+    else:
+        sys.exit("it was allowed")
+"""
+    tracker = build(folder)
+    tracker.open()
+    subprocess.run([sys.executable, "-c", program, folder], check=True, timeout=120)
+    log(tracker, [1])
+    tracker.close("FINISHED")
+    assert history(folder) == losses([1])
+
+
+# Without a store
+
+
+def test_no_tracker_keeps_the_journal(tmp_path: Path) -> None:
+    tracker = NoTracker(tmp_path)
+    tracker.open()
+    tracker.log_params({"seed": 0})
+    tracker.set_tags({"a": "b"})
+    tracker.log_artifact(tmp_path / "missing")
+    log(tracker, range(5))
+    info = read_run_info(tmp_path)
+    assert info is not None
+    assert info.status == "RUNNING"
+    assert tracker.run_id is None
+    assert tracker.url == str(tmp_path / "journal.jsonl")
+    tracker.leave_open()
+    again = NoTracker(tmp_path)
+    again.open()
+    again.drop_after(2)
+    log(again, range(3, 7))
+    again.close("FINISHED")
+    assert [line.step for line in again.journal.lines()] == list(range(7))
+    info = read_run_info(tmp_path)
+    assert info is not None
+    assert info.status == "FINISHED"
+    with pytest.raises(DataError, match="logger=none"):
+        sync(tmp_path)
+    fresh = NoTracker(tmp_path)
+    fresh.open()
+    fresh.close("FINISHED")
+    assert list(fresh.journal.lines()) == []
+    assert len(list(Journal(tmp_path / "journal.1.jsonl").lines())) == 7
+
+
+def test_a_dead_run_without_a_store(tmp_path: Path) -> None:
+    tracker = NoTracker(tmp_path)
+    tracker.open()
+    tracker.journal.close()
+    assert mark_dead(tmp_path)
+    info = read_run_info(tmp_path)
+    assert info is not None
+    assert info.status == "KILLED"
+    assert not mark_dead(tmp_path / "nothing here")
+
+
+# Addresses and run.json
+
+
+@pytest.mark.parametrize(
+    ("uri", "expected"),
+    [
+        ("sqlite:////abs/mlflow.db", "sqlite:////abs/mlflow.db"),
+        ("sqlite:////abs/mlflow.db?timeout=1", "sqlite:////abs/mlflow.db?timeout=1"),
+        ("http://host:5000", "http://host:5000"),
+        ("https://host", "https://host"),
+        ("postgresql+psycopg2://user@host/db", "postgresql+psycopg2://user@host/db"),
+        ("databricks", "databricks"),
+    ],
+)
+def test_addresses(uri: str, expected: str) -> None:
+    assert store_uri(uri) == expected
+
+
+def test_relative_addresses_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert store_uri("sqlite:///a/b.db?timeout=1") == f"sqlite:///{tmp_path}/a/b.db?timeout=1"
+    assert default_uri(Path("outputs/a/b")) == f"sqlite:///{tmp_path}/outputs/mlflow.db"
+    assert default_uri(Path("elsewhere/run")) == f"sqlite:///{tmp_path}/elsewhere/mlflow.db"
+
+
+@pytest.mark.parametrize(
+    "uri", ["file:///tmp/mlruns", "./mlruns", "sqlite:///", "sqlite:///:memory:", "http://", "ftp://a"]
+)
+def test_addresses_that_keep_nothing_are_refused(uri: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"logger\.uri="):
+        build(tmp_path, uri=uri)
+
+
+def test_what_to_type_to_see_a_run(folder: Path) -> None:
+    tracker = build(folder)
+    assert tracker.url == f"mlflow ui --backend-store-uri {default_uri(folder)}"
+    remote = build(folder, uri="https://me:pass@host:5000/", run_id="12")
+    remote._wanted = replace(remote._wanted, experiment_id="7")
+    assert remote.url == "https://host:5000/#/experiments/7/runs/12"
+    assert without_password("postgresql://me:p@db/x") == "postgresql://db/x"
+
+
+def test_damaged_run_json_is_said(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(DataError, match=r"run\.json is damaged"):
+        read_run_info(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(DataError, match=r"run\.json is damaged"):
+        NoTracker(tmp_path).open()
+    assert read_run_info(tmp_path / "missing") is None
+
+
+def test_run_json_of_a_later_version_can_be_read(tmp_path: Path) -> None:
+    info = RunInfo("1", "sqlite:///x", "e", "r", None, None, "key", 0.5, "RUNNING", owed=(("a", "b"),))
+    Sidecar(tmp_path, info).update(sent=4)
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "new": 1}))
+    assert read_run_info(tmp_path) == replace(info, sent=4)
+
+
+def test_run_json_that_cannot_be_written_stops_nobody(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder)
+    tracker.open()
+
+    def full(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("framework.run_info.write_atomically", full)
+    log(tracker, range(5))
+    tracker.close("FINISHED")
+    assert history(folder) == losses(range(5))
+    assert "run.json could not be written" in caplog.text
+
+
+# Finding a run again
+
+
+def test_the_folder_of_a_run_or_a_copy_of_its_checkpoints(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    tracker = build(folder)
+    tracker.open()
+    (folder / "model.ckpt").write_text("weights")
+    tracker.log_artifact(folder / "model.ckpt", "checkpoints")
+    tracker.close("FINISHED")
+    run_id = str(tracker.run_id)
+    assert run_folder(run_id) == folder
+    shutil.move(folder, tmp_path / "moved")
+    assert (run_folder(run_id) / "checkpoints" / "model.ckpt").read_text() == "weights"
+    with pytest.raises(CheckpointError, match="cannot be had from"):
+        run_folder("0" * 32)
+    with pytest.raises(CheckpointError, match="There is no tracking store"):
+        run_folder(run_id, "sqlite:///missing.db")
+    assert not (tmp_path / "missing.db").exists()
+
+
+def test_a_run_without_checkpoints_is_said(folder: Path) -> None:
+    tracker = build(folder)
+    tracker.open()
+    tracker.close("FINISHED")
+    shutil.rmtree(folder)
+    with pytest.raises(CheckpointError, match="has no checkpoints"):
+        run_folder(str(tracker.run_id), default_uri(folder))
+
+
+# What it costs who does not use it
+
+
+def test_nothing_heavy_is_imported_before_a_store_is_opened() -> None:
+    program = (
+        "import sys, framework.journal, framework.tracking, framework.provenance\n"
+        "assert not {'mlflow', 'torch', 'pytorch_lightning', 'sqlalchemy', 'numpy'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_mlflow_reports_to_nobody() -> None:
+    assert os.environ["MLFLOW_DISABLE_TELEMETRY"] == "true"
