@@ -14,4 +14,6 @@ def machine(*packages: str) -> str:
         names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         processor = f"{names[0].partition(':')[2].strip()}, {len(names)} cores" if names else processor
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
-    return f"{processor}; {datetime.date.today().isoformat()}; Python {platform.python_version()}, {versions}."
+    return (
+        f"{processor}; {datetime.date.today().isoformat()}; Python {platform.python_version()}, {versions}."
+    )

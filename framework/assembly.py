@@ -47,9 +47,7 @@ def build_data(resolved: Resolved) -> Data:
     return build("data", resolved["data"])
 
 
-def build_predictor(
-    resolved: Resolved, target: Target, input_shape: tuple[int, ...], seed: int
-) -> Predictor:
+def build_predictor(resolved: Resolved, target: Target, input_shape: tuple[int, ...], seed: int) -> Predictor:
     """The untrained predictor; its initial weights are a function of `seed` and the config."""
     torch.manual_seed(seed)
 
@@ -68,7 +66,9 @@ def build_predictor(
     return factory()
 
 
-def _wrapped(part: Mapping[str, Any], inner: Callable[[], Predictor], target: Target) -> Callable[[], Predictor]:
+def _wrapped(
+    part: Mapping[str, Any], inner: Callable[[], Predictor], target: Target
+) -> Callable[[], Predictor]:
     return lambda: build("uncertainty", part, model=inner, target=target)
 
 

@@ -137,7 +137,7 @@ class Batches(pl.LightningDataModule):
             batch_size=self.batch_size,
             num_workers=self.workers,
             collate_fn=as_batch,
-            generator=torch.Generator(),
+            generator=self._generator(),
         )
 
     def _loader(self, dataset: Dataset[Batch], **order: Any) -> DataLoader[Batch]:
@@ -156,8 +156,12 @@ class Batches(pl.LightningDataModule):
             persistent_workers=self.workers > 0,
             collate_fn=as_batch,
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
-            generator=torch.Generator(),  # else each epoch's start draws from the global one
+            generator=self._generator(),
         )
+
+    def _generator(self) -> torch.Generator:
+        """For the workers' seeds, which a DataLoader else draws from the global generator at each start."""
+        return torch.Generator().manual_seed(self.seed)
 
     def _position(self, batches: int) -> Position:
         """Where training is, from the counters Lightning keeps in a checkpoint.

@@ -17,9 +17,9 @@ class Camera:
     A world point X is seen at pixel (fx x/z + cx, fy y/z + cy), where (x, y, z) = rotation @ X + translation.
 
     Attributes:
-        rotation: world to camera.
+        rotation: world to camera, determinant +1.
         translation: metres.
-        focal: (fx, fy), pixels.
+        focal: (fx, fy), pixels, > 0.
         principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2).
         height, width: image size, pixels.
         near: nothing nearer than this is seen, metres, > 0.
@@ -35,7 +35,12 @@ class Camera:
 
 
 def look_from(
-    azimuth: float, elevation: float, tilt: float, distance: float, field_of_view: float, size: tuple[int, int]
+    azimuth: float,
+    elevation: float,
+    tilt: float,
+    distance: float,
+    field_of_view: float,
+    size: tuple[int, int],
 ) -> Camera:
     """A camera at `distance` (metres) from the origin that looks at it, z up, angles in radians.
 

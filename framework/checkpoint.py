@@ -93,10 +93,9 @@ def read(path: Path) -> dict[str, Any]:
         try:
             return torch.load(file, weights_only=True, map_location="cpu")
         except UnpicklingError:
-            names = ", ".join(get_unsafe_globals_in_checkpoint(path))
             raise CheckpointError(
-                f"The checkpoint {path} holds more than dicts, lists, numbers, strings and tensors: {names}, "
-                "which could run code. This framework did not write it: do not use it."
+                f"The checkpoint {path} holds more than dicts, lists, numbers, strings and tensors, which "
+                "could run code. This framework did not write it: do not use it."
             ) from None
 
 
@@ -204,6 +203,8 @@ def _bytes_needed(checkpoint: object) -> int:
         needed += 10
         if not isinstance(item, Tensor | Mapping | list | tuple | set | str | bytes):
             continue
+        if isinstance(item, Tensor) and item.layout is not torch.strided:
+            continue  # has no storage of its own to ask; a disk that fills up is met when it does
         identity = item.untyped_storage().data_ptr() if isinstance(item, Tensor) else id(item)
         if identity in seen:
             needed += 128

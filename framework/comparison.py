@@ -7,10 +7,9 @@ from typing import Any
 
 from rich.console import Console
 
+from framework.report import COST_COLUMNS
 from framework.table import aggregate, csv, results_table
 from framework.tracking import MlflowTracker
-
-COST = {"milliseconds_per_sample": "ms / sample", "parameters": "parameters"}
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
@@ -22,7 +21,9 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
     tracker.open()
     tracker.set_tags({"mode": "sweep", "folder": str(folder)})
     run_id = tracker.run_id
-    (folder / "parent.json").write_text(json.dumps({"run_id": run_id, "logger": dict(logger)}), encoding="utf-8")
+    (folder / "parent.json").write_text(
+        json.dumps({"run_id": run_id, "logger": dict(logger)}), encoding="utf-8"
+    )
     tracker.leave_open()
     return run_id
 
@@ -34,11 +35,11 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     files: list[Path] = []
     if rows:
         keys = _varied(overrides)
-        by = ["method", *(key for key in keys if key not in ("seed", "experiment"))]
-        columns = {"method": "method", **{key: key.rpartition(".")[2] for key in by[1:]}}
-        columns |= rows[0]["columns"] | COST
+        by = ["method", "data", *(key for key in keys if key not in ("seed", "experiment", "data.category"))]
+        columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
         compared = aggregate(rows, by=by, over="seed")
-        console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}"))
+        better = rows[0]["better"]
+        console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
         csv(compared, columns, folder / "comparison.csv")
         files.append(folder / "comparison.csv")
         files.extend(_picture(compared, by, folder))

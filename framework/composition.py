@@ -66,7 +66,9 @@ def plain(config: DictConfig) -> dict[str, Any]:
     assert isinstance(values, dict)
     for group in PLURAL:
         chosen = values.get(group) or {}
-        values[group] = {key: part for key, part in chosen.items() if isinstance(part, Mapping) and "name" in part}
+        values[group] = {
+            key: part for key, part in chosen.items() if isinstance(part, Mapping) and "name" in part
+        }
     return {str(key): value for key, value in values.items()}
 
 

@@ -11,6 +11,10 @@ from framework.circular import circular_median, grid
 from framework.errors import UserError
 
 
+CHUNK = 2**20
+"""Component densities evaluated at once without gradient, when one density is asked at many points."""
+
+
 class Mixture(Distribution):
     """Σ_k w_k p_k: every wrapper and mixture head returns this; parameters are never averaged.
 
@@ -40,17 +44,26 @@ class Mixture(Distribution):
         return self.components.support
 
     def log_prob(self, value: Tensor) -> Tensor:
+        extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
+        rows = max(1, CHUNK // max(1, self.log_weights.numel()))
+        if extra > 0 and value.shape[0] > rows and not torch.is_grad_enabled():
+            # a grid of angles on many samples of many components would fill the memory
+            return torch.cat([self.log_prob(part) for part in value.split(rows)])
         spread = value.unsqueeze(-1 - len(self.event_shape))
         return torch.logsumexp(self.log_weights + self.components.log_prob(spread), -1)
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape)
-        drawn = self.components.sample(shape)  # (*sample, *batch, K, *event)
-        which = torch.distributions.Categorical(logits=self.log_weights, validate_args=False).sample(shape)
-        index = which.reshape(*which.shape, 1, *(1,) * len(self.event_shape))
-        axis = which.dim()
-        return drawn.gather(axis, index.expand(*which.shape, 1, *self.event_shape)).squeeze(axis)
+        which = self._which(shape)
+        return pick(self.components, which).sample()
+
+    def _which(self, shape: torch.Size) -> Tensor:
+        whole = shape + self.batch_shape
+        if whole.numel() == 0:  # torch.multinomial refuses to draw nothing
+            return torch.zeros(whole, dtype=torch.int64, device=self.log_weights.device)
+        weights = self.log_weights.exp().reshape(-1, self.log_weights.shape[-1])
+        return torch.multinomial(weights, shape.numel(), replacement=True).T.reshape(whole)
 
     @property
     def mode(self) -> Tensor:
@@ -86,6 +99,51 @@ circular = _Circular()
 
 
 @singledispatch
+def pick(density: Distribution, index: Tensor) -> Distribution:
+    """Of a density with batch_shape (*batch, K) the one at `index` (*sample, *batch) of the last batch dimension.
+
+    A density with parameters registers its own, which gathers them: `@pick.register`. Without it everything is drawn
+    and all but one of K draws thrown away.
+    """
+    return _Picked(density, index)
+
+
+class _Picked(Distribution):
+    """Samples of one component each, by drawing all."""
+
+    arg_constraints = {}
+
+    def __init__(self, density: Distribution, index: Tensor) -> None:
+        self.density = density
+        self.index = index
+        super().__init__(index.shape, density.event_shape, validate_args=False)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        lead = self.index.shape[: self.index.dim() - len(self.density.batch_shape) + 1]
+        drawn = self.density.sample(torch.Size(sample_shape) + lead)  # (*sample, *lead, *batch, K, *event)
+        index = self.index.expand((*sample_shape, *self.index.shape))
+        axis = index.dim()
+        index = index.reshape(*index.shape, 1, *(1,) * len(self.event_shape))
+        return drawn.gather(axis, index.expand((*index.shape[: axis + 1], *self.event_shape))).squeeze(axis)
+
+
+@pick.register
+def _(density: Independent, index: Tensor) -> Distribution:
+    base = density.base_dist
+    if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
+        return _Picked(density, index)
+    loc, scale = (take(parameter, index) for parameter in (base.loc, base.scale))
+    return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+
+def take(parameter: Tensor, index: Tensor) -> Tensor:
+    """`parameter` (*batch, K, number) at `index` (*sample, *batch) of K: (*sample, *batch, number)."""
+    lead = index.shape[: index.dim() - parameter.dim() + 2]
+    wide = parameter.expand((*lead, *parameter.shape))
+    return wide.gather(-2, index[..., None, None].expand(*index.shape, 1, parameter.shape[-1])).squeeze(-2)
+
+
+@singledispatch
 def marginal(density: Distribution, index: int) -> Distribution:
     """The density of number `index` of the target alone; keeps an event dimension of one.
 
@@ -109,6 +167,8 @@ def _(density: Mixture, index: int) -> Distribution:
 
 @marginal.register
 def _(density: Independent, index: int) -> Distribution:
+    if density.event_shape == (1,) and index == 0:
+        return density
     if not isinstance(density.base_dist, Normal):
         raise UserError(f"No marginal is known for Independent({type(density.base_dist).__name__}).")
     here = slice(index, index + 1)
@@ -128,20 +188,26 @@ def median(density: Distribution, samples: int) -> Tensor:
     return drawn.median(0).values
 
 
-def circular_grid(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
+def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Tensor]:
     """Angles (points,) in [-π, π) and the log-density there (points, *batch) of a density of one angle.
 
-    Each value is averaged over nothing: a density narrower than the grid (concentration above points²/40) may fall
-    between two points; use more points for those.
+    A density narrower than the grid (concentration above points²/40) may fall between two points; use more points
+    for those.
     """
     if tuple(density.event_shape) != (1,):
-        raise ValueError(f"wanted the density of one angle, got event_shape {tuple(density.event_shape)}; use marginal().")
-    angles = grid(points)
-    value = angles.reshape(points, *(1,) * len(density.batch_shape), 1).expand(points, *density.batch_shape, 1)
+        raise ValueError(
+            f"wanted the density of one angle, got event_shape {tuple(density.event_shape)}; use marginal()."
+        )
+    # a sample of nothing tells the density's dtype and device
+    like = density.sample(torch.Size((0,)))
+    angles = grid(points, dtype=like.dtype, device=like.device)
+    value = angles.reshape(points, *(1,) * len(density.batch_shape), 1).expand(
+        points, *density.batch_shape, 1
+    )
     return angles, density.log_prob(value)
 
 
-def circular_entropy(density: Distribution, points: int = 4096) -> Tensor:
+def circular_entropy(density: Distribution, points: int = 720) -> Tensor:
     """Entropy of a density of one angle, nats, by the trapezium rule (spectrally exact for smooth densities)."""
     _, log_density = circular_grid(density, points)
     mass = log_density.exp() * (2 * math.pi / points)

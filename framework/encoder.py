@@ -29,4 +29,4 @@ class Encoder(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
-        """Features of shape (batch, *output_shape); float32 unless `inputs` are float64. The batch may be empty."""
+        """Features of shape (batch, *output_shape), of the parameters' dtype. The batch may be empty."""

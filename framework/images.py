@@ -59,7 +59,8 @@ class Crop:
         """
         with opened(self.file) as raw:
             image = _plain(raw, self.channels, upright=self.upright)
-        pixels = square(image, self.box or (0.0, 0.0, *image.size), self.margin, self.side)
+        whole = (0.0, 0.0, float(image.width), float(image.height))
+        pixels = square(image, self.box or whole, self.margin, self.side)
         if pixels is None:
             raise self._outside(image.size)
         return torch.from_numpy(pixels)
@@ -141,12 +142,15 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
     start_x, start_y = max(0.0, x - half - first_x), max(0.0, y - half - first_y)
     window = (start_x, start_y, min(cut.width, start_x + 2 * half), min(cut.height, start_y + 2 * half))
     result = np.asarray(cut.resize((side, side), Image.Resampling.BILINEAR, box=window))
-    return np.ascontiguousarray(np.atleast_3d(result).transpose(2, 0, 1))
+    return np.array(np.atleast_3d(result).transpose(2, 0, 1), order="C")
 
 
 def clipped(box: Box, size: tuple[int, int]) -> Box | None:
-    """The part of a box within an image of (width, height); None: there is none, or a number is NaN."""
-    left, top, right, bottom = max(0.0, box[0]), max(0.0, box[1]), min(size[0], box[2]), min(size[1], box[3])
+    """The part of a box within an image of (width, height); None: there is none, or it is not finite."""
+    if not all(map(math.isfinite, box)):
+        return None
+    width, height = map(float, size)
+    left, top, right, bottom = max(0.0, box[0]), max(0.0, box[1]), min(width, box[2]), min(height, box[3])
     return (left, top, right, bottom) if left < right and top < bottom else None
 
 
@@ -241,8 +245,8 @@ def augmented(
     """Images varied at random, values 0…1, on their device.
 
     Those `mirrored` names are reflected left to right. Every image is shifted and scaled by up to `jitter` of
-    its side (linear interpolation, border pixels repeated), and its contrast and brightness are changed by
-    up to twice `jitter`. Random numbers come from torch's global CPU generator.
+    its side (linear interpolation, border pixels repeated), made brighter or darker by up to `jitter`, and
+    its contrast changed by up to twice that. Random numbers come from torch's global CPU generator.
     """
     batch, _, height, width = images.shape
     amount = (2 * torch.rand(5, batch) - 1) * jitter
@@ -255,7 +259,7 @@ def augmented(
     image = _interpolated(image.transpose(2, 3), rows)
 
     full = 1.0 if images.is_floating_point() else 255.0
-    contrast, brightness = (2 * amount[3]).exp(), 2 * amount[4]
+    contrast, brightness = (2 * amount[3]).exp(), amount[4]
     gain, offset = contrast / full, 0.5 - 0.5 * contrast + brightness
     return image.mul_(gain.view(-1, 1, 1, 1).to(image)).add_(offset.view(-1, 1, 1, 1).to(image)).clamp_(0, 1)
 

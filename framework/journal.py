@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -68,14 +69,12 @@ class Journal:
         with self._lock:
             self.open()
             self.last += 1
-            line = {"n": self.last, "time": round(time.time(), 3), "step": int(step), "epoch": int(epoch)}
-            numbers = {name: float(value) for name, value in values.items()}
-            try:
-                text = _encode({**line, "values": numbers})
-            except ValueError:  # JSON knows no NaN and no infinity
-                names = {name: _name_if_not_finite(value) for name, value in numbers.items()}
-                text = _encode({**line, "values": names})
-            self._put(text)
+            # By hand, as it stands in the training loop: half the time of the JSON encoder.
+            pairs = ",".join([f"{_quoted(name)}:{_number_or_name(value)}" for name, value in values.items()])
+            self._put(
+                f'{{"n":{self.last},"time":{time.time():.3f},"step":{int(step)},"epoch":{int(epoch)},'
+                f'"values":{{{pairs}}}}}'
+            )
 
     def append(self, **record: Any) -> None:
         """Append a line that holds something else than metrics: plain JSON values.
@@ -367,5 +366,12 @@ def _record(line: bytes) -> dict[str, Any] | None:
     return record if isinstance(record, dict) and isinstance(record.get("n"), int) else None
 
 
-def _name_if_not_finite(value: float) -> float | str:
-    return value if value - value == 0 else str(value)
+@cache
+def _quoted(name: str) -> str:
+    return json.dumps(name)
+
+
+def _number_or_name(value: float) -> str:
+    number = float(value)
+    # JSON knows no NaN and no infinity.
+    return repr(number) if number - number == 0 else f'"{number}"'

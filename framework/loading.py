@@ -45,7 +45,9 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     return load_with_description(run_or_checkpoint, uri=uri)[0]
 
 
-def load_with_description(run_or_checkpoint: str | Path, *, uri: str | None = None) -> tuple[Predictor, dict[str, Any]]:
+def load_with_description(
+    run_or_checkpoint: str | Path, *, uri: str | None = None
+) -> tuple[Predictor, dict[str, Any]]:
     """As `load`, with what the checkpoint says of itself (`description`)."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
@@ -56,6 +58,9 @@ def load_with_description(run_or_checkpoint: str | Path, *, uri: str | None = No
             "Give a run folder, or a checkpoint from its checkpoints/."
         )
     resolved = checked(described["config"])
+    for part in resolved["encoder"]:
+        # The checkpoint holds the weights now; the file they were started from may be gone.
+        part.update({"weights": None} if "weights" in part else {})
     target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
     predictor = build_predictor(resolved, target, tuple(described["input_shape"]), seed=0)
     fill(predictor, weights(content), str(path))

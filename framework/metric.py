@@ -1,7 +1,7 @@
 """The contract of a metric: predictions in, named numbers out."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torchmetrics
 from torch import Tensor
@@ -13,7 +13,8 @@ class Metric(torchmetrics.Metric, ABC):
     """A torchmetrics.Metric that reads predictions.
 
     `full_state_update` is False. States are sums and counts (`dist_reduce_fx="sum"`), or lists of per-sample numbers
-    ("cat") where a sum does not suffice, as for a median; never angles, which do not add. Sums are float64.
+    ("cat") where a sum does not suffice, as for a median, or have a merging function of their own (a stable variance);
+    never angles, which do not add. Sums are float64.
 
     A constructor's keyword-only parameters are the config; it may ask for `target: Target` before `*`. It costs
     nothing when it is not asked for: whatever several metrics share (the log-likelihood, the point prediction) lives
@@ -27,6 +28,9 @@ class Metric(torchmetrics.Metric, ABC):
     columns: ClassVar[dict[str, str]]
     """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
     A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own."""
+
+    better: ClassVar[dict[str, Literal["higher", "lower"]]]
+    """Which way a column is better, for those of `columns` that have a better way."""
 
     @abstractmethod
     def update(self, prediction: Prediction) -> None:

@@ -43,25 +43,24 @@ class MlflowStore(Store):
 
     Args:
         folder: of the run.
-        info: of the run; its id is looked for first, then its key.
-        running: the run's process is alive: its status becomes RUNNING.
+        info: of the run; its id is looked for first, then its key. If it says RUNNING, MLflow does so too.
 
     Raises:
         Exception: whatever MLflow, SQLAlchemy or the network raise when the store is locked, full or away.
     """
 
-    def __init__(self, folder: Path, info: RunInfo, running: bool) -> None:
+    def __init__(self, folder: Path, info: RunInfo) -> None:
         self._folder = folder
         self._client, experiment_id = _opened(info)
         run = self._found(info, experiment_id)
-        self.replay_after = info.replay_after
+        self.replay = {"replay_after": info.replay_after, "replay_until": info.replay_until}
         sent, owed = info.sent, info.owed
         if run is None:
             run = self._created(info, experiment_id)
-            sent, owed, self.replay_after = 0, (), None
+            sent, owed, self.replay = 0, (), {"replay_after": None, "replay_until": {}}
         elif run.info.lifecycle_stage == "deleted":
             raise RuntimeError(f"run {run.info.run_id} was deleted there; restore it in MLflow")
-        elif running:
+        elif info.status == "RUNNING":
             self._client.update_run(run.info.run_id, status="RUNNING")
             self._client.set_tag(run.info.run_id, _FOLDER, str(folder))  # it may have been moved
         self.identity = {
@@ -69,13 +68,12 @@ class MlflowStore(Store):
             "experiment_id": run.info.experiment_id,
             "sent": sent,
             "owed": owed,
-            "replay_after": self.replay_after,
+            **self.replay,
         }
         self._run_id: str = run.info.run_id
         self._params: dict[str, str] = dict(run.data.params)
         # The last step of each metric; RunData itself gives the values alone.
         self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
-        self._until = dict(self._stored)  # what a run resumed from replay_after has not to send again
         self._renamed: set[str] = set()
 
     def send(self, batch: Sequence[Record]) -> None:
@@ -87,7 +85,7 @@ class MlflowStore(Store):
             else:
                 self._client.set_terminated(self._run_id, status, end)
         elif "resumed_after" in batch[0]:
-            self.replay_after, self._until = batch[0]["resumed_after"], dict(self._stored)
+            self.replay = {"replay_after": batch[0]["resumed_after"], "replay_until": dict(self._stored)}
         else:
             metrics = [metric for record in batch for metric in self._metrics(record)]
             params, tags = self._params_and_tags(batch)
@@ -128,11 +126,10 @@ class MlflowStore(Store):
         return self._client.create_run(experiment_id, int(info.started * 1000), tags, info.run_name)
 
     def _metrics(self, record: Record) -> Iterator[Metric]:
-        step = record.get("step", 0)
+        after, until = self.replay["replay_after"], self.replay["replay_until"]
         for name, value in record.get("values", {}).items():
-            key = self._name(name)
-            replayed = self.replay_after is not None and step > self.replay_after
-            if not (replayed and step <= self._until.get(key, self.replay_after)):
+            key, step = self._name(name), record["step"]
+            if after is None or not after < step <= until.get(key, after):
                 yield Metric(key, float(value), round(record["time"] * 1000), step)
 
     def _params_and_tags(self, batch: Sequence[Record]) -> tuple[list[Param], list[RunTag]]:
@@ -233,6 +230,8 @@ def _make_database(path: Path, info: RunInfo) -> None:
         leftover.unlink(missing_ok=True)
     SqlAlchemyStore(f"sqlite:///{partial}", info.artifacts).engine.dispose()
     partial.replace(path)
+    # MLflow keeps its connections by address: they may lead to a deleted file that was there before.
+    SqlAlchemyStore(info.uri, info.artifacts).engine.dispose()
 
 
 def _experiment(client: MlflowClient, info: RunInfo) -> str:

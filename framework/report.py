@@ -13,7 +13,7 @@ from rich.console import Console
 
 from framework.batches import Batches
 from framework.circular import angular_distance
-from framework.cost import Cost
+from framework.cost import COLUMNS, Cost
 from framework.data import Batch, Data
 from framework.density import circular_entropy, circular_grid
 from framework.evaluation import Evaluation, cost, evaluate, on_device
@@ -21,13 +21,14 @@ from framework.metric import Metric
 from framework.model import Predictor
 from framework.prediction import Prediction
 from framework.run import Run
-from framework.table import results_table
+from framework.table import Better, results_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COST_COLUMNS = {"milliseconds_per_sample": "ms / sample", "parameters": "parameters"}
-PICTURED = 400
+COST_COLUMNS = {key: COLUMNS[key] for key in ("milliseconds_per_sample", "flops_per_sample", "parameters")}
+COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
+PICTURED = 128
 """How many test samples the gallery of predicted densities is chosen from."""
 
 
@@ -54,7 +55,8 @@ def report_test(
     )
     spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
-    results = _results(run, data, found, spent, columns)
+    better: Better = {key: way for metric in metrics for key, way in metric.better.items()} | COST_BETTER
+    results = _results(run, data, found, spent, columns, better)
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
     run.results.update(results)
@@ -63,22 +65,30 @@ def report_test(
     for name, numbers in found.groups.items():
         run.tracker.log_metrics({f"test/{name}/{key}": value for key, value in numbers.items()}, step, 0)
     run.tracker.log_metrics(
-        {f"cost/{key}": float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)},
+        {
+            f"cost/{key}": float(value)
+            for key, value in asdict(spent).items()
+            if isinstance(value, int | float)
+        },
         step,
         0,
     )
     run.tracker.log_artifact(path)
     if data.target.kind == "angle":
         picture(run, gallery(predictor, data, batches, device, settings.samples), "predicted_densities.png")
-    rows = [results, *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items())]
-    better: dict[str, Any] = {}
+    rows = [
+        results,
+        *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
+    ]
     title = f"{results['experiment']} on {results['data']}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
-    console.print(results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better))
+    console.print(
+        results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
+    )
     _next_steps(run, spent, console)
 
 
 def _results(
-    run: Run, data: Data, found: Evaluation, spent: Cost, columns: dict[str, str]
+    run: Run, data: Data, found: Evaluation, spent: Cost, columns: dict[str, str], better: Better
 ) -> dict[str, Any]:
     values = run.values
     head = values.get("density_head") or {}
@@ -92,16 +102,19 @@ def _results(
         "seed": run.settings.seed,
         "synthetic": data.synthetic,
         **{key: _plain(value) for key, value in found.total.items()},
-        "groups": {name: {k: _plain(v) for k, v in numbers.items()} for name, numbers in found.groups.items()},
+        "groups": {
+            name: {k: _plain(v) for k, v in numbers.items()} for name, numbers in found.groups.items()
+        },
         **{key: _plain(value) for key, value in asdict(spent).items()},
         "columns": columns,
+        "better": better,
         "folder": str(run.folder),
     }
 
 
 def _plain(value: Any) -> Any:
     """JSON has no NaN: a number that could not be had is null, which tables print as "not available"."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def report_training(run: Run, *, best_epoch: int, synthetic: bool) -> None:
@@ -145,13 +158,19 @@ def gallery(
     from framework.pictures import choose, viewing_circles
 
     images: list[np.ndarray] = []
-    columns: dict[str, list[np.ndarray]] = {"density": [], "truth": [], "point": [], "entropy": [], "error": [], "symmetry": []}
+    columns: dict[str, list[np.ndarray]] = {
+        "density": [],
+        "truth": [],
+        "point": [],
+        "entropy": [],
+        "error": [],
+        "symmetry": [],
+    }
     angles = np.zeros(0)
     for batch in on_device(batches.test_dataloader(), device):
         if len(images) >= PICTURED:
             break
-        _collect(predictor, data, batch, samples, images, columns)
-        angles = circular_grid(Prediction(predictor(batch["input"][:1]), batch, samples).marginal(0))[0].cpu().numpy()
+        angles = _collect(predictor, data, batch, samples, images, columns)
     joined = {key: np.concatenate(value, axis=-1) for key, value in columns.items()}
     chosen = choose(joined["entropy"], joined["error"], joined["density"])
     order = [index for row in chosen.values() for index in row]
@@ -162,8 +181,13 @@ def gallery(
         angles,
         joined["truth"][order],
         joined["point"][order],
-        [_caption(joined["entropy"][index], joined["error"][index], int(joined["symmetry"][index])) for index in order],
-        modes=[_modes(truth, int(fold)) for truth, fold in zip(joined["truth"][order], symmetry, strict=True)],
+        [
+            _caption(joined["entropy"][index], joined["error"][index], int(joined["symmetry"][index]))
+            for index in order
+        ],
+        modes=[
+            _modes(truth, int(fold)) for truth, fold in zip(joined["truth"][order], symmetry, strict=True)
+        ],
         rows={name: len(row) for name, row in chosen.items()},
         title=f"{', '.join(data.groups)}: predicted density of the {data.target.names[0]}",
         synthetic=data.synthetic,
@@ -182,11 +206,13 @@ def _collect(
     samples: int,
     images: list[np.ndarray],
     columns: dict[str, list[np.ndarray]],
-) -> None:
+) -> np.ndarray:
+    """Add a batch to the columns; the grid angles its densities are given at."""
     prediction = Prediction(predictor(batch["input"]), batch, samples)
     first = prediction.marginal(0)
     images.extend(data.picture(item) for item in batch["input"].cpu())
-    columns["density"].append(circular_grid(first)[1].cpu().numpy())
+    angles, log_density = circular_grid(first)
+    columns["density"].append(log_density.cpu().numpy())
     columns["entropy"].append(circular_entropy(first).cpu().numpy())
     truth, point = batch["target"][:, 0], prediction.point[:, 0]
     columns["truth"].append(truth.cpu().numpy())
@@ -194,6 +220,7 @@ def _collect(
     columns["error"].append(angular_distance(truth, point).cpu().numpy())
     symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
     columns["symmetry"].append(symmetry.cpu().numpy())
+    return angles.cpu().numpy()
 
 
 def _modes(truth: float, symmetry: int) -> np.ndarray:

@@ -130,4 +130,3 @@ def _record(run: Run, error: BaseException) -> None:
     if isinstance(error, Stopped):
         sentence = f"stopped by {error.signal}"
     run.tracker.set_tags({"error": sentence[:5000]})
-

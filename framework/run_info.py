@@ -4,7 +4,7 @@ import json
 import logging
 import re
 import threading
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,9 @@ class RunInfo:
     sent: int = 0
     """Lines of the journal up to this number are in the store."""
     replay_after: int | None = None
-    """The step the run was last resumed from; metrics of later steps may be in the store already."""
+    """The step the run was last resumed from, and repeats what came after."""
+    replay_until: dict[str, int] = field(default_factory=dict)
+    """Up to which step each metric was in the store by then, and need not be sent again."""
     owed: tuple[tuple[str, str], ...] = ()
     """Files (path, folder in the store) that the store has still to take."""
 
@@ -55,7 +57,7 @@ def read_run_info(folder: Path) -> RunInfo | None:
     path = folder / SIDECAR
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        known = {field.name: stored[field.name] for field in fields(RunInfo) if field.name in stored}
+        known = {item.name: stored[item.name] for item in fields(RunInfo) if item.name in stored}
         return RunInfo(**{**known, "owed": tuple((file, place) for file, place in stored["owed"])})
     except FileNotFoundError:
         return None

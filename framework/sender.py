@@ -27,9 +27,9 @@ class Store(ABC):
     """One run in a store. Whatever a method raises is taken for a store that is away: it is called again."""
 
     identity: Mapping[str, Any]
-    """Fields of `RunInfo` as they are from now on."""
-    replay_after: int | None
-    """As in `RunInfo`, after what was sent so far."""
+    """Fields of `RunInfo` as they are once the store is open."""
+    replay: Mapping[str, Any]
+    """The fields `replay_...` of `RunInfo`, after what was sent so far."""
 
     @abstractmethod
     def send(self, batch: Sequence[Record]) -> None:
@@ -40,8 +40,8 @@ class Store(ABC):
         """Store a file or a directory, its path absolute or in the run folder, under the folder `place`."""
 
 
-OpenStore = Callable[[Path, RunInfo, bool], Store]
-"""(run folder, what is known of the run, whether its process is alive) to the run in its store."""
+OpenStore = Callable[[Path, RunInfo], Store]
+"""From a run folder and what is known of the run to the run in its store."""
 
 
 def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
@@ -67,9 +67,12 @@ def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
 
 
 def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> int:
-    """Send what the journal has and the store lacks, until there is no more or `stop()`; how many lines."""
-    count = 0
-    while records := journal.read(sidecar.info.sent):
+    """Send what the journal has by now and the store lacks, or as much until `stop()`; how many lines.
+
+    What is logged meanwhile waits for the next call, or a training would be followed line by line.
+    """
+    count, last_line = 0, journal.last
+    while sidecar.info.sent < last_line and (records := journal.read(sidecar.info.sent)):
         for batch in batches(records):
             if stop():
                 return count
@@ -80,7 +83,7 @@ def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[]
                 sidecar.update(sent=last, owed=owed)
             else:
                 store.send(batch)
-                sidecar.update(sent=last, replay_after=store.replay_after)
+                sidecar.update(sent=last, **store.replay)
             count += len(batch)
     return count
 
@@ -99,7 +102,7 @@ def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenS
         UserError: the store did not take everything.
     """
     try:
-        store = open_store(folder, sidecar.info, False)
+        store = open_store(folder, sidecar.info)
         sidecar.update(**store.identity)
         count = send_new(journal, sidecar, store, lambda: False)
         send_owed(sidecar, store, lambda: False)
@@ -165,6 +168,7 @@ class Sender(threading.Thread):
             try:
                 self._send()
             except Exception as error:
+                self._store = None  # looked for anew, as it may be another one then
                 self.warn(reason(error))
                 self.tried.set()
                 # Once finishing there is little time: it is spent on trying.
@@ -187,7 +191,7 @@ class Sender(threading.Thread):
 
     def _send(self) -> None:
         if self._store is None:
-            self._store = self._open_store(self._folder, self._sidecar.info, True)
+            self._store = self._open_store(self._folder, self._sidecar.info)
             self._sidecar.update(**self._store.identity)
         send_new(self._journal, self._sidecar, self._store, lambda: self._abandoned)
         send_owed(self._sidecar, self._store, lambda: self._abandoned)

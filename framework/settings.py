@@ -85,7 +85,9 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
     }
     for key, (kind, least) in numbers.items():
         value = trainer.get(key)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, kind) or not value >= least):
+        if value is not None and (
+            isinstance(value, bool) or not isinstance(value, kind) or not value >= least
+        ):
             raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
 
 

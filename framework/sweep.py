@@ -102,15 +102,15 @@ def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
     return found
 
 
-def free_folder(subfolder: Callable[[int], Path], number: int, taken: set[Path]) -> Path:
-    """The first folder from `number` on that no other job has.
+def free_number(subfolder: Callable[[int], Path], number: int, taken: set[Path]) -> int:
+    """The first number from `number` on whose folder no other job has.
 
     Raises:
         ConfigError: `hydra.sweep.subdir` gives two jobs one folder.
     """
     for candidate in range(number, number + len(taken) + 1):
         if subfolder(candidate) not in taken:
-            return subfolder(candidate)
+            return candidate
     raise ConfigError(
         f"hydra.sweep.subdir gives two jobs the folder {subfolder(number)}: wanted one for each. "
         "Use the default, ${hydra.job.num}."
@@ -147,7 +147,10 @@ def run(
     queue = deque(job for job in jobs if not job.completed)
     for job in queue:
         job.folder.mkdir(parents=True, exist_ok=True)
-        job.update(key=job.key, number=job.number, overrides=job.overrides, status="queued", error=None)
+        lock = _lock(job)
+        if lock is not None:
+            job.update(key=job.key, number=job.number, overrides=job.overrides, status="queued", error=None)
+            os.close(lock)
     log.info(
         f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them completed earlier; {at_once} at once with "
         f"{max(1, cores() // at_once)} cores each"
@@ -166,7 +169,9 @@ def run(
                 lock = _lock(job)
                 if lock is None:
                     queue.append(job)
-                elif job.completed:  # by another sweep, while this one waited for the folder
+                    continue
+                job.record = json.loads((job.folder / RECORD).read_text(encoding="utf-8"))
+                if job.completed:  # by another sweep, while this one waited for the folder
                     os.close(lock)
                 else:
                     slot = min(set(range(at_once)) - {one.slot for one in running})
@@ -270,7 +275,7 @@ def _end(one: _Running) -> None:
     elif code - 128 in (signal.SIGINT, signal.SIGTERM):
         status, error = "died", f"stopped by {signal.Signals(code - 128).name}"
     else:
-        status, error = "failed", _last_line(job.folder / CONSOLE) or f"exit code {code}"
+        status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
     job.update(status=status, error=error, ended=time.time())
     os.close(one.lock)
     seconds = job.record["ended"] - job.record["started"]
@@ -310,7 +315,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _lock(job: Job) -> int | None:
-    """A descriptor that holds the job's folder, the record read anew; None where another process does."""
+    """A descriptor that holds the job's folder; None where a process of another sweep does."""
     descriptor = os.open(job.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -320,11 +325,13 @@ def _lock(job: Job) -> int | None:
             log.info(f"#{job.number} waits: a process of another sweep is still in {job.folder}")
         job.waits = True
         return None
-    job.record = json.loads((job.folder / RECORD).read_text(encoding="utf-8"))
     return descriptor
+
+
+_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
 
 
 def _end_with_parent() -> None:
     """In the child, before the job: get SIGTERM when the sweep is killed (Linux; elsewhere it runs on)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+    if _LIBRARY is not None:
+        _LIBRARY.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG

@@ -345,7 +345,13 @@ def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None
             experiment_id=earlier.experiment_id,
         )
         if (earlier.uri, earlier.run_id) == (known.uri, known.run_id):  # another store gets everything
-            known = replace(known, sent=earlier.sent, replay_after=earlier.replay_after, owed=earlier.owed)
+            known = replace(
+                known,
+                sent=earlier.sent,
+                owed=earlier.owed,
+                replay_after=earlier.replay_after,
+                replay_until=earlier.replay_until,
+            )
     else:
         known = wanted
         if earlier is not None or journal.last:

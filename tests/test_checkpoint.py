@@ -140,7 +140,7 @@ def test_code_in_a_checkpoint_is_refused_unrun(saved: Path, tmp_path: Path) -> N
     forged = saved.read_bytes()
     saved.write_bytes(forged + b"\nsha256 of above:" + hashlib.sha256(forged).digest())
     assert verify(saved) is None
-    with pytest.raises(CheckpointError, match=r"posix\.mkdir.*could run code"):
+    with pytest.raises(CheckpointError, match=r"could run code.*did not write it"):
         read(saved)
     assert not (tmp_path / "was run").exists()
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.distributions import Distribution, Independent, Normal
 
-from framework.density import Mixture, circular, circular_entropy, circular_grid, marginal, median
+from framework.density import Mixture, circular, circular_entropy, circular_grid, marginal, median, pick
 from framework.errors import UserError
 
 
@@ -25,6 +25,10 @@ class Cardioid(Distribution):
     def __init__(self, rho: torch.Tensor) -> None:
         self.rho = rho
         super().__init__(rho.shape, torch.Size((1,)), validate_args=False)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> torch.Tensor:
+        """By rejection from the uniform density; only ever asked for the shape here."""
+        return torch.zeros(*sample_shape, *self.rho.shape, 1, dtype=self.rho.dtype)
 
     def log_prob(self, value: torch.Tensor) -> torch.Tensor:
         return torch.log1p(2 * self.rho * value[..., 0].cos()) - math.log(2 * math.pi)
@@ -70,6 +74,15 @@ def test_samples_come_in_the_proportions_of_the_weights() -> None:
     drawn = Mixture(torch.tensor([[0.3, 0.7]]).log(), component).sample((20000,))
     share = (drawn > 0).double().mean().item()
     assert abs(share - 0.7) < 4 * math.sqrt(0.21 / 20000)
+
+
+def test_a_component_is_picked_for_each_sample_and_batch() -> None:
+    component = Independent(Normal(torch.arange(12.0).reshape(2, 3, 2), torch.full((2, 3, 2), 1e-6)), 1)
+    index = torch.tensor([[0, 2], [1, 1], [2, 0], [0, 0]])
+    wanted = torch.stack([component.base_dist.loc[[0, 1], row] for row in index])
+    for picked in (pick(component, index), pick.dispatch(object)(component, index)):
+        assert picked.batch_shape == (4, 2)
+        torch.testing.assert_close(picked.sample(), wanted, rtol=0, atol=1e-4)
 
 
 def test_monte_carlo_entropy_agrees_with_quadrature() -> None:

@@ -43,7 +43,8 @@ sweep.COMMAND = json.loads(os.environ["JOB"])
 def run(config):
     from hydra.core.hydra_config import HydraConfig
     folder = Path(HydraConfig.get().runtime.output_dir)
-    (folder / "seen.json").write_text(json.dumps([config.what, config.x, dict(config.get("extra") or {})]))
+    seen = [config.what, config.x, config.number, dict(config.get("extra") or {})]
+    (folder / "seen.json").write_text(json.dumps(seen))
 
 run()
 """
@@ -104,6 +105,7 @@ defaults:
 what: ok
 x: 0
 value: 1
+number: ${hydra:job.num}
 experiment_name: ${hydra:runtime.choices.experiment}
 hydra:
   output_subdir: null
@@ -130,11 +132,7 @@ class App:
             (folder / "conf" / path).write_text(text)
         shutil.copytree(ROOT / "conf" / "hydra" / "launcher", folder / "conf" / "hydra" / "launcher")
         self.environment = {
-            **{
-                key: value
-                for key, value in os.environ.items()
-                if key not in ("OMP_NUM_THREADS", "PYTHONPATH")
-            },
+            **{key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"},
             "JOB": json.dumps([sys.executable, "-S", str(folder / "job.py")]),
             "HYDRA_FULL_ERROR": "1",
         }
@@ -182,10 +180,10 @@ def test_the_others_go_on_when_a_job_fails_or_is_killed(app: App) -> None:
     records = [app.record(number) for number in range(4)]
     assert [record["status"] for record in records] == ["failed", "died", "completed", "failed"]
     assert [record["error"] for record in records] == [
-        "ValueError: this job is bad",
+        "ValueError: this job is bad (exit code 1)",
         "killed by SIGKILL, as the system does when memory runs out",
         None,
-        "hello from exit",
+        "hello from exit (exit code 7)",
     ]
     assert all(record["tries"] == 1 and record["ended"] >= record["started"] for record in records)
     console = (app.sweep / "0" / "console.log").read_text()
@@ -202,7 +200,7 @@ def test_the_others_go_on_when_a_job_fails_or_is_killed(app: App) -> None:
     assert json.loads((app.folder / "summarised.json").read_text()) == [str(app.sweep), overrides]
     [begun] = [json.loads(line) for line in (app.folder / "begun.jsonl").read_text().splitlines()]
     assert begun[0] == str(app.sweep)
-    assert begun[1] == {"what": "raise", "x": 0, "value": 1, "experiment_name": None}
+    assert begun[1] == {"what": "raise", "x": 0, "value": 1, "number": 0, "experiment_name": None}
 
 
 def test_the_same_sweep_again_runs_what_did_not_complete(app: App) -> None:
@@ -317,6 +315,7 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
     assert again.stdout is not None
     while "#1 waits" not in again.stdout.readline():
         assert again.poll() is None
+    assert app.record(1)["status"] == "running"
     assert app.tries(1) == 1, "two processes in one folder would mix their checkpoints"
     (app.folder / "release").touch()
     again.communicate(timeout=60)
@@ -345,7 +344,8 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
     assert process.returncode == 0, output
     seen = sorted((app.folder / name).rglob("seen.json"))
     assert [json.loads(path.read_text()) for path in seen] == [
-        [what, "quoted, text", {"depth": 3}] for what in ("p", "q")
+        ["p", "quoted, text", 0, {"depth": 3}],
+        ["q", "quoted, text", 1, {"depth": 3}],
     ]
 
 
@@ -355,12 +355,12 @@ def test_two_jobs_in_one_folder_are_refused(app: App) -> None:
     assert "ConfigError: hydra.sweep.subdir gives two jobs the folder" in output
 
 
-def test_free_folder() -> None:
+def test_free_number() -> None:
     taken = {Path("0"), Path("1"), Path("3")}
-    assert sweep.free_folder(lambda number: Path(str(number)), 0, taken) == Path("2")
-    assert sweep.free_folder(lambda number: Path(str(number)), 4, taken) == Path("4")
+    assert sweep.free_number(lambda number: Path(str(number)), 0, taken) == 2
+    assert sweep.free_number(lambda number: Path(str(number)), 4, taken) == 4
     with pytest.raises(ConfigError, match="two jobs the folder 1"):
-        sweep.free_folder(lambda number: Path("1"), 4, taken)
+        sweep.free_number(lambda number: Path("1"), 4, taken)
 
 
 def test_what_a_job_leaves_for_an_optimising_sweeper(tmp_path: Path) -> None:

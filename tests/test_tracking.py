@@ -137,6 +137,20 @@ def short_locks() -> Iterator[None]:
     sqlalchemy.event.remove(sqlalchemy.Engine, "before_cursor_execute", shorten)
 
 
+def copies(empty_store: Path) -> Callable[[str, str], mlflow_store.SqlAlchemyStore]:
+    """Stands for MLflow's making of a store: copies one, which takes no seconds."""
+    make = mlflow_store.SqlAlchemyStore
+
+    def make_quickly(uri: str, artifacts: str) -> mlflow_store.SqlAlchemyStore:
+        if uri.endswith(".partial"):
+            path = Path(uri.removeprefix("sqlite:///"))
+            assert not path.exists()
+            shutil.copy(empty_store, path)
+        return make(uri, artifacts)
+
+    return make_quickly
+
+
 # What a run leaves in the store
 
 
@@ -290,7 +304,7 @@ class ListStore(Store):
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
         self.identity = {"run_id": "1"}
-        self.replay_after = None
+        self.replay = {}
         self.got: list[Record] = []
         self.files: list[str] = []
         self.calls = 0
@@ -309,7 +323,7 @@ def test_ten_thousand_metrics_take_few_calls(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.jsonl")
     store = ListStore()
     sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
-    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info, running: store)
+    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info: store)
     carrier.start()
     for step in range(10_000):
         journal.write({"loss": 1.0}, step, 0)
@@ -320,13 +334,30 @@ def test_ten_thousand_metrics_take_few_calls(tmp_path: Path) -> None:
     journal.close()
 
 
+def test_a_training_is_not_followed_line_by_line(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.jsonl")
+    for step in range(20):
+        journal.write({"loss": 1.0}, step, 0)
+
+    class GoesOn(ListStore):
+        def send(self, batch: Sequence[Record]) -> None:
+            super().send(batch)
+            journal.write({"loss": 1.0}, 20 + self.calls, 0)  # the training, meanwhile
+
+    store = GoesOn()
+    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    assert sender.send_new(journal, sidecar, store, lambda: store.calls > 5) == 20
+    assert store.calls == 1
+    journal.close()
+
+
 def test_what_waited_goes_in_the_largest_batches(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.jsonl")
     for step in range(10_000):
         journal.write({"loss": 1.0, "rate": 2.0}, step, 0)
     store = ListStore()
     sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
-    assert sender.send_all(tmp_path, journal, sidecar, lambda folder, info, running: store) == 10_000
+    assert sender.send_all(tmp_path, journal, sidecar, lambda folder, info: store) == 10_000
     assert 20 <= store.calls <= 22  # 1000 values each; a block that was read may end with fewer
     journal.close()
 
@@ -337,7 +368,7 @@ def test_a_store_that_fails_again_and_again_gets_everything_once_and_in_order(
     journal = Journal(tmp_path / "journal.jsonl")
     store = ListStore(failures=7)
     sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
-    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info, running: store)
+    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info: store)
     carrier.start()
     for step in range(500):
         journal.write({"loss": 1.0}, step, 0)
@@ -764,6 +795,26 @@ def test_a_store_that_lost_the_run_gets_it_anew(
     assert "the run is stored there anew" in caplog.text
 
 
+def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
+    folder: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", copies(empty_store))
+    tracker = build(folder)
+    tracker.open()
+    tracker.log_params({"seed": 0})
+    log(tracker, range(10))
+    until(lambda: len(history(folder)) == 10)
+    before = tracker.run_id
+    (folder.parents[1] / "mlflow.db").unlink()
+    log(tracker, range(10, 20))
+    tracker.close("FINISHED")
+    assert tracker.run_id != before
+    assert history(folder) == losses(range(20))
+    assert client(folder).get_run(identity(folder)).data.params == {"seed": "0"}
+    assert status(folder) == "FINISHED"
+    assert f"knows no run {before}" in caplog.text
+
+
 def test_a_new_run_in_a_used_folder_sets_the_old_one_aside(folder: Path) -> None:
     first = build(folder)
     first.open()
@@ -850,6 +901,7 @@ def test_a_store_whose_making_was_cut_short_is_made_again(
 ) -> None:
     path = tmp_path / "mlflow.db"
     info = RunInfo(None, f"sqlite:///{path}", "e", "r", None, str(tmp_path), "key", 0.0, "RUNNING")
+    make_quickly = copies(empty_store)
 
     class Killed(BaseException):
         pass
@@ -861,18 +913,12 @@ def test_a_store_whose_making_was_cut_short_is_made_again(
             file.write_bytes(b"half a store")
             raise Killed
 
-    class Whole:
-        def __init__(self, uri: str, artifacts: str) -> None:
-            file = Path(uri.removeprefix("sqlite:///"))
-            assert not file.exists()
-            shutil.copy(empty_store, file)
-            self.engine = sqlalchemy.create_engine(uri)
-
     monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", CutShort)
     with pytest.raises(Killed):
         mlflow_store._opened(info)
     assert not path.exists()
-    monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", Whole)
+    assert list(tmp_path.glob(".*partial"))
+    monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", make_quickly)
     _, experiment = mlflow_store._opened(info)
     assert MlflowClient(info.uri).get_experiment(experiment).name == "e"
 

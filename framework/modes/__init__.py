@@ -28,7 +28,9 @@ def run(config: DictConfig) -> float | None:
         values, overrides = _stored(folder, overrides)
     name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
     if name not in MODES:
-        raise ConfigError(f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}.")
+        raise ConfigError(
+            f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}."
+        )
     chosen = settings(values)
     module = import_module(f"framework.modes.{name}")
     return module.run(values, chosen, folder, overrides)
@@ -47,7 +49,9 @@ def _stored(folder: Path, overrides: list[str]) -> tuple[dict[str, Any], list[st
         )
     earlier = read_run_info(folder)
     if earlier is not None and earlier.status == "FINISHED":
-        raise ConfigError(f"resume={folder}: that run has finished; there is nothing to go on with. Start a new run.")
+        raise ConfigError(
+            f"resume={folder}: that run has finished; there is nothing to go on with. Start a new run."
+        )
     values = stored_config(folder)
     if not isinstance(values, dict):
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")

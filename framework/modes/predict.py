@@ -44,7 +44,9 @@ def _files(path: Path) -> list[Path]:
         raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
     found = [path] if path.is_file() else sorted(item for item in path.iterdir() if item.is_file())
     if not found:
-        raise DataError(f"mode.files={path} is an empty folder. Give a folder that holds the files to predict for.")
+        raise DataError(
+            f"mode.files={path} is an empty folder. Give a folder that holds the files to predict for."
+        )
     return found
 
 

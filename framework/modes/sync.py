@@ -14,6 +14,8 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
     """Replay the journal of `mode.run`."""
     target = Path(str(values["mode"]["run"])).expanduser()
     if not (target / "run.json").is_file():
-        raise ConfigError(f"mode.run={target}: {target / 'run.json'} does not exist. Give the folder of a run.")
+        raise ConfigError(
+            f"mode.run={target}: {target / 'run.json'} does not exist. Give the folder of a run."
+        )
     sent = sync(target)
     Console().print(f"{sent} metric lines sent from {target}.")

@@ -24,9 +24,7 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
     with opened(folder, values, settings, overrides) as run:
         predictor, data, described = loaded(run)
         record_citations(run, citations(described["config"]))
-        batches = Batches(
-            data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed
-        )
+        batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
         metrics = build_metrics(described["config"], data.target)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         report_test(run, predictor, data, batches, metrics, device, Console())
@@ -51,11 +49,17 @@ def loaded(run: Run) -> tuple[Predictor, Data, dict[str, Any]]:
         described["config"]["data"] = resolve("data", run.values["data"])
     if run.values.get("metric"):
         chosen = run.values["metric"]
-        described["config"]["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
+        described["config"]["metric"] = [
+            resolve("metric", part, f"metric.{key}") for key, part in chosen.items()
+        ]
     data = build_data({"data": resolve("data", described["config"]["data"])})
     data.prepare()
     describe_data(run, data)
-    wanted = (tuple(described["input_shape"]), described["target"]["kind"], tuple(described["target"]["names"]))
+    wanted = (
+        tuple(described["input_shape"]),
+        described["target"]["kind"],
+        tuple(described["target"]["names"]),
+    )
     found = (data.input_shape, data.target.kind, data.target.names)
     if wanted != found:
         raise CheckpointError(

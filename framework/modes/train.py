@@ -1,7 +1,9 @@
 """mode=train: fit, calibrate, test, report."""
 
+import ctypes
 import inspect
 import logging
+import platform
 import warnings
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,8 @@ from framework.run import Run, opened
 from framework.settings import TRAINER_OURS, Settings, check_trainer_keys
 from framework.training import KeepCheckpoints, Report, StopAtBatch, Training
 
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> float:
     """Returns the best validation loss, nats: what a sweeper minimises."""
@@ -42,6 +46,7 @@ def _run(run: Run) -> float:
     if settings.threads:
         torch.set_num_threads(settings.threads)
     quiet()
+    keep_memory()
     check_trainer_keys(settings.trainer, set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"})
     resolved = resolve_all(run.values)
     console.print(f"run folder: {run.folder}")
@@ -115,13 +120,27 @@ def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
     )
 
 
+def keep_memory() -> None:
+    """Let glibc keep freed memory: a training step frees and asks for the same megabytes again and again.
+
+    Without it each step pays for thousands of page faults, a quarter of a small network's time. Elsewhere than on
+    glibc nothing happens.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        library = ctypes.CDLL(None)
+        library.mallopt(M_MMAP_THRESHOLD, 1 << 30)
+        library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
 def quiet() -> None:
     """Lightning's notices about hardware it did not find, and a deprecation inside it, tell our user nothing."""
     logging.getLogger("pytorch_lightning").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")
     warnings.filterwarnings("ignore", message=".*does not have many workers", module="pytorch_lightning")
     # ours is resumable, by another way than the one Lightning looks for
-    warnings.filterwarnings("ignore", message=".*your dataloader is not resumable", module="pytorch_lightning")
+    warnings.filterwarnings(
+        "ignore", message=".*your dataloader is not resumable", module="pytorch_lightning"
+    )
 
 
 def describe_data(run: Run, data: Data) -> None:

@@ -71,7 +71,9 @@ def _run(run: Run, options: _Options) -> None:
     run.tracker.log_artifact(path)
     for point in curve.points:
         numbers = {key: value for key, value in asdict(point).items() if isinstance(value, float)}
-        run.tracker.log_metrics({f"work_precision/{key}": value for key, value in numbers.items()}, int(point.value), 0)
+        run.tracker.log_metrics(
+            {f"work_precision/{key}": value for key, value in numbers.items()}, int(point.value), 0
+        )
     figure = pictures.work_precision(
         {name: curve.points},
         title=f"{name} on {', '.join(data.groups)}: error against run time along {knob}",
@@ -81,6 +83,8 @@ def _run(run: Run, options: _Options) -> None:
     where = picture(run, figure, "work_precision.png")
     console = Console()
     console.print(
-        results_table(rows({name: curve}, synthetic=data.synthetic), COLUMNS, title=f"{name}: {curve.samples} samples")
+        results_table(
+            rows({name: curve}, synthetic=data.synthetic), COLUMNS, title=f"{name}: {curve.samples} samples"
+        )
     )
     console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)

@@ -1,6 +1,7 @@
 """Hydra's way to `framework.sweep`. Hydra imports this at every start: nothing heavy here."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,22 +80,27 @@ class PoolLauncher(Launcher):
         known = sweep.records(folder)
         taken = {path for earlier in known.values() for path, _ in earlier}
         jobs = []
-        for number, (config, given) in enumerate(zip(configs, job_overrides, strict=True), first):
+        for index, (config, given) in enumerate(zip(configs, job_overrides, strict=True), first):
             overrides = list(filter_overrides(given))
             key = sweep.hashed(*sorted(overrides))
             if known.get(key):
                 path, record = known[key].pop(0)
+                number = record["number"]
             else:
-                path = sweep.free_folder(
-                    lambda num, config=config: folder / _subfolder(config, num), number, taken
-                )
-                record = {}
+                place = partial(_place, folder, config)
+                number, record = sweep.free_number(place, index, taken), {}
+                path = place(number)
             taken.add(path)
             jobs.append(
                 sweep.Job(
                     number=number,
                     overrides=overrides,
-                    arguments=[*self._passed_on(), *given, f"hydra.run.dir={_quoted(path)}"],
+                    arguments=[
+                        *self._passed_on(),
+                        *given,
+                        f"hydra.job.num={number}",
+                        f"hydra.run.dir={_quoted(path)}",
+                    ],
                     folder=path,
                     key=key,
                     config=sweep.hashed(OmegaConf.to_yaml(_without_hydra(config))),
@@ -118,11 +124,11 @@ class PoolLauncher(Launcher):
         ]
 
 
-def _subfolder(config: DictConfig, number: int) -> str:
+def _place(folder: Path, config: DictConfig, number: int) -> Path:
     with read_write(config), open_dict(config):
         config.hydra.job.num = number
         config.hydra.job.id = str(number)
-    return str(config.hydra.sweep.subdir)
+    return folder / str(config.hydra.sweep.subdir)
 
 
 def _without_hydra(config: DictConfig) -> DictConfig:

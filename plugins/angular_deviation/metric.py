@@ -1,7 +1,7 @@
 """Mean absolute angular deviation, of all angles of the target and of each apart."""
 
 import math
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ class MeanAngularDeviation(Metric):
   year      = {2015}
 }"""
     columns: ClassVar[dict[str, str]] = {"maad_deg": "MAAD °"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"maad_deg": "lower"}
     count: Tensor
     total: Tensor
     squares: Tensor

@@ -1,1 +1,1 @@
-"""Conditional variational autoencoder: an infinite mixture with a learned prior (thesis §3.5.2)."""
+"""Conditional variational autoencoder (thesis §3.5.2)."""

@@ -33,7 +33,7 @@ class Gaussian:
 
 
 def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
-    """KL(first || second), nats, (*batch,) (Kingma & Welling 2014, appendix B); exactly 0 where they are equal."""
+    """KL(first || second), nats, (*batch,), exactly 0 of equals (Kingma & Welling 2014, appendix B)."""
     log_ratio = 2 * (first.log_scale - second.log_scale)
     shift = (first.mean - second.mean) * torch.exp(-second.log_scale)
     return ((torch.expm1(log_ratio) - log_ratio + shift.square()) / 2).sum(-1)
@@ -64,7 +64,7 @@ class Networks:
 
 
 def importance_log_weights(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """log p(φ|x,z) p(z|x) / q(z|x,φ) at z ~ q, (samples, *sample, *batch), nats (the terms of eq. 3.19-3.20)."""
+    """log p(φ|x,z) p(z|x) / q(z|x,φ) at z ~ q, (samples, *sample, *batch), nats (terms of eq. 3.19)."""
     posterior = networks.posterior(value)
     z = posterior.draw(samples)
     likelihood = networks.component(networks.decode(z)).log_prob(value)
@@ -72,7 +72,7 @@ def importance_log_weights(networks: Networks, value: Tensor, samples: int) -> T
 
 
 def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """Lower bound on log p(φ|x), nats: its first term by `samples` draws, its second exactly (eq. 3.17-3.18)."""
+    """Lower bound on log p(φ|x), nats: the first term by `samples` draws, the second exactly (eq. 3.17)."""
     posterior = networks.posterior(value)
     likelihood = networks.component(networks.decode(posterior.draw(samples))).log_prob(value)
     return likelihood.mean(0) - kl_divergence(posterior, networks.prior)
@@ -81,12 +81,12 @@ def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
 class CVAEDensity(Distribution):
     """p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12).
 
-    `log_prob` is the importance-weighted bound (eq. 3.19) with `samples` proposals z ~ q(z|x,φ) for every value: it
-    is random, in expectation below the truth, and rises to it with `samples`. `sample` draws a fresh z from the
-    prior for every value. `entropy`, `mode`, `median` and `marginal` are those of `mixture`.
+    `log_prob` is the importance-weighted bound (eq. 3.19) with `samples` proposals z ~ q(z|x,φ) for every
+    value: it is random, in expectation below the truth, and rises to it with `samples`. `sample` draws a
+    fresh z from the prior for every value. `entropy`, `mode`, `median` and `marginal` are of `mixture`.
     """
 
-    arg_constraints = {}
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
 
     def __init__(self, networks: Networks, samples: int) -> None:
@@ -97,16 +97,13 @@ class CVAEDensity(Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        return self._example.support
+        return self._example.support  # pyright: ignore[reportReturnType]
 
     @cached_property
     def mixture(self) -> Mixture:
         """Equal weights on `samples` components with z from the prior: drawn on first use, then kept."""
-        step = self._at_once(self.samples, 1)
-        parts = [
-            self.networks.decode(self.networks.prior.draw(min(step, self.samples - done)))
-            for done in range(0, self.samples, step)
-        ]
+        z = self.networks.prior.draw(self.samples)
+        parts = [self.networks.decode(part) for part in z.split(self._at_once(self.samples, 1))]
         number = torch.cat(parts).movedim(0, -2)
         weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
         return Mixture(weights, self.networks.component(number))
@@ -152,7 +149,7 @@ class CVAEDensity(Distribution):
         return self.mixture.entropy()
 
     def _at_once(self, count: int, each: int) -> int:
-        """How many of `count` to decode together, each needing `each` z per item; all of them under gradient."""
+        """How many of `count` to decode together, each with `each` z per item; under gradient all of them."""
         if torch.is_grad_enabled():
             return max(1, count)
         return max(1, CHUNK // (max(1, self.batch_shape.numel()) * each * self.networks.width))

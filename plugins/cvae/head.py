@@ -1,6 +1,7 @@
 """The conditional variational autoencoder head."""
 
-from typing import Annotated, cast
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -8,20 +9,23 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from framework.density_head import DensityHead
-from framework.errors import ConfigError
+from framework.latent_decoder import LARGEST_FEATURE, LatentDecoder
+from framework.raw_numbers import require_finite, require_trained
 from framework.target import Target
 from plugins.cvae.density import CVAEDensity, Gaussian, Networks, evidence_bound
 
 LARGEST_LOG_SCALE = 7.0
 """Standard deviations of z stay within e^±7, so that no ratio of two of them overflows."""
+MODERATE = {"name": "von_mises", "floor": 1.0}
+"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
 
 
 class CVAEHead(DensityHead):
-    """Infinite mixture over a latent z with learned prior p(z|x), encoder q(z|x,φ), decoder p(φ|x,z) (eq. 3.12).
+    """CVAE: an infinite mixture over a latent z with a learned prior (thesis §3.5.2, eq. 3.12-3.20).
 
-    Trains by the evidence lower bound (eq. 3.17-3.18); the density's log_prob is the importance-weighted bound
-    (eq. 3.19). It reads 3 × hidden numbers: the framework's linear layer is the part of each network's first layer
-    that sees the features, and so is computed once per item and not once per z.
+    Prior p(z|x), encoder q(z|x,φ) and decoder p(φ|x,z) train by the evidence lower bound (eq. 3.17-3.18);
+    log_prob is the importance-weighted bound (eq. 3.19). It reads 3 × hidden numbers: the framework's linear
+    layer is the part of each network's first layer that sees the features, computed once per item.
 
     Args:
         latent: dimensions of z.
@@ -31,7 +35,7 @@ class CVAEHead(DensityHead):
         component: the head whose densities are mixed.
     """
 
-    knobs = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
     bibtex = """@inproceedings{sohn2015learning,
   title = {Learning Structured Output Representation using Deep Conditional Generative Models},
   author = {Sohn, Kihyuk and Lee, Honglak and Yan, Xinchen},
@@ -53,28 +57,21 @@ class CVAEHead(DensityHead):
         hidden: Annotated[int, Field(ge=1)] = 128,
         training_samples: Annotated[int, Field(ge=1)] = 10,
         samples: Annotated[int, Field(ge=1)] = 500,
-        component: DensityHead = cast(DensityHead, "von_mises"),
+        component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
-        fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
-        if fitted:
-            raise ConfigError(
-                f"density_head.component fits {', '.join(sorted(fitted))} after training, which a component of a "
-                "mixture cannot; choose one that predicts it, such as concentration=predicted."
-            )
         self.target = target
         self.size = 3 * hidden
         self.hidden = hidden
         self.training_samples = training_samples
         self.samples = samples
-        self.component = component
+        self.component = require_trained(component)
         self.prior = _rest(hidden, 2 * latent)
         self.from_value = nn.Linear(
             len(target.names) * (2 if target.kind == "angle" else 1), hidden, bias=False
         )
         self.posterior = _rest(hidden, 2 * latent)
-        self.from_latent = nn.Linear(latent, hidden, bias=False)
-        self.decoder = _rest(hidden, component.size)
+        self.decoder = LatentDecoder(latent, hidden, component.size)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> CVAEDensity:
         return CVAEDensity(self.networks(raw), self.training_samples if self.training else self.samples)
@@ -87,23 +84,17 @@ class CVAEHead(DensityHead):
 
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
         """Prior, encoder and decoder, given the features."""
-        if raw.shape[-1] != self.size:
-            raise ValueError(
-                f"raw numbers of shape {tuple(raw.shape)}; wanted {self.size} in the last dimension."
-            )
-        bad = ~raw.isfinite().all(-1)
-        if bad.any():
-            row = tuple(bad.nonzero()[0].tolist())
-            raise ValueError(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
+        raw = require_finite(raw, self.size)
         kind = self.from_value.weight.dtype
-        # past 1e30 the layers behind would overflow; nothing is learned there
-        for_prior, for_posterior, for_decoder = raw.to(kind).clamp(-1e30, 1e30).chunk(3, -1)
+        # so that no raw number, however large, overflows in the layers behind
+        features = raw.to(kind).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
+        for_prior, for_posterior, for_decoder = features.chunk(3, -1)
         return Networks(
             prior=_gaussian(self.prior(for_prior)),
             posterior=lambda value: _gaussian(
                 self.posterior(for_posterior + self.from_value(self.encode(value).to(kind)))
             ),
-            decode=lambda z: self.decoder(for_decoder + self.from_latent(z)),
+            decode=lambda z: self.decoder(for_decoder, z),
             component=self.component,
             width=self.hidden,
         )

@@ -85,7 +85,9 @@ class ImagesWithAngles(Data):
             crops = [self._crop(root / row.file) for row in chosen]
             angles = [[(a + math.pi) % (2 * math.pi) - math.pi for a in row.angles] for row in chosen]
             fields = {
-                "target": torch.tensor(angles, dtype=torch.float32).reshape(len(chosen), -1),
+                "target": torch.tensor(angles, dtype=torch.float32).reshape(
+                    len(chosen), len(self.target.names)
+                ),
                 "group": torch.zeros(len(chosen), dtype=torch.int64),
             }
             self._tables[split], bad = images.load(crops, fields, f"the {split} images", in_memory=in_memory)

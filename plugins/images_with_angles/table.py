@@ -53,11 +53,11 @@ def read_table(
     for index, (number, cells) in enumerate(lines.items()):
         name = cells[FILE].strip()
         if not name:
-            raise DataError(f"{file} line {number}: `{FILE}` is empty; wanted the name of an image.")
+            raise DataError(f"{file} line {number}: no `{FILE}`; wanted the name of an image.")
         if name in first_line:
             raise DataError(
-                f"{file} line {number}: {name!r} stands already in line {first_line[name]}; wanted each image "
-                "once. Take one of the lines out."
+                f"{file} line {number}: {name!r} stands already in line {first_line[name]}; wanted each "
+                "image once. Take one of the lines out."
             )
         first_line[name] = number
         split = _split(file, number, cells[SPLIT]) if SPLIT in header else split_of(name)
@@ -125,8 +125,8 @@ def _angle_columns(
         ]
         if not found:
             raise DataError(
-                f"{file} has no column of numbers beside `{FILE}` and `{SPLIT}`; wanted one for each angle, in "
-                "degrees. Add one, or name them with data.angle_columns."
+                f"{file} has no column of numbers beside `{FILE}` and `{SPLIT}`; wanted one for each angle, "
+                "in degrees. Add one, or name them with data.angle_columns."
             )
         return found
     for name in asked:
@@ -167,8 +167,8 @@ def _refuse_radians(file: Path, column: str, numbers: Sequence[float]) -> None:
     largest = max(map(abs, numbers))
     if len(numbers) > ENOUGH_ROWS and 0 < largest <= 2 * math.pi:
         raise DataError(
-            f"{file}, column {column!r}: none of {len(numbers)} values exceeds {largest:.4g}: this looks like "
-            "radians; wanted degrees. Set angles_in: radians, or angles_in: degrees if degrees they are."
+            f"{file}, column {column!r}: none of {len(numbers)} values exceeds {largest:.4g}: this looks "
+            "like radians; wanted degrees. Set angles_in: radians, or angles_in: degrees if degrees they are."
         )
 
 

@@ -1,6 +1,6 @@
 """Mean log-likelihood and its standard error, from a running mean and a running sum of squared deviations."""
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -26,6 +26,7 @@ class LogLikelihood(Metric):
   year    = {2007}
 }"""
     columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
     moments: Tensor
 
     def __init__(self) -> None:

@@ -1,30 +1,35 @@
 """The finite mixture head."""
 
-from typing import Annotated, cast
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.density import Mixture
 from framework.density_head import DensityHead
-from framework.errors import ConfigError
+from framework.raw_numbers import require_finite, require_trained
 from framework.target import Target
+
+MODERATE = {"name": "von_mises", "floor": 1.0}
+"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
 
 
 class MixtureHead(DensityHead):
     """Finite mixture of any other head's densities, weights by softmax (thesis eq. 3.10-3.11).
 
-    Reads K logits, then K times what the component reads. Every sample has components of its own; a component that
-    is fitted after training (it keeps a buffer) is refused, because which data belongs to it is not known.
+    Reads K logits, then K times what the component reads, then that once more, which is added to all K: what every
+    component must know is learnt by all at once, and none falls behind (README). A component that is fitted after training (it keeps
+    a buffer) is refused, because which data belongs to it is not known.
 
     Args:
         components: K. With 1 the density is the component, to the last bit.
         component: the head whose densities are mixed.
     """
 
-    knobs = {}
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = """@techreport{bishop1994mixture,
   title = {Mixture Density Networks},
   author = {Bishop, Christopher M.},
@@ -38,31 +43,28 @@ class MixtureHead(DensityHead):
         target: Target,
         *,
         components: Annotated[int, Field(ge=1)] = 5,
-        component: DensityHead = cast(DensityHead, "von_mises"),
+        component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
-        fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
-        if fitted:
-            raise ConfigError(
-                f"density_head.component fits {', '.join(sorted(fitted))} after training, which a component of a "
-                "mixture cannot; choose one that predicts it, such as concentration=predicted."
-            )
         self.components = components
-        self.component = component
+        self.component = require_trained(component)
         self.size = components * (component.size + 1)
+        if components > 1:
+            # the numbers all components have in common, and what makes them differ from the first step
+            self.size += component.size
+            self.spread = nn.Parameter(torch.randn(components, component.size))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Mixture:
-        if raw.shape[-1] != self.size:
-            raise ValueError(
-                f"raw numbers of shape {tuple(raw.shape)}; wanted {self.size} in the last dimension."
+        raw = require_finite(raw, self.size)
+        own = self.components * self.component.size
+        logits, apart, common = raw.tensor_split([self.components, self.components + own], -1)
+        numbers = apart.unflatten(-1, (self.components, self.component.size))
+        if self.components > 1:
+            most = torch.finfo(raw.dtype).max / 4  # so that the sum does not overflow
+            numbers = (
+                numbers.clamp(-most, most) + common.clamp(-most, most).unsqueeze(-2) + self.spread.to(raw)
             )
-        bad = ~raw.isfinite().all(-1)
-        if bad.any():
-            row = tuple(bad.nonzero()[0].tolist())
-            raise ValueError(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
-        number = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        logits, rest = number.tensor_split([self.components], -1)
-        return Mixture(logits, self.component(rest.unflatten(-1, (self.components, self.component.size))))
+        return Mixture(logits, self.component(numbers))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         return -self(raw).log_prob(target)

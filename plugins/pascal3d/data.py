@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from framework import cache, images, schema
 from framework.data import Batch, Data
 from framework.errors import DataError, did_you_mean
-from framework.images import Crop
+from framework.images import Box, Crop
 from framework.renderer import Renderer
 from framework.target import Target
 from plugins.pascal3d import layout
@@ -35,7 +35,7 @@ class Pascal3D(Data):
 
     Beside the contract's fields a batch has "symmetry" (int64: 1 none, 2 the same after 180° of azimuth, 4
     after 90°, 0 after any turn; 1 for real data) and, for generated data, "blur" (float32: standard deviation
-    of the blur, pixels of the whole picture).
+    of the blur, pixels of the input).
 
     Attributes:
         excluded: how many objects the protocol left out, by reason; set by `prepare`.
@@ -188,9 +188,14 @@ class Pascal3D(Data):
             "symmetry": torch.tensor([annotation.symmetry for annotation, _ in samples], dtype=torch.int64),
         }
         if self.synthetic:
-            blur = [annotation.blur or 0.0 for annotation, _ in samples]
+            blur = [self._scale(annotation.box) * (annotation.blur or 0.0) for annotation, _ in samples]
             fields["blur"] = torch.tensor(blur, dtype=torch.float32)
         return fields
+
+    def _scale(self, box: Box) -> float:
+        """Pixels of the input for each pixel of the picture."""
+        left, top, right, bottom = box
+        return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
 
     def train(self) -> Dataset[Batch]:
         return self._tables["train"]

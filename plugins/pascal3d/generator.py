@@ -22,7 +22,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer
 from plugins.pascal3d.families import FAMILIES
 from plugins.pascal3d.layout import VOC_LISTS
@@ -42,7 +42,14 @@ def generated(parent: Path, category: str, images: int, seed: int, renderer: Ren
 
     Raises:
         DataError: the cache cannot be written, or holds something else in its place.
+        ConfigError: the renderer cannot draw what is needed.
     """
+    missing = {"color", "mask"} - renderer.channels
+    if missing:
+        raise ConfigError(
+            f"data.renderer = {type(renderer).__name__} draws no {' and no '.join(sorted(missing))}; wanted "
+            "color and mask. Choose another renderer."
+        )
     drawn_by = f"{type(renderer).__module__}.{type(renderer).__qualname__}"
     mark = {
         "generator_version": VERSION,

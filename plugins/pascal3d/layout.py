@@ -155,7 +155,10 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
 
 def _load(file: Path) -> mat_struct:
     try:
-        content = scipy.io.loadmat(file, squeeze_me=True, struct_as_record=False, variable_names=["record"])
+        with file.open("rb") as stream:
+            content = scipy.io.loadmat(
+                stream, squeeze_me=True, struct_as_record=False, variable_names=["record"]
+            )
     except FileNotFoundError:
         raise DataError(
             f"{file}: no such file, though a list names it. Restore it from the release."

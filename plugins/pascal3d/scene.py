@@ -121,8 +121,8 @@ def draw(
         camera=window(camera, (x0, y0), (y1 - y0, x1 - x0), SUPERSAMPLING),
     )
     drawn = renderer(scene, ("color", "mask"))
-    layer.color[y0:y1, x0:x1] = _averaged(drawn["color"].numpy())
-    layer.cover[y0:y1, x0:x1] = _averaged(drawn["mask"].numpy().astype(np.float32))
+    layer.color[y0:y1, x0:x1] = _averaged(drawn["color"].cpu().numpy())
+    layer.cover[y0:y1, x0:x1] = _averaged(drawn["mask"].cpu().numpy().astype(np.float32))
     return layer
 
 
@@ -162,7 +162,7 @@ def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
     if random.random() < 0.1:
         left, top, right, bottom = box_of(main.layer)
         center = (random.uniform(left, right), random.uniform(top, bottom))
-        mask = blob(random, height, width, center, max(right - left, bottom - top))
+        mask = blob(random, height, width, center, float(max(right - left, bottom - top)))
         pixels += mask[..., None] * (texture(random, height, width) - pixels)
         hidden = [np.maximum(other, mask) for other in hidden]
 

@@ -7,11 +7,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Number = float | int
+Points = Sequence[Any] | NDArray[Any]
+"""A point (3,), or a list of them (points, 3), or of those."""
 Color = tuple[float, float, float]
 
 
@@ -61,7 +65,7 @@ class Body:
         self.add(solid, color)
         self.add(transformed(solid, scale=(-1.0, 1.0, 1.0)), color)
 
-    def turned(self, *angles: float) -> "Body":
+    def turned(self, *angles: Number) -> "Body":
         """One copy of this body for each angle (radians), turned by it about the vertical."""
         whole = Body()
         for angle in angles:
@@ -98,17 +102,17 @@ class Body:
         )
 
 
-def transformed(solid: Solid, *, scale: ArrayLike = 1.0, shift: ArrayLike = 0.0) -> Solid:
+def transformed(solid: Solid, *, scale: Points = (1.0, 1.0, 1.0), shift: Points = (0.0, 0.0, 0.0)) -> Solid:
     """Scaled per axis, then shifted."""
     return Solid(solid.vertices * np.asarray(scale) + np.asarray(shift), solid.faces)
 
 
-def off(point: ArrayLike, x: float, y: float, z: float) -> Array:
+def off(point: Points, x: Number, y: Number, z: Number) -> Array:
     """The point that far from another."""
     return np.asarray(point) + np.array([x, y, z])
 
 
-def box(size: ArrayLike, center: ArrayLike) -> Solid:
+def box(size: Points, center: Points) -> Solid:
     """An upright box: (width in x, length in y, height in z)."""
     return transformed(_unit_box(), scale=size, shift=center)
 
@@ -119,7 +123,7 @@ def _unit_box() -> Solid:
     return loft([np.insert(square, 2, height, axis=1) for height in (-0.5, 0.5)])
 
 
-def loft(rings: ArrayLike, *, smooth: bool = False) -> Solid:
+def loft(rings: Points, *, smooth: bool = False) -> Solid:
     """The hull of a stack of rings (rings, points, 3), closed by a flat cap at either end.
 
     A ring may shrink to a point. `smooth` shades across the ring's points, but not over the rim of a cap.
@@ -161,7 +165,7 @@ def _circle(sides: int) -> Array:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Solid:
+def lathe(profile: Sequence[tuple[Number, Number]], sides: int = 24) -> Solid:
     """A body of revolution about z: (radius, height) pairs from the bottom up."""
     rings = np.empty((len(profile), sides, 3))
     for layer, (radius, height) in enumerate(profile):
@@ -171,7 +175,7 @@ def lathe(profile: Sequence[tuple[float, float]], sides: int = 24) -> Solid:
 
 
 def rod(
-    start: ArrayLike, end: ArrayLike, radius: float, end_radius: float | None = None, sides: int = 6
+    start: Points, end: Points, radius: Number, end_radius: Number | None = None, sides: int = 6
 ) -> Solid:
     """A straight round bar, or a cone."""
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
@@ -189,14 +193,14 @@ def rod(
     return loft([first + radii[0] * circle, last + radii[1] * circle], smooth=sides > 6)
 
 
-def wheel(center: ArrayLike, radius: float, width: float, sides: int = 16) -> Solid:
+def wheel(center: Points, radius: Number, width: Number, sides: int = 16) -> Solid:
     """A disc that turns about x."""
     middle = np.asarray(center, dtype=np.float64)
     half = np.array([width / 2, 0, 0])
     return rod(middle - half, middle + half, radius, sides=sides)
 
 
-def ring(center: ArrayLike, radius: float, thickness: float, sides: int = 20, around: int = 5) -> Solid:
+def ring(center: Points, radius: Number, thickness: Number, sides: int = 20, around: int = 5) -> Solid:
     """A torus that turns about x: `radius` to the middle of a tyre of `thickness` (its diameter)."""
     out, along = _circle(sides), _circle(around)
     reach = radius + thickness / 2 * along[:, 0]
@@ -213,24 +217,24 @@ def _ring_faces(sides: int, around: int) -> NDArray[np.int64]:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def ellipsoid(center: ArrayLike, radii: ArrayLike, sides: int = 14, layers: int = 9) -> Solid:
+def ellipsoid(center: Points, radii: Points, sides: int = 14, layers: int = 9) -> Solid:
     angle = np.linspace(-np.pi / 2, np.pi / 2, layers)
     unit = lathe([(float(np.cos(a)), float(np.sin(a))) for a in angle], sides)
     return transformed(unit, scale=radii, shift=center)
 
 
-def plate(outline: ArrayLike, offset: ArrayLike) -> Solid:
+def plate(outline: Points, offset: Points) -> Solid:
     """A convex plane outline (points, 3), thickened by the vector `offset` to both sides."""
     points, half = np.asarray(outline, dtype=np.float64), np.asarray(offset, dtype=np.float64) / 2
     return loft([points - half, points + half])
 
 
-def side_plate(outline: Sequence[tuple[float, float]], x: float, thickness: float) -> Solid:
+def side_plate(outline: Sequence[tuple[Number, Number]], x: Number, thickness: Number) -> Solid:
     """A convex outline of (y, z) pairs, thick in x, its middle at `x`."""
     return plate([(x, y, z) for y, z in outline], (thickness, 0, 0))
 
 
-def tapered(levels: Sequence[tuple[float, float, float, float]], middle: float = 0.0) -> Solid:
+def tapered(levels: Sequence[tuple[Number, Number, Number, Number]], middle: Number = 0.0) -> Solid:
     """A stack of level rectangles (half width, y in front, y behind, height) about x = `middle`."""
     rings = [
         [(middle + half, near, z), (middle + half, far, z), (middle - half, far, z), (middle - half, near, z)]
@@ -239,7 +243,7 @@ def tapered(levels: Sequence[tuple[float, float, float, float]], middle: float =
     return loft(rings)
 
 
-def rounded(width: float, low: float, high: float, y: float, bevel: float = 0.25) -> Array:
+def rounded(width: Number, low: Number, high: Number, y: Number, bevel: Number = 0.25) -> Array:
     """A ring of eight points across y: a rectangle, its corners cut by `bevel` of the shorter half side."""
     half, middle, tall = width / 2, (low + high) / 2, (high - low) / 2
     cut = bevel * min(half, tall)

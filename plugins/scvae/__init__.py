@@ -1,1 +1,1 @@
-"""Simplified conditional variational autoencoder: an infinite mixture with a standard normal prior (thesis §3.5.2)."""
+"""Simplified conditional variational autoencoder (thesis §3.5.2)."""

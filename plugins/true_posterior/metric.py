@@ -1,7 +1,7 @@
 """The azimuth density against what is truly known of the azimuth of a symmetric object."""
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +15,7 @@ from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
-CHUNK = 96  # grid points evaluated at once: memory is CHUNK × batch × components
+CHUNK = 16  # azimuths evaluated at once: CHUNK × batch × components numbers should stay in the cache
 
 
 class TruePosterior(Metric):
@@ -57,6 +57,10 @@ class TruePosterior(Metric):
         "mode_mass_min": "least mode mass",
         "uniform_gap": "gap to uniform",
     }
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
+        "mode_mass_min": "higher",
+        "uniform_gap": "lower",
+    }
     count: Tensor
     entropy: Tensor
     samples_with: Tensor
@@ -67,7 +71,7 @@ class TruePosterior(Metric):
         self,
         target: Target,
         *,
-        points: Annotated[int, Field(ge=180)] = 1440,
+        points: Annotated[int, Field(ge=180)] = 720,
         largest_symmetry: Annotated[int, Field(ge=2, le=36)] = 16,
     ) -> None:
         super().__init__()
@@ -158,7 +162,7 @@ def entropy_and_mode_mass(
     weight = log_density.exp() * step
     total = weight.sum(0)
     # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
-    entropy = -(weight * log_density.clamp(min=-1e4)).sum(0) / total + 0
+    entropy = -(weight * log_density.clamp(min=-1e4)).sum(0) / total
     mass = _mass_by_mode(relative.unsqueeze(-1).expand_as(weight), weight / total, symmetry, modes, step)
     narrow = ~((total - 1).abs() < 0.01)
     if narrow.any():

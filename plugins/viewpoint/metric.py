@@ -1,7 +1,7 @@
 """Acc_π/6 and MedErr of Tulsiani & Malik (2015) on the geodesic distance between rotations."""
 
 import math
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -35,6 +35,7 @@ class Viewpoint(Metric):
   year      = {2015}
 }"""
     columns: ClassVar[dict[str, str]] = {"acc_pi_6": "Acc π/6", "mederr_deg": "MedErr °"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"acc_pi_6": "higher", "mederr_deg": "lower"}
     errors: list[Tensor] | Tensor
 
     def __init__(self, target: Target) -> None:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.density import circular, marginal, median
+from framework.density import circular, marginal, median, pick, take
 from plugins.von_mises import functions
 
 
@@ -17,7 +17,7 @@ class VonMises(Distribution):
         concentration: (*batch, angle), κ ≥ 0; 0 is the uniform density.
     """
 
-    arg_constraints = {}
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
 
     def __init__(
@@ -55,6 +55,11 @@ class VonMises(Distribution):
 def _(density: VonMises, index: int) -> VonMises:
     here = slice(index, index + 1)
     return VonMises(density.location[..., here], density.concentration[..., here])
+
+
+@pick.register
+def _(density: VonMises, index: Tensor) -> VonMises:
+    return VonMises(take(density.location, index), take(density.concentration, index))
 
 
 @median.register

@@ -1,8 +1,8 @@
 """The von Mises density p(φ) = exp(κ cos(φ-μ)) / (2π I0(κ)) (thesis eq. 3.3), accurate from κ = 0 to 1e30.
 
-Nothing here subtracts two large numbers that nearly agree: the density is written as its height at the mean times
-exp(-2κ sin²((φ-μ)/2)), and the Bessel functions come from polynomials (coefficients.py) of what stays smooth from
-κ = 0 to infinity. Every function broadcasts, keeps its arguments' dtype (float32 or float64), and expects κ ≥ 0.
+Nothing here subtracts two large numbers that nearly agree: the density is written as its height at the mean
+times exp(-2κ sin²((φ-μ)/2)), and the Bessel functions come from polynomials (coefficients.py) of what stays
+smooth from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch.autograd import Function
 from plugins.von_mises.coefficients import PIECES
 
 SAMPLING_ROUNDS = 64
-"""Best and Fisher accept at least 65.7 % of proposals: after 64 rounds fewer than one lane in 10^29 is left."""
+"""At least 65.7 % of proposals are accepted: after 64 rounds fewer than one lane in 10^29 is left."""
 
 
 def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
@@ -73,12 +73,12 @@ def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
 
     Args:
         resultant: R, the mean of cos(φ-μ); below 0 it is answered with κ = 0.
-        deviation: V = 1 - R, given beside it because neither can be had from the other: R carries no digits of
-            a large κ and V none of a small one. 0 is answered with infinity.
+        deviation: V = 1 - R, the mean of 2 sin²((φ-μ)/2), given beside it because R carries no digits of a
+            large κ and V none of a small one. 0 is answered with infinity.
     """
     resultant, deviation = resultant.double().clamp(min=0), deviation.double()
     spread_out = resultant < 0.5
-    # starting values within 10 %: series of A at 0 (Mardia & Jupp 2000, 5.3.7-9), and 1 - A = 1/(2κ) + 1/(8κ²) + ...
+    # starts within 10 %: the series of the inverse at R = 0 and V = 0 (Mardia & Jupp 2000, 5.3.9-10)
     small = resultant * (2 + resultant**2 + 5 / 6 * resultant**4)
     concentration = torch.where(spread_out, small, 0.5 / deviation + 0.25)
     tiny = torch.finfo(torch.float64).tiny
@@ -99,8 +99,8 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     """One angle in [-π, π] per element, by rejection (Best & Fisher 1979), float64 inside.
 
     Best and Fisher propose from a wrapped Cauchy of the same peak; with t = tan(θ/2) its proposal is
-    t = (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): no cancellation at any κ. Lanes
-    that have not accepted after SAMPLING_ROUNDS keep their last proposal, so that no input can hang the loop.
+    t = (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ.
+    Lanes that have not accepted after SAMPLING_ROUNDS keep their last proposal: no input can hang the loop.
     """
     mean, concentration = torch.broadcast_tensors(mean, concentration)
     kappa = concentration.double().flatten()
@@ -123,22 +123,30 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
         rejected = ~(accept < cost * torch.exp(1 - cost))
         lanes, kappa, scale, floor = lanes[rejected], kappa[rejected], scale[rejected], floor[rejected]
     angle = mean.double() + 2 * torch.atan(half_tangent).reshape(mean.shape)
-    return torch.remainder(angle + math.pi, 2 * math.pi).sub(math.pi).to(mean.dtype)
+    wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+    # angles that need no wrapping keep their last digits
+    return torch.where(angle.abs() <= math.pi, angle, wrapped).to(mean.dtype)
 
 
 def _polynomial(name: str, concentration: Tensor) -> Tensor:
     """One of the smooth functions of v = 2/(κ+2) in fit_coefficients.py; branch-free, so that it compiles."""
     dtype = "float32" if concentration.dtype == torch.float32 else "float64"
+    tracked = torch.is_grad_enabled() and concentration.requires_grad
     v = 2 / (concentration + 2)
     found = None
     for middle, half_width, coefficients in PIECES[dtype][name]:
         y = (v - middle) / half_width
         total = torch.full_like(y, coefficients[-1])
         for coefficient in coefficients[-2::-1]:
-            total = total * y + coefficient
+            # in place it takes half the time, but autograd needs the steps
+            total = total * y + coefficient if tracked else total.mul_(y).add_(coefficient)
         found = total if found is None else torch.where(v < middle - half_width, found, total)
     assert found is not None
     return found
+
+
+def _log_peak(concentration: Tensor) -> Tensor:
+    return torch.log(concentration + 2) / 2 - _polynomial("log_peak", concentration)
 
 
 def _one_minus_ratio(concentration: Tensor) -> Tensor:
@@ -156,7 +164,7 @@ class _Fall(Function):
         return concentration * unit_fall
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         value, mean, concentration, unit_fall, sine = ctx.saved_tensors
         if torch.is_grad_enabled():  # a second derivative is wanted: the same in operations that have one
             half_sine, half_cosine = half_angle(value, mean)
@@ -176,10 +184,10 @@ class _LogPeak(Function):
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
         ctx.save_for_backward(concentration)
-        return torch.log(concentration + 2) / 2 - _polynomial("log_peak", concentration)
+        return _log_peak(concentration)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         (concentration,) = ctx.saved_tensors
         return grad * mean_deviation(concentration)
 
@@ -193,7 +201,7 @@ class _OneMinusRatio(Function):
         return _one_minus_ratio(concentration)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         (concentration,) = ctx.saved_tensors
         return -grad * mean_resultant_slope(concentration)
 
@@ -208,7 +216,7 @@ class _Ratio(Function):
         return _polynomial("ratio", concentration) * part
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         (concentration,) = ctx.saved_tensors
         return grad * mean_resultant_slope(concentration)
 
@@ -217,12 +225,11 @@ class _Entropy(Function):
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
         ctx.save_for_backward(concentration)
-        height = torch.log(concentration + 2) / 2 - _polynomial("log_peak", concentration)
         part = 1 / (2 + 1 / concentration)  # κ/(1+2κ)
-        return part * _polynomial("one_minus_ratio", concentration) - height
+        return part * _polynomial("one_minus_ratio", concentration) - _log_peak(concentration)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         (concentration,) = ctx.saved_tensors
         # -κ A'(κ), the product ordered so that nothing under- or overflows
         part = 2 / (concentration + 2)

@@ -1,6 +1,7 @@
 """The von Mises head: one mean and one concentration per angle."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -8,6 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.density_head import DensityHead
+from framework.raw_numbers import require_finite
 from framework.target import Target
 from plugins.von_mises import functions
 from plugins.von_mises.density import VonMises
@@ -19,16 +21,20 @@ LARGEST_CONCENTRATION = 1e12
 class VonMisesHead(DensityHead):
     """One von Mises density per angle: biternion mean, predicted or one global concentration (thesis §3.4).
 
-    With `concentration="predicted"` it reads (cos, sin, raw concentration) per angle and trains by likelihood
-    (eq. 3.7). With "fixed" it reads (cos, sin), trains with κ = 1, which is the cosine loss of Biternion networks up
-    to constants (eq. 3.8-3.9), and `calibrate` sets one κ per angle by maximum likelihood (eq. 3.5).
+    With `concentration="predicted"` it reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with
+    κ = |(cos, sin)| g(r): up to the scale g(r) the pair is the density's natural parameter, so that the uniform
+    density is a point like any other. Were the pair normalised, as in eq. 3.1, and κ = g(r), the gradients in
+    both would vanish with κ, and a network that begins by finding an angle unpredictable stays there (README).
+
+    With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to
+    constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on validation (eq. 3.5).
 
     Args:
         concentration: where κ comes from.
-        floor: the least κ that can be predicted.
+        floor: the least κ.
     """
 
-    knobs = {}
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = """@inproceedings{prokudin2018deep,
   title = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
   author = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
@@ -56,17 +62,17 @@ class VonMisesHead(DensityHead):
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> VonMises:
         number = self._per_angle(raw)
-        mean = biternion_angle(number[..., 0], number[..., 1])
+        mean, length = polar(number[..., 0], number[..., 1])
         if self.predicted:
-            return VonMises(mean, self.floor + concentration_of_raw(number[..., 2]))
+            concentration = self.floor + length.clamp(max=1e24) * scale_of_raw(number[..., 2])
+            return VonMises(mean, concentration.clamp(max=LARGEST_CONCENTRATION))
         return VonMises(mean, self.concentration.to(mean).expand_as(mean))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        if self.predicted:
-            return -self(raw).log_prob(target)
-        number = self._per_angle(raw)
-        mean = biternion_angle(number[..., 0], number[..., 1])
-        return -VonMises(mean, torch.ones_like(mean)).log_prob(target)
+        density = self(raw)
+        if not self.predicted:  # the cosine loss does not change with calibration
+            density = VonMises(density.mean, torch.ones_like(density.mean))
+        return -density.log_prob(target)
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
@@ -80,34 +86,27 @@ class VonMisesHead(DensityHead):
         self.concentration.copy_(found.clamp(self.floor, LARGEST_CONCENTRATION))
 
     def _per_angle(self, raw: Tensor) -> Tensor:
-        if raw.shape[-1] != self.size:
-            raise ValueError(
-                f"raw numbers of shape {tuple(raw.shape)}; wanted {self.size} in the last dimension."
-            )
-        bad = ~raw.isfinite().all(-1)
-        if bad.any():
-            row = tuple(bad.nonzero()[0].tolist())
-            raise ValueError(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
-        number = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
-        return number.unflatten(-1, (self.angles, -1))
+        return require_finite(raw, self.size).unflatten(-1, (self.angles, -1))
 
 
-def biternion_angle(
+def polar(
     cosine: Float[Tensor, "*shape"], sine: Float[Tensor, "*shape"]
-) -> Float[Tensor, "*shape"]:
-    """The angle of the normalised pair (eq. 3.1), radians; 0 with zero gradient for a pair shorter than 1e-18."""
-    # the angle does not depend on the pair's length: divided away so that squares neither over- nor underflow
-    length = torch.maximum(cosine.detach().abs(), sine.detach().abs())
-    none = length < 1e-18
-    length = torch.where(none, 1, length)
-    return torch.atan2(torch.where(none, 0, sine / length), torch.where(none, 1, cosine / length))
+) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+    """Angle, radians, and length of a pair (eq. 3.1), with finite gradients at any pair, also at zero."""
+    shortest = 1e-18
+    # pushed off zero, where the angle has no gradient; the gradient of length × cos(φ - angle) stays right there
+    cosine = torch.where((cosine.abs() < shortest) & (sine.abs() < shortest), cosine + 2 * shortest, cosine)
+    # the larger of the two is divided away so that no square over- or underflows
+    size = torch.maximum(cosine.detach().abs(), sine.detach().abs())
+    cosine, sine = cosine / size, sine / size
+    return torch.atan2(sine, cosine), size * (cosine.square() + sine.square()).sqrt()
 
 
-def concentration_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """exp(r) for r ≤ 0 and (1 + r/4)⁴ above: κ = 1 at 0, smooth, at most LARGEST_CONCENTRATION.
+def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """g(r) = exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_CONCENTRATION.
 
-    The Fisher information of log κ is nearly constant (1/2 for large κ), so a logarithmic map trains best; the power
-    keeps that shape over the κ that occur, but neither overflows nor lets one outlier's gradient explode as exp does.
+    The Fisher information of log κ is nearly constant (1/2 for large κ), so a logarithmic map trains best;
+    the power keeps that shape over the κ that occur, but lets neither κ nor an outlier's gradient explode.
     """
     most = 4 * (LARGEST_CONCENTRATION**0.25 - 1)
     high = (1 + raw.clamp(0, most) / 4).square().square()

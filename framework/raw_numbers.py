@@ -1,0 +1,36 @@
+"""What every density head does with the raw numbers it reads: checks them, and refuses components it cannot use."""
+
+import torch
+from torch import Tensor
+
+from framework.density_head import DensityHead
+from framework.errors import ConfigError
+
+
+def require_finite(raw: Tensor, size: int) -> Tensor:
+    """`raw` (*batch, size) itself, half precision upcast to float32.
+
+    Raises:
+        ValueError: another last dimension, or a number that is not finite; names the first such batch row.
+    """
+    if raw.shape[-1] != size:
+        raise ValueError(f"raw numbers of shape {tuple(raw.shape)}; wanted {size} in the last dimension.")
+    if not raw.isfinite().all():
+        row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
+        raise ValueError(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
+    return raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
+
+
+def require_trained(component: DensityHead) -> DensityHead:
+    """The component itself, if all it has is trained by gradient.
+
+    Raises:
+        ConfigError: it fits something after training, for which it would have to know which data belong to it.
+    """
+    fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
+    if fitted:
+        raise ConfigError(
+            f"density_head.component fits {', '.join(sorted(fitted))} after training, which a component cannot; "
+            "choose one that predicts it, such as concentration=predicted."
+        )
+    return component
