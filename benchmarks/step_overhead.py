@@ -21,7 +21,7 @@ from framework.assembly import build_predictor, resolve_all
 from framework.batches import Batches
 from framework.data import Batch
 from framework.fields import Fields
-from framework.settings import OptimizerSettings, Settings
+from framework.settings import OptimizerSettings
 from framework.signals import Stopper
 from framework.target import Target
 from framework.tracking import NoTracker

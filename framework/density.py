@@ -2,6 +2,7 @@
 
 import math
 from functools import singledispatch
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -9,7 +10,6 @@ from torch.distributions import Distribution, Independent, Normal, constraints
 
 from framework.circular import circular_median, grid
 from framework.errors import UserError
-
 
 CHUNK = 2**20
 """Component densities evaluated at once without gradient, when one density is asked at many points."""
@@ -26,7 +26,7 @@ class Mixture(Distribution):
     of one term is that term.
     """
 
-    arg_constraints = {}
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     has_rsample = False
 
     def __init__(self, log_weights: Tensor, components: Distribution) -> None:
@@ -40,7 +40,7 @@ class Mixture(Distribution):
         super().__init__(components.batch_shape[:-1], components.event_shape, validate_args=False)
 
     @property
-    def support(self) -> constraints.Constraint:
+    def support(self) -> constraints.Constraint | None:
         return self.components.support
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -111,7 +111,7 @@ def pick(density: Distribution, index: Tensor) -> Distribution:
 class _Picked(Distribution):
     """Samples of one component each, by drawing all."""
 
-    arg_constraints = {}
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
     def __init__(self, density: Distribution, index: Tensor) -> None:
         self.density = density

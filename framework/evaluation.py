@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
-from torchmetrics import Metric as AnyMetric
 
 from framework.batches import seed_step
 from framework.cost import Cost, measure
@@ -42,8 +42,8 @@ def evaluate(
     """Every metric over every batch; noise is a function of (seed, batch), so a second call gives the same bits."""
     predictor.eval().to(device)
     several = len(groups) > 1
-    apart = {name: [metric.clone().to(device) for metric in metrics] for name in groups} if several else {}
-    together = [metric.clone().to(device) for metric in metrics]
+    apart = {name: _fresh(metrics, device) for name in groups} if several else {}
+    together = _fresh(metrics, device)
     for number, batch in enumerate(on_device(batches, device)):
         seed_step(seed, number, "test")
         _update(together, predictor, batch, samples)
@@ -55,13 +55,17 @@ def evaluate(
     return Evaluation(_numbers(together), {name: _numbers(group) for name, group in apart.items()})
 
 
+def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
+    return [cast(Metric, metric.clone().to(device)) for metric in metrics]
+
+
 def _update(metrics: Sequence[Metric], predictor: Predictor, batch: Batch, samples: int) -> None:
     prediction = Prediction(predictor(batch["input"]), batch, samples)
     for metric in metrics:
         metric.update(prediction)
 
 
-def _numbers(metrics: Sequence[AnyMetric]) -> dict[str, float]:
+def _numbers(metrics: Sequence[Metric]) -> dict[str, float]:
     found: dict[str, float] = {}
     for metric in metrics:
         found |= {name: float(value) for name, value in metric.compute().items()}

@@ -1,6 +1,7 @@
 """Images on the way to a network: reading files, square crops, data sets of crops, augmentation, pictures."""
 
 import math
+import os
 import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from torch.utils.data import Dataset
 from framework.errors import DataError
 from framework.fields import Fields
 
-READERS = 2
+READERS = min(8, os.cpu_count() or 1)
 """Threads that decode at once."""
 IN_MEMORY = 2 * 2**30
 """Bytes of crops up to which they are kept in memory."""

@@ -3,7 +3,7 @@
 import ast
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,18 @@ from framework.errors import ConfigError, did_you_mean
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
 
+Entry = Any
+"""An importlib.metadata.EntryPoint, or that of its backport, which takes over once MLflow has been imported."""
+
 
 @cache
-def installed(group: str) -> dict[str, EntryPoint]:
+def installed(group: str) -> dict[str, Entry]:
     """Name and entry point of everything installed under `framework.<group>`, sorted by name.
 
     Raises:
         ConfigError: two distributions give different things the same name.
     """
-    found: dict[str, EntryPoint] = {}
+    found: dict[str, Entry] = {}
     for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
         other = found.setdefault(entry.name, entry)
         if other.value != entry.value:
@@ -31,12 +34,12 @@ def installed(group: str) -> dict[str, EntryPoint]:
     return found
 
 
-def origin(entry: EntryPoint) -> str:
+def origin(entry: Entry) -> str:
     """Distribution and version an entry point comes from, e.g. 'their-package 1.2'."""
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"
 
 
-def find(group: str, name: str) -> EntryPoint:
+def find(group: str, name: str) -> Entry:
     """The entry point called `name`.
 
     Raises:
@@ -129,7 +132,7 @@ class Description:
     bibtex: str
 
 
-def describe(group: str, entry: EntryPoint) -> Description:
+def describe(group: str, entry: Entry) -> Description:
     """First docstring line and BibTeX of the class an entry point names."""
     summary, bibtex = "(source not found)", ""
     module, _, attribute = entry.value.partition(":")

@@ -33,8 +33,8 @@ class Renderer(ABC):
 
     Keyword-only constructor parameters are the config. A renderer has no state that one call leaves for the next
     (buffers it reuses are its own affair), so that calls may come in any order. A triangle with a vertex behind the
-    near plane, a coordinate that is not finite or no area (at the renderer's own precision) is left out, never drawn wrong; a scene out of view
-    gives the background. Where two surfaces are equally far, the lower face index wins.
+    near plane, a coordinate that is not finite or no area (at the renderer's own precision) is left out, never drawn
+    wrong; a scene out of view gives the background. Where two surfaces are equally far, the lower face index wins.
     """
 
     group: ClassVar[str] = "renderer"

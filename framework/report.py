@@ -55,7 +55,7 @@ def report_test(
     )
     spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
-    better: Better = {key: way for metric in metrics for key, way in metric.better.items()} | COST_BETTER
+    better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     results = _results(run, data, found, spent, columns, better)
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")

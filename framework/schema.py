@@ -121,7 +121,9 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
         if fault["type"] == "missing":
             raise ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.") from None
         if fault["type"] == "literal_error":
-            hint = did_you_mean(str(fault["input"]), fault["ctx"]["expected"].replace("'", "").split(" or "))
+            hint = did_you_mean(
+                str(fault["input"]), fault.get("ctx", {})["expected"].replace("'", "").split(" or ")
+            )
         else:
             hint = ""
         raise ConfigError(f"{where} = {fault['input']!r}: {fault['msg']}.{hint}") from None

@@ -59,7 +59,7 @@ def test_an_experiment_is_its_differences(name: str) -> None:
     ],
 )
 def test_a_mistake_becomes_a_sentence(overrides: list[str], message: str) -> None:
-    with pytest.raises(Exception) as caught:  # noqa: PT011  Hydra raises what it likes
+    with pytest.raises(Exception) as caught:
         composed(*overrides)
     said = sentence(caught.value)
     assert said is not None

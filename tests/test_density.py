@@ -1,10 +1,11 @@
 """Mixture, marginals, medians and quadratures of densities that no method owns."""
 
 import math
+from typing import ClassVar
 
 import pytest
 import torch
-from torch.distributions import Distribution, Independent, Normal
+from torch.distributions import Distribution, Independent, Normal, constraints
 
 from framework.density import Mixture, circular, circular_entropy, circular_grid, marginal, median, pick
 from framework.errors import UserError
@@ -19,7 +20,7 @@ def normals(*shape: int) -> Independent:
 class Cardioid(Distribution):
     """(1 + 2ρ cos φ) / 2π: a density on the circle with a closed-form entropy series, for reference."""
 
-    arg_constraints = {}
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = circular
 
     def __init__(self, rho: torch.Tensor) -> None:

@@ -18,4 +18,4 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
             f"mode.run={target}: {target / 'run.json'} does not exist. Give the folder of a run."
         )
     sent = sync(target)
-    Console().print(f"{sent} metric lines sent from {target}.")
+    Console().print(f"{sent} journal lines sent from {target}.")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.callbacks import EarlyStopping, RichProgressBar
 from rich.console import Console
 
 from framework.assembly import (
@@ -85,6 +86,7 @@ def _run(run: Run) -> float:
 def _fit(run: Run, training: Training, batches: Batches, trainer: pl.Trainer, console: Console) -> None:
     resume = latest_good(run.checkpoints) if run.resumed else None
     if run.resumed and resume is None:
+        run.tracker.drop_after(0)
         console.print("nothing to resume from yet: starting from the beginning.")
     if resume is not None:
         step = int(read(resume)["global_step"])
@@ -103,10 +105,10 @@ def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
         StopAtBatch(run.stopper, keep),
     ]
     if patience:
-        callbacks.append(pl.callbacks.EarlyStopping("validation/loss", patience=patience, check_finite=True))
+        callbacks.append(EarlyStopping("validation/loss", patience=patience, check_finite=True))
     terminal = Console(stderr=True).is_terminal
     if terminal:
-        callbacks.append(pl.callbacks.RichProgressBar())
+        callbacks.append(RichProgressBar())
     arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
     defaults = {"enable_progress_bar": terminal, "enable_model_summary": False, "num_sanity_val_steps": 0}
     return pl.Trainer(

@@ -21,8 +21,8 @@ class MixtureHead(DensityHead):
     """Finite mixture of any other head's densities, weights by softmax (thesis eq. 3.10-3.11).
 
     Reads K logits, then K times what the component reads, then that once more, which is added to all K: what every
-    component must know is learnt by all at once, and none falls behind (README). A component that is fitted after training (it keeps
-    a buffer) is refused, because which data belongs to it is not known.
+    component must know is learnt by all at once, and none falls behind (README). A component that is fitted after
+    training (it keeps a buffer) is refused, because which data belongs to it is not known.
 
     Args:
         components: K. With 1 the density is the component, to the last bit.

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 from scipy.io.matlab import mat_struct
 
 from framework.errors import DataError
 from framework.images import Box
+from plugins.pascal3d.matlab import read_variables
 
 CLASSES = (
     "aeroplane", "bicycle", "boat", "bottle", "bus", "car",
@@ -129,14 +129,14 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     for number, entry in enumerate(_structs(getattr(record, "objects", None)), start=1):
         if _text(entry, "class") != category:
             continue
-        corners = np.atleast_1d(np.asarray(_filled(entry, "bbox", []), dtype=np.float64)).ravel()
-        if corners.shape != (4,) or not np.isfinite(corners).all():
+        corners = _numbers(entry, "bbox")
+        if len(corners) != 4 or not all(map(math.isfinite, corners)):
             raise DataError(
-                f"{file}: object {number} has the bbox {corners.tolist()}; wanted four finite numbers "
-                "x1 y1 x2 y2. Mend the annotation."
+                f"{file}: object {number} has the bbox {corners}; wanted four finite numbers x1 y1 x2 y2. "
+                "Mend the annotation."
             )
-        x1, y1, x2, y2 = corners.tolist()
-        blur = _number(entry, "blur")
+        x1, y1, x2, y2 = corners
+        symmetry = _number(entry, "symmetry")
         found.append(
             Annotation(
                 file=file,
@@ -146,8 +146,8 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
                 truncated=bool(_number(entry, "truncated")),
                 occluded=bool(_number(entry, "occluded")),
                 difficult=bool(_number(entry, "difficult")),
-                symmetry=int(_filled(entry, "symmetry", 1)),
-                blur=blur,
+                symmetry=1 if symmetry is None or not math.isfinite(symmetry) else int(symmetry),
+                blur=_number(entry, "blur"),
             )
         )
     return found
@@ -155,10 +155,7 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
 
 def _load(file: Path) -> mat_struct:
     try:
-        with file.open("rb") as stream:
-            content = scipy.io.loadmat(
-                stream, squeeze_me=True, struct_as_record=False, variable_names=["record"]
-            )
+        content = read_variables(file, ["record"])
     except FileNotFoundError:
         raise DataError(
             f"{file}: no such file, though a list names it. Restore it from the release."
@@ -167,7 +164,7 @@ def _load(file: Path) -> mat_struct:
         raise DataError(
             f"{file}: a MATLAB 7.3 file; wanted version 5, as released. Save it with '-v7'."
         ) from None
-    except Exception as error:  # a damaged file makes SciPy raise nearly anything
+    except Exception as error:  # nearly any, where the file is damaged
         raise DataError(
             f"{file}: cannot be read as a MATLAB file ({error}). Restore it from the release."
         ) from error
@@ -194,21 +191,22 @@ def _structs(value: Any) -> Iterator[mat_struct]:
             yield item
 
 
-def _filled(entry: mat_struct, name: str, default: Any) -> Any:
-    """A field's value; `default` where the field is missing or empty."""
-    value = getattr(entry, name, None)
-    return default if value is None or np.size(value) == 0 else value
-
-
 def _text(entry: mat_struct, name: str) -> str:
-    value = _filled(entry, name, "")
+    """A field's text; nothing where it is missing, empty or no text."""
+    value = getattr(entry, name, None)
     return value.strip() if isinstance(value, str) else ""
 
 
+def _numbers(entry: mat_struct, name: str) -> list[float]:
+    """A field's numbers; none where it is missing, empty or holds something else."""
+    value = np.asarray(getattr(entry, name, None))
+    real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
+    return value.astype(np.float64).ravel().tolist() if real else []
+
+
 def _number(entry: mat_struct, name: str) -> float | None:
-    """A field's number; None where it is missing, empty or no number."""
-    value = np.asarray(_filled(entry, name, [])).ravel()
-    return float(value[0]) if value.size and np.issubdtype(value.dtype, np.number) else None
+    """A field's first number; None where there is none."""
+    return next(iter(_numbers(entry, name)), None)
 
 
 def _angles(viewpoint: Any) -> tuple[float, float, float] | None:

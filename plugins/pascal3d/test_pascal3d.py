@@ -208,6 +208,28 @@ def test_annotation_that_is_cut_short_or_is_another_matrix(tmp_path: Path) -> No
         read_annotations(tmp_path, "car", "pascal", "one")
 
 
+@pytest.mark.filterwarnings("ignore")  # SciPy warns of some damage beside
+def test_damaged_annotations_are_read_or_named(tmp_path: Path) -> None:
+    annotated(tmp_path, CAR, {**CAR, "truncated": 1})
+    file = tmp_path / "Annotations" / "car_pascal" / "one.mat"
+    whole = file.read_bytes()
+    random = np.random.default_rng(0)
+    refused = 0
+    for _ in range(300):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        places = random.integers(128, len(whole), 3)
+        damaged[places] = random.integers(0, 256, 3)
+        file.write_bytes(damaged.tobytes())
+        try:
+            found = read_annotations(tmp_path, "car", "pascal", "one")
+        except DataError as error:
+            assert str(error).startswith(str(file))
+            refused += 1
+        else:
+            assert len(found) <= 2
+    assert refused > 50
+
+
 def test_lists(tmp_path: Path) -> None:
     file = tmp_path / "car_train.txt"
     file.write_text(

@@ -110,22 +110,26 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     gap = (1 + 1 / (root + 2 * kappa) + torch.sqrt(2 * tau)) / span  # 1 - ρ
     scale = gap / (1 + 2 * kappa / span)
     floor = gap * gap * span / 4  # κ(r-1) with r = (1+ρ²)/(2ρ)
-    half_tangent = torch.empty_like(kappa)
-    lanes = torch.arange(kappa.numel(), device=kappa.device)
-    for _ in range(SAMPLING_ROUNDS):
+    half_tangent, rejected = _propose(kappa, scale, floor)
+    lanes = rejected.nonzero().flatten()
+    for _ in range(SAMPLING_ROUNDS - 1):
         if lanes.numel() == 0:
             break
-        uniform, accept = torch.rand(2, lanes.numel(), dtype=torch.float64, device=kappa.device)
-        tangent = scale * torch.tan(math.pi * (uniform - 0.5))
-        half_tangent[lanes] = tangent
-        square = tangent * tangent
-        cost = floor + kappa * (2 * square / (1 + square))
-        rejected = ~(accept < cost * torch.exp(1 - cost))
-        lanes, kappa, scale, floor = lanes[rejected], kappa[rejected], scale[rejected], floor[rejected]
+        half_tangent[lanes], rejected = _propose(kappa[lanes], scale[lanes], floor[lanes])
+        lanes = lanes[rejected]
     angle = mean.double() + 2 * torch.atan(half_tangent).reshape(mean.shape)
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
     # angles that need no wrapping keep their last digits
     return torch.where(angle.abs() <= math.pi, angle, wrapped).to(mean.dtype)
+
+
+def _propose(kappa: Tensor, scale: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
+    """tan(θ/2) of one wrapped Cauchy proposal per lane, and whether it is rejected."""
+    uniform, accept = torch.rand(2, kappa.numel(), dtype=kappa.dtype, device=kappa.device)
+    tangent = scale * torch.tan(math.pi * (uniform - 0.5))
+    square = tangent * tangent
+    cost = floor + kappa * (2 * square / (1 + square))
+    return tangent, ~(accept < cost * torch.exp(1 - cost))
 
 
 def _polynomial(name: str, concentration: Tensor) -> Tensor:

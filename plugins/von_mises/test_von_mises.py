@@ -212,7 +212,7 @@ def test_samples_follow_the_density(concentration):
 def test_sampling_ends_whatever_it_is_given():
     drawn = functions.sample(torch.zeros(4), torch.tensor([math.nan, math.inf, 0.0, 1e38]))
     assert drawn[0].isnan()
-    assert drawn[1:].isfinite().all() or drawn[1].isnan()
+    assert drawn[2:].isfinite().all()
     assert functions.sample(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
 
 
