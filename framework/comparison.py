@@ -8,8 +8,9 @@ from typing import Any
 from rich.console import Console
 
 from framework.report import COST_COLUMNS
+from framework.sweep import RECORD
 from framework.table import aggregate, csv, results_table
-from framework.tracking import MlflowTracker
+from framework.tracking import MlflowTracker, mark_dead
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
@@ -31,8 +32,12 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     """Compare the finished jobs in `folder`: print the table, write comparison.csv and .png, log them to the parent."""
     console = Console()
-    rows = [row for row in (_row(path, overrides) for path in sorted(folder.glob("*/results.json"))) if row]
+    for path in folder.glob("*/run.json"):
+        if _status(path.parent) == "died":
+            mark_dead(path.parent)  # a killed process could not close its run
+    rows = [row for row in (_row(path) for path in sorted(folder.glob("*/results.json"))) if row]
     files: list[Path] = []
+    compared: list[dict[str, object]] = []
     if rows:
         keys = _varied(overrides)
         by = ["method", "data", *(key for key in keys if key not in ("seed", "experiment", "data.category"))]
@@ -44,14 +49,18 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         files.append(folder / "comparison.csv")
         files.extend(_picture(compared, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
-    _close_parent(folder, files, compared if rows else [])
+    _close_parent(folder, files, compared)
 
 
-def _row(path: Path, overrides: Sequence[Sequence[str]]) -> dict[str, Any] | None:
-    results = json.loads(path.read_text(encoding="utf-8"))
-    record = json.loads((path.parent / "job.json").read_text(encoding="utf-8"))
-    if record.get("status") != "completed":
+def _status(folder: Path) -> str:
+    return json.loads((folder / RECORD).read_text(encoding="utf-8")).get("status", "")
+
+
+def _row(path: Path) -> dict[str, Any] | None:
+    if _status(path.parent) != "completed":
         return None
+    results = json.loads(path.read_text(encoding="utf-8"))
+    record = json.loads((path.parent / RECORD).read_text(encoding="utf-8"))
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
     return {**swept, **results}
 
@@ -107,9 +116,9 @@ def _close_parent(folder: Path, files: Sequence[Path], rows: Sequence[Mapping[st
     tracker.open()
     for row in rows:
         numbers = {key: float(value) for key, value in row.items() if isinstance(value, int | float)}
-        name = "/".join(str(row[key]) for key in row if key in ("method",))
+        name = f"{row['method']}/{row['data']}"
         tracker.log_metrics({f"{name}/{key}": value for key, value in numbers.items()}, 0, 0)
     for file in files:
         tracker.log_artifact(file)
-    failed = [record for record in folder.glob("*/job.json") if '"completed"' not in record.read_text()]
+    failed = [record for record in folder.glob(f"*/{RECORD}") if _status(record.parent) != "completed"]
     tracker.close("FAILED" if failed else "FINISHED")

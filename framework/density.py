@@ -60,7 +60,8 @@ class Mixture(Distribution):
 
     def _which(self, shape: torch.Size) -> Tensor:
         whole = shape + self.batch_shape
-        if whole.numel() == 0:  # torch.multinomial refuses to draw nothing
+        # torch.multinomial refuses to draw nothing; and one component's draws are its own, bit by bit
+        if whole.numel() == 0 or self.log_weights.shape[-1] == 1:
             return torch.zeros(whole, dtype=torch.int64, device=self.log_weights.device)
         weights = self.log_weights.exp().reshape(-1, self.log_weights.shape[-1])
         return torch.multinomial(weights, shape.numel(), replacement=True).T.reshape(whole)
@@ -74,14 +75,17 @@ class Mixture(Distribution):
         return modes.gather(0, index.expand(1, *best.shape, *self.event_shape)).squeeze(0)
 
     def entropy(self) -> Tensor:
-        """Nats. Of one angle by quadrature; otherwise the mean of -log_prob over 256 samples a component."""
-        if self.log_weights.shape[-1] == 1:
+        """Nats. Of one angle by quadrature; otherwise the mean of -log_prob over about 1000 samples in all, as many
+        of each component, so that only their spread within components is left to chance."""
+        count = self.log_weights.shape[-1]
+        if count == 1:
             return self.components.entropy().squeeze(-1)
         if self.event_shape == (1,) and self.support is circular:
             return circular_entropy(self)
-        drawn = self.components.sample(torch.Size((256,)))
+        each = max(2, 1024 // count)
+        drawn = self.components.sample(torch.Size((each,)))
         values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
-        surprise = -self.log_prob(values).unflatten(0, (256, -1)).mean(0).movedim(0, -1)
+        surprise = -self.log_prob(values).unflatten(0, (each, count)).mean(0).movedim(0, -1)
         return (self.log_weights.exp() * surprise).sum(-1)
 
 

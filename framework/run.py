@@ -16,10 +16,8 @@ from framework.journal import write_atomically
 from framework.provenance import flatten, git_commit, package_versions
 from framework.settings import Settings
 from framework.signals import Stopped, Stopper
+from framework.sweep import PARENT
 from framework.tracking import MlflowTracker, NoTracker, Tracker, read_run_info
-
-PARENT = "FRAMEWORK_SWEEP_PARENT"
-"""Environment variable by which a sweep tells its jobs the parent run's id."""
 
 
 @dataclass

@@ -192,6 +192,7 @@ def check_gradient(head: DensityHead, target: Target, *, step: float = 1e-5, lim
     for number, (argument, gradient) in enumerate(zip(arguments, gradients, strict=True)):
         torch.manual_seed(number)
         direction = torch.randn_like(argument)
+        direction = direction / direction.norm()
         analytic = 0.0 if gradient is None else (gradient * direction).sum().item()
         ends = []
         with torch.no_grad():

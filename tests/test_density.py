@@ -42,6 +42,10 @@ def test_mixture_of_one_is_its_component_to_the_last_bit() -> None:
     assert torch.equal(mixture.log_prob(value), component.log_prob(value[:, :, None]).squeeze(-1))
     assert torch.equal(mixture.entropy(), component.entropy().squeeze(-1))
     assert torch.equal(mixture.mode, component.base_dist.loc.squeeze(1))
+    torch.manual_seed(3)
+    drawn = mixture.sample((5,))
+    torch.manual_seed(3)
+    assert torch.equal(drawn, component.sample((5,)).squeeze(2))
 
 
 def test_mixture_log_prob_is_the_logarithm_of_the_weighted_sum() -> None:
@@ -98,7 +102,7 @@ def test_monte_carlo_entropy_agrees_with_quadrature() -> None:
     grid = torch.linspace(-12, 12, 20001, dtype=torch.float64)[:, None, None]
     log_density = mixture.log_prob(grid)
     wanted = -(log_density.exp() * log_density).sum().item() * 24 / 20000
-    assert mixture.entropy().item() == pytest.approx(wanted, abs=0.15)
+    assert mixture.entropy().item() == pytest.approx(wanted, abs=0.1)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.2, 0.45])

@@ -30,6 +30,7 @@ from framework.model import Predictor
 from framework.report import report_test, report_training
 from framework.run import Run, opened
 from framework.settings import TRAINER_OURS, Settings, check_trainer_keys
+from framework.sweep import RECORD, leave_value
 from framework.training import KeepCheckpoints, Report, StopAtBatch, Training
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -38,7 +39,10 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> float:
     """Returns the best validation loss, nats: what a sweeper minimises."""
     with opened(folder, values, settings, overrides) as run:
-        return _run(run)
+        loss = _run(run)
+    if (folder / RECORD).is_file():  # this is a job of a sweep
+        leave_value(folder, loss)
+    return loss
 
 
 def _run(run: Run) -> float:

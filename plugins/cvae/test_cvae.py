@@ -92,7 +92,7 @@ def test_density(config, target):
         testing.check_samples(alone)
         if target is TWO:
             testing.check_normalised(density.mixture, points=256)
-            testing.check_marginal(density.mixture, points=128)
+            testing.check_marginal(density.mixture, points=256)
 
 
 # one latent dimension, where the integral (eq. 3.12) is a sum

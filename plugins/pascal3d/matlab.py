@@ -2,7 +2,7 @@
 
 SciPy's reader can crash the process on a file with a wrong byte in it (seen with SciPy 1.17). So the file's outline
 is checked first: what MATLAB compressed has a checksum, and of what is not compressed every element must be of a
-known type and lie within the one that holds it.
+known type and lie within the one that holds it. Complex numbers, which annotations do not hold, are refused.
 """
 
 import io
@@ -14,7 +14,8 @@ from typing import Any
 import scipy.io
 
 HEADER_BYTES = 128
-MATRIX, COMPRESSED = 14, 15
+UNSIGNED, MATRIX, COMPRESSED = 6, 14, 15
+COMPLEX = 0x0800
 PLAIN_TYPES = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
 """Element types of the MAT-File Format, table 1-1: integers, floating point and text."""
 
@@ -63,6 +64,12 @@ def _check_element(content: bytes, kind: int, start: int, end: int, order: str) 
     position = start
     while position < end:
         inner, first, last = _element(content, position, end, order)
+        if position == start:
+            if inner != UNSIGNED or last - first != 8:
+                raise ValueError(f"a matrix without its flags at byte {start}")
+            (flags,) = struct.unpack_from(f"{order}I", content, first)
+            if flags & COMPLEX:  # SciPy looks for an imaginary part, whether there is one or not
+                raise ValueError(f"complex numbers at byte {start}")
         _check_element(content, inner, first, last, order)
         position = _padded(last)
 
