@@ -18,7 +18,9 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
     logger = config.get("logger") or {}
     if logger.get("name") != "mlflow":
         return None
-    tracker = _parent(folder, logger, None)
+    earlier = folder / "parent.json"  # of the sweep that is being resumed
+    known = json.loads(earlier.read_text(encoding="utf-8"))["run_id"] if earlier.is_file() else None
+    tracker = _parent(folder, logger, known)
     tracker.open()
     tracker.set_tags({"mode": "sweep", "folder": str(folder)})
     run_id = tracker.run_id

@@ -17,7 +17,7 @@ class DataError(UserError):
 
 
 class CheckpointError(UserError):
-    """A checkpoint is damaged, or belongs to another model."""
+    """A checkpoint is damaged, belongs to another model, or finds no room on the disk."""
 
 
 class NonFiniteLoss(UserError):

@@ -124,7 +124,8 @@ class KeepCheckpoints(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if self.every_steps and trainer.global_step % self.every_steps == 0:
+        # not at an epoch's last batch: a run resumed from there would skip the validation that is about to come
+        if self.every_steps and trainer.global_step % self.every_steps == 0 and not trainer.is_last_batch:
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -171,7 +172,8 @@ class Report(pl.Callback):
 
 
 class StopAtBatch(pl.Callback):
-    """While fitting, a signal waits for the batch to end; then last.ckpt is saved and the run stops."""
+    """While fitting, a signal waits for the batch to end, or for the epoch's end if it is the last one; then last.ckpt is
+    saved and the run stops."""
 
     def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:
         self.stopper = stopper
@@ -186,9 +188,13 @@ class StopAtBatch(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if self.stopper.received is not None:
+        if self.stopper.received is not None and not trainer.is_last_batch:
             self.keep.save_last(trainer)
             self.stopper.stop()
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if self.stopper.received is not None:
+            self.stopper.stop()  # KeepCheckpoints, called before, has saved
 
     def on_validation_batch_end(
         self,

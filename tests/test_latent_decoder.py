@@ -8,17 +8,18 @@ from framework.latent_decoder import LARGEST_FEATURE, LatentDecoder
 def test_it_is_a_network_of_both_plus_a_path_of_each() -> None:
     torch.manual_seed(0)
     decoder = LatentDecoder(latent=3, hidden=5, numbers=4).double()
-    features, z = torch.randn(2, 1, 5, dtype=torch.float64), torch.randn(2, 7, 3, dtype=torch.float64)
-    found = decoder(features, z)
-    gate = decoder.gate.weight.reshape(4, 3, 5)
+    assert decoder.size == 5 + 4 + 12
+    raw = torch.randn(2, 1, decoder.size, dtype=torch.float64)
+    z = torch.randn(2, 7, 3, dtype=torch.float64)
+    found = decoder(raw, z)
     for item in range(2):
-        active = features[item, 0].clamp(min=0)
+        features, shared, turned = raw[item, 0, :5], raw[item, 0, 5:9], raw[item, 0, 9:].reshape(4, 3)
         for sample in range(7):
             one = z[item, sample]
-            hidden = (features[item, 0] + decoder.from_latent.weight @ one).clamp(min=0)
+            hidden = (features + decoder.from_latent.weight @ one).clamp(min=0)
             hidden = (decoder.body[1].weight @ hidden + decoder.body[1].bias).clamp(min=0)
-            wanted = decoder.body[3].weight @ hidden + decoder.body[3].bias + decoder.shared.weight @ active
-            wanted = wanted + (decoder.spread + gate @ active) @ one
+            wanted = decoder.body[3].weight @ hidden + decoder.body[3].bias + shared
+            wanted = wanted + (decoder.spread + turned) @ one
             torch.testing.assert_close(found[item, sample], wanted, rtol=1e-12, atol=1e-12)
 
 
@@ -33,6 +34,6 @@ def test_huge_features_do_not_overflow() -> None:
     torch.manual_seed(2)
     decoder = LatentDecoder(latent=2, hidden=4, numbers=3)
     z = torch.randn(5, 2)
-    huge = decoder(torch.full((1, 4), 3e38), z)
+    huge = decoder(torch.full((1, decoder.size), 3e38), z)
     assert huge.isfinite().all()
-    assert torch.equal(huge, decoder(torch.full((1, 4), LARGEST_FEATURE), z))
+    assert torch.equal(huge, decoder(torch.full((1, decoder.size), LARGEST_FEATURE), z))

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -122,6 +122,8 @@ class App:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.sweep = folder / "sweep"
+        self.output = folder / "output.txt"
+        self.processes: list[subprocess.Popen[bytes]] = []
         (folder / "app.py").write_text(APP)
         (folder / "job.py").write_text(JOB)
         for path, text in {
@@ -137,21 +139,31 @@ class App:
             "HYDRA_FULL_ERROR": "1",
         }
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [sys.executable, "app.py", *arguments],
-            cwd=self.folder,
-            env=self.environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-        )
+    def start(self, *arguments: str) -> subprocess.Popen[bytes]:
+        with self.output.open("wb") as output:
+            process = subprocess.Popen(
+                [sys.executable, "app.py", *arguments],
+                cwd=self.folder,
+                env=self.environment,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+        self.processes.append(process)
+        return process
 
     def __call__(self, *arguments: str) -> tuple[int, str]:
         """Exit code and output of a multirun under the pool."""
-        process = self.start("-m", "hydra/launcher=pool", *arguments)
-        output, _ = process.communicate(timeout=120)
-        return process.returncode, output
+        return self.start("-m", "hydra/launcher=pool", *arguments).wait(timeout=60), self.said()
+
+    def said(self) -> str:
+        return self.output.read_text(encoding="utf-8")
+
+    def close(self) -> None:
+        """Leave no process behind, however the test ended."""
+        (self.folder / "release").touch()
+        for process in self.processes:
+            process.kill()
+            process.wait()
 
     def record(self, number: int) -> dict[str, Any]:
         return json.loads((self.sweep / str(number) / "job.json").read_text())
@@ -170,8 +182,10 @@ class App:
 
 
 @pytest.fixture
-def app(tmp_path: Path) -> App:
-    return App(tmp_path)
+def app(tmp_path: Path) -> Iterator[App]:
+    app = App(tmp_path)
+    yield app
+    app.close()
 
 
 def test_the_others_go_on_when_a_job_fails_or_is_killed(app: App) -> None:
@@ -268,8 +282,7 @@ def test_a_signal_lets_the_jobs_close_and_the_sweep_be_resumed(number: signal.Si
     process = app.start("-m", "hydra/launcher=pool", *arguments)
     app.until_ready(0, 1)
     process.send_signal(number)
-    output, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + number, output
+    assert process.wait(timeout=60) == 128 + number, app.said()
     records = [app.record(job) for job in range(3)]
     assert [record["status"] for record in records] == ["died", "died", "queued"]
     assert [record["error"] for record in records] == [f"stopped by {number.name}"] * 2 + [None]
@@ -286,20 +299,16 @@ def test_ctrl_c_at_the_terminal_reaches_each_job_once(app: App) -> None:
     app.until_ready(0, 1)
     assert os.getsid(app.record(0)["pid"]) == app.record(0)["pid"]
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.wait(timeout=60) == 130, app.said()
 
 
 def test_a_third_signal_kills(app: App) -> None:
     process = app.start("-m", "hydra/launcher=pool", "what=stubborn")
     app.until_ready(0)
-    assert process.stdout is not None
-    for number in (signal.SIGINT, signal.SIGINT, signal.SIGTERM):
+    for count, number in enumerate((signal.SIGINT, signal.SIGINT, signal.SIGTERM), 1):
         process.send_signal(number)
-        while "told to stop" not in process.stdout.readline():
-            assert process.poll() is None
-    process.communicate(timeout=60)
-    assert process.returncode == 130
+        app.until(lambda count=count: app.said().count("told to stop") == count)
+    assert process.wait(timeout=60) == 130
     assert app.record(0)["error"].startswith("killed by SIGKILL")
 
 
@@ -308,18 +317,15 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
     process = app.start("-m", "hydra/launcher=pool", *arguments)
     app.until_ready(0, 1)
     process.kill()
-    process.communicate(timeout=60)
+    process.wait()
     if sys.platform == "linux":
         app.until((app.sweep / "0" / "closed SIGTERM").exists)
     again = app.start("-m", "hydra/launcher=pool", *arguments)
-    assert again.stdout is not None
-    while "#1 waits" not in again.stdout.readline():
-        assert again.poll() is None
+    app.until(lambda: "#1 waits" in app.said())
     assert app.record(1)["status"] == "running"
     assert app.tries(1) == 1, "two processes in one folder would mix their checkpoints"
     (app.folder / "release").touch()
-    again.communicate(timeout=60)
-    assert again.returncode == 0
+    assert again.wait(timeout=60) == 0, app.said()
     assert [app.record(job)["tries"] for job in range(2)] == [2, 2]
 
 
@@ -340,8 +346,7 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
         f"hydra.sweep.dir='{name.replace(chr(39), chr(92) + chr(39))}'",
         "hydra.sweep.subdir=${hydra.job.override_dirname}/${hydra.job.num}",
     )
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 0, output
+    assert process.wait(timeout=60) == 0, app.said()
     seen = sorted((app.folder / name).rglob("seen.json"))
     assert [json.loads(path.read_text()) for path in seen] == [
         ["p", "quoted, text", 0, {"depth": 3}],

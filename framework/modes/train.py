@@ -33,6 +33,8 @@ from framework.settings import TRAINER_OURS, Settings, check_trainer_keys
 from framework.sweep import RECORD, leave_value
 from framework.training import KeepCheckpoints, Report, StopAtBatch, Training
 
+TRAINED = {"last.ckpt", "previous.ckpt", "best.ckpt"}
+"""Checkpoints that training can go on from; model.ckpt holds weights alone."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
@@ -88,7 +90,7 @@ def _run(run: Run) -> float:
 
 
 def _fit(run: Run, training: Training, batches: Batches, trainer: pl.Trainer, console: Console) -> None:
-    resume = latest_good(run.checkpoints) if run.resumed else None
+    resume = latest_good(run.checkpoints, names=TRAINED) if run.resumed else None
     if run.resumed and resume is None:
         run.tracker.drop_after(0)
         console.print("nothing to resume from yet: starting from the beginning.")

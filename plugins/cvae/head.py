@@ -24,8 +24,8 @@ class CVAEHead(DensityHead):
     """CVAE: an infinite mixture over a latent z with a learned prior (thesis §3.5.2, eq. 3.12-3.20).
 
     Prior p(z|x), encoder q(z|x,φ) and decoder p(φ|x,z) train by the evidence lower bound (eq. 3.17-3.18);
-    log_prob is the importance-weighted bound (eq. 3.19). It reads 3 × hidden numbers: the framework's linear
-    layer is the part of each network's first layer that sees the features, computed once per item.
+    log_prob is the importance-weighted bound (eq. 3.19). The framework's linear layer is
+    the part of each network's first layer that sees the features, computed once per item.
 
     Args:
         latent: dimensions of z.
@@ -61,7 +61,6 @@ class CVAEHead(DensityHead):
     ) -> None:
         super().__init__()
         self.target = target
-        self.size = 3 * hidden
         self.hidden = hidden
         self.training_samples = training_samples
         self.samples = samples
@@ -72,6 +71,7 @@ class CVAEHead(DensityHead):
         )
         self.posterior = _rest(hidden, 2 * latent)
         self.decoder = LatentDecoder(latent, hidden, component.size)
+        self.size = 2 * hidden + self.decoder.size
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> CVAEDensity:
         return CVAEDensity(self.networks(raw), self.training_samples if self.training else self.samples)
@@ -88,7 +88,9 @@ class CVAEHead(DensityHead):
         kind = self.from_value.weight.dtype
         # so that no raw number, however large, overflows in the layers behind
         features = raw.to(kind).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
-        for_prior, for_posterior, for_decoder = features.chunk(3, -1)
+        for_prior, for_posterior, for_decoder = features.split(
+            [self.hidden, self.hidden, self.decoder.size], -1
+        )
         return Networks(
             prior=_gaussian(self.prior(for_prior)),
             posterior=lambda value: _gaussian(

@@ -168,7 +168,7 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
         "objects": _objects(shot),
     }
     content = io.BytesIO()
-    scipy.io.savemat(content, {"record": record})
+    scipy.io.savemat(content, {"record": record}, do_compression=True)
     (part / "Annotations" / folder / f"{name}.mat").write_bytes(HEADER + content.getvalue()[len(HEADER) :])
 
 

@@ -27,7 +27,7 @@ class SCVAEHead(DensityHead):
 
     Args:
         latent: dimensions of z.
-        hidden: width of the decoder, and the numbers read per item.
+        hidden: width of the decoder.
         training_samples: S of the training loss.
         samples: S in evaluation; may be set at any time. The density keeps S components per item, so memory
             grows as batch × S × (numbers of a component).
@@ -46,19 +46,19 @@ class SCVAEHead(DensityHead):
         self,
         target: Target,
         *,
-        latent: Annotated[int, Field(ge=1)] = 8,
+        latent: Annotated[int, Field(ge=1)] = 2,
         hidden: Annotated[int, Field(ge=1)] = 128,
         training_samples: Annotated[int, Field(ge=1)] = 50,
         samples: Annotated[int, Field(ge=1)] = 500,
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
-        self.size = hidden
         self.latent = latent
         self.training_samples = training_samples
         self.samples = samples
         self.component = require_trained(component)
         self.decoder = LatentDecoder(latent, hidden, component.size)
+        self.size = self.decoder.size
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Mixture:
         raw = require_finite(raw, self.size)
