@@ -54,6 +54,9 @@ class Crops:
     def train(self) -> Fields:
         return self.fields
 
+    def validation(self) -> Fields:
+        return self.fields
+
     def augment(self, batch: Batch) -> Batch:
         return batch
 
@@ -106,7 +109,7 @@ def ours(data: Crops, folder: Path) -> float:
         callbacks=[Report(tracker, 10), StopAtBatch(Stopper(), keep), clock],
     )
     batches.attach(trainer)
-    trainer.fit(training, train_dataloaders=batches.train_dataloader())
+    trainer.fit(training, datamodule=batches)
     tracker.close("FINISHED")
     return 1e3 * (clock.end - clock.start) / STEPS
 

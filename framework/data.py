@@ -20,7 +20,7 @@ class Data(ABC):
     """Gives the three splits of a data set; order, batching, workers and resuming are the framework's.
 
     The constructor only keeps its keyword-only parameters (the config): it reads nothing. `prepare` does the work
-    and is called once before anything else; after it all attributes below are set. Bad input raises a DataError
+    and is called once before anything but `read`; after it all attributes below are set. Bad input raises a DataError
     that says which file, what was wanted and what to do; a sample that cannot be read is never replaced silently.
 
     A data set that cannot be shipped may be generated: its generator writes the official layout to the cache
@@ -65,7 +65,7 @@ class Data(ABC):
 
     @abstractmethod
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Unlabelled samples from a user's own files, for `mode=predict`: "input" and "index" only.
+        """Unlabelled samples from a user's own files, for `mode=predict`: "input" and "index" only. Needs no `prepare`.
 
         Raises:
             DataError: a file cannot be read; names it.

@@ -7,6 +7,7 @@ names it, it is built from that base's registry and arrives ready.
 """
 
 import inspect
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -121,9 +122,8 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
         if fault["type"] == "missing":
             raise ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.") from None
         if fault["type"] == "literal_error":
-            hint = did_you_mean(
-                str(fault["input"]), fault.get("ctx", {})["expected"].replace("'", "").split(" or ")
-            )
+            expected = re.findall("'([^']*)'", fault.get("ctx", {})["expected"])
+            hint = did_you_mean(str(fault["input"]), expected)
         else:
             hint = ""
         raise ConfigError(f"{where} = {fault['input']!r}: {fault['msg']}.{hint}") from None

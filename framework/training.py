@@ -76,7 +76,7 @@ class Training(pl.LightningModule):
         optimizer = OPTIMIZERS[chosen.name](
             self.parameters(), lr=chosen.learning_rate, weight_decay=chosen.weight_decay
         )
-        total = max(1, int(self.trainer.estimated_stepping_batches))
+        total = self._planned_steps()
 
         def factor(step: int) -> float:
             warm = min(1.0, (step + 1) / (chosen.warmup_steps + 1))
@@ -86,6 +86,19 @@ class Training(pl.LightningModule):
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _planned_steps(self) -> int:
+        """Optimiser steps until the end, for the schedule.
+
+        Not `trainer.estimated_stepping_batches`: it starts the loader, whose workers then fetch from the first batch
+        before a resumed run knows where it is.
+        """
+        trainer: Any = self.trainer
+        batches = len(trainer.datamodule.train_dataloader())
+        limit = trainer.limit_train_batches
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        steps = math.ceil(batches / trainer.accumulate_grad_batches) * max(1, trainer.max_epochs or 1)
+        return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["framework"] = self.description
@@ -172,8 +185,8 @@ class Report(pl.Callback):
 
 
 class StopAtBatch(pl.Callback):
-    """While fitting, a signal waits for the batch to end, or for the epoch's end if it is the last one; then last.ckpt is
-    saved and the run stops."""
+    """While fitting, a signal waits for the batch to end, or for the epoch's end if it is the last one; then last.ckpt
+    is saved and the run stops."""
 
     def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:
         self.stopper = stopper

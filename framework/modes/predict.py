@@ -26,10 +26,11 @@ from framework.target import Target
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
     """Write predictions.csv into the run folder."""
     with opened(folder, values, settings, overrides) as run:
-        predictor, data, _ = loaded(run)
         wanted = values["mode"].get("files")
         files = _files(Path(str(wanted)).expanduser()) if wanted else []
-        rows = predictions(predictor, data, files, settings)
+        predictor, data, described = loaded(run, prepare=not files)
+        target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
+        rows = predictions(predictor, data, target, files, settings)
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, list(rows[0]))
@@ -52,7 +53,7 @@ def _files(path: Path) -> list[Path]:
 
 @torch.no_grad()
 def predictions(
-    predictor: Predictor, data: Data, files: Sequence[Path], settings: Settings
+    predictor: Predictor, data: Data, target: Target, files: Sequence[Path], settings: Settings
 ) -> list[dict[str, str]]:
     """One row a sample: its name, the point prediction, and the entropy of the density in nats."""
     dataset = data.read(files) if files else data.test()
@@ -63,7 +64,7 @@ def predictions(
         seed_step(settings.seed, number, "predict")
         density = predictor(batch["input"])
         prediction = Prediction(density, batch, settings.samples)
-        columns = _columns(data.target, prediction.point) | {"entropy_nats": density.entropy()}
+        columns = _columns(target, prediction.point) | {"entropy_nats": density.entropy()}
         for row in range(len(batch["index"])):
             values = {key: _text(column[row]) for key, column in columns.items()}
             rows.append({"sample": names[len(rows)], **values})

@@ -30,8 +30,10 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
         report_test(run, predictor, data, batches, metrics, device, Console())
 
 
-def loaded(run: Run) -> tuple[Predictor, Data, dict[str, Any]]:
+def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str, Any]]:
     """The model of `checkpoint`, with the data named on the command line, or else the data it was trained on.
+
+    Without `prepare` the data can only read a user's own files: nothing is generated or loaded for that.
 
     Raises:
         ConfigError: no checkpoint is named.
@@ -53,6 +55,8 @@ def loaded(run: Run) -> tuple[Predictor, Data, dict[str, Any]]:
             resolve("metric", part, f"metric.{key}") for key, part in chosen.items()
         ]
     data = build_data({"data": resolve("data", described["config"]["data"])})
+    if not prepare:
+        return predictor, data, described
     data.prepare()
     describe_data(run, data)
     wanted = (
