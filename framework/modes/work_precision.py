@@ -41,7 +41,7 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
 def _run(run: Run, options: _Options) -> None:
     from framework import pictures
 
-    predictor, data, _ = loaded(run)
+    predictor, data, described = loaded(run)
     if not isinstance(predictor, Model):
         raise ConfigError("mode=work_precision wants a model without an uncertainty wrapper around it.")
     knobs = predictor.head.knobs
@@ -65,7 +65,7 @@ def _run(run: Run, options: _Options) -> None:
         repeats=options.repeats,
         seed=settings.seed,
     )
-    name = type(predictor.head).__name__
+    name = described["config"]["density_head"]["name"]
     path = run.folder / "work_precision.csv"
     write({name: curve}, path, synthetic=data.synthetic)
     run.tracker.log_artifact(path)
