@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from framework.report import COST_COLUMNS
+from framework.settings import store_experiment
 from framework.sweep import RECORD
 from framework.table import aggregate, csv, results_table
 from framework.tracking import MlflowTracker, mark_dead
@@ -20,13 +21,12 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
         return None
     earlier = folder / "parent.json"  # of the sweep that is being resumed
     known = json.loads(earlier.read_text(encoding="utf-8"))["run_id"] if earlier.is_file() else None
+    logger = {**logger, "experiment": store_experiment(config)}
     tracker = _parent(folder, logger, known)
     tracker.open()
     tracker.set_tags({"mode": "sweep", "folder": str(folder)})
     run_id = tracker.run_id
-    (folder / "parent.json").write_text(
-        json.dumps({"run_id": run_id, "logger": dict(logger)}), encoding="utf-8"
-    )
+    (folder / "parent.json").write_text(json.dumps({"run_id": run_id, "logger": logger}), encoding="utf-8")
     tracker.leave_open()
     return run_id
 
@@ -102,7 +102,7 @@ def _parent(folder: Path, logger: Mapping[str, Any], run_id: str | None) -> Mlfl
     return MlflowTracker(
         folder,
         uri=logger.get("uri"),
-        experiment=logger.get("experiment") or "sweeps",
+        experiment=logger["experiment"],
         run_name=f"sweep {folder.name}",
         parent=None,
         run_id=run_id,

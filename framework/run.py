@@ -14,7 +14,7 @@ import yaml
 from framework.errors import UserError
 from framework.journal import write_atomically
 from framework.provenance import flatten, git_commit, package_versions
-from framework.settings import Settings
+from framework.settings import Settings, store_experiment
 from framework.signals import Stopped, Stopper
 from framework.sweep import PARENT
 from framework.tracking import MlflowTracker, NoTracker, Tracker, read_run_info
@@ -67,7 +67,9 @@ def opened(folder: Path, values: dict[str, Any], settings: Settings, overrides: 
     if not resumed:
         write_atomically(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
         write_atomically(folder / "overrides.yaml", yaml.safe_dump(overrides).encode())
-    tracker = _tracker(folder, settings, values, earlier.run_id if resumed and earlier else None, resumed)
+    tracker = _tracker(
+        folder, settings, values, overrides, earlier.run_id if resumed and earlier else None, resumed
+    )
     stopper = Stopper()
     with stopper.installed():
         tracker.open()
@@ -92,21 +94,42 @@ def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
 
 
 def _tracker(
-    folder: Path, settings: Settings, values: Mapping[str, Any], run_id: str | None, resumed: bool
+    folder: Path,
+    settings: Settings,
+    values: Mapping[str, Any],
+    overrides: list[str],
+    run_id: str | None,
+    resumed: bool,
 ) -> Tracker:
     if settings.logger.name == "none":
         return NoTracker(folder, resumed=resumed)
-    seed = f"seed {settings.seed}"
-    name = settings.experiment_name or values["mode"]["name"]
     return MlflowTracker(
         folder,
         uri=settings.logger.uri,
-        experiment=settings.logger.experiment or "default",
-        run_name=f"{name}, {seed}",
+        experiment=store_experiment(values),
+        run_name=run_name(settings, values["mode"]["name"], overrides),
         parent=os.environ.get(PARENT),
         run_id=run_id,
         resumed=resumed,
     )
+
+
+def run_name(settings: Settings, mode: str, overrides: list[str]) -> str:
+    """What tells a run from its neighbours: the method, then what was changed on the command line, then the seed."""
+    parts = [(settings.experiment_name or mode).rpartition("/")[2]]
+    for override in overrides:
+        key, _, value = override.lstrip("+~").partition("=")
+        if key.partition(".")[0] not in (
+            "experiment",
+            "seed",
+            "threads",
+            "logger",
+            "mode",
+            "hydra",
+            "workers",
+        ):
+            parts.append(f"{key.rpartition('.')[2]}={value}")
+    return ", ".join([*parts, f"seed={settings.seed}"])[:200]
 
 
 def _describe(run: Run, overrides: list[str]) -> None:

@@ -52,6 +52,16 @@ class Settings(_Strict):
     mode: dict[str, Any] = {}
 
 
+def store_experiment(config: Mapping[str, Any]) -> str:
+    """The tracking store's experiment for a run: "data" for `experiment=data/method`, unless the logger names one.
+
+    One for all methods on the same data, so that a sweep over methods stands under its parent and compares.
+    """
+    logger = config.get("logger") or {}
+    name = config.get("experiment_name")
+    return str(logger.get("experiment") or (name.partition("/")[0] if name else "default"))
+
+
 TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps"}
 """Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
 

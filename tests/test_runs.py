@@ -14,6 +14,8 @@ import pytest
 import torch
 
 from framework.checkpoint import WholeCheckpoints
+from framework.run import run_name
+from framework.settings import Settings, store_experiment
 from tests.conftest import TINY, Done, Framework, listed
 
 QUIET = [*TINY, "logger=none"]
@@ -241,3 +243,19 @@ def test_a_wrong_key_or_value_is_said_before_any_data_is_read(
     assert message in done.out
     assert "Traceback" not in done.out
     assert status(done) == "FAILED"
+
+
+def test_a_run_is_named_by_what_tells_it_from_its_neighbours() -> None:
+    chosen = Settings(seed=3, experiment_name="faces/mixture")
+    overrides = [
+        "experiment=faces/mixture",
+        "data.category=car",
+        "threads=1",
+        "+trainer.max_steps=5",
+        "seed=3",
+    ]
+    assert run_name(chosen, "train", overrides) == "mixture, category=car, max_steps=5, seed=3"
+    assert run_name(Settings(), "test", []) == "test, seed=0"
+    assert store_experiment({"experiment_name": "faces/mixture"}) == "faces"
+    assert store_experiment({"experiment_name": None, "logger": {"experiment": None}}) == "default"
+    assert store_experiment({"experiment_name": "a/b", "logger": {"experiment": "mine"}}) == "mine"
