@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.table import aggregate, markdown
 
+METHODS = ("fixed_kappa", "von_mises", "mixture", "cvae", "scvae")
 COLUMNS = {
     "data": "class",
     "method": "method",
@@ -34,8 +35,9 @@ COLUMNS = {
 
 def main() -> None:
     folder = Path(sys.argv[1])
-    rows = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/results.json"))]
-    compared = sorted(aggregate(rows, by=["data", "method"]), key=lambda row: str(row["data"]))
+    rows = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*/results.json")]
+    rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))
+    compared = aggregate(rows, by=["data", "method"])
     threads = sorted({row["threads"] for row in rows})
     text = (
         "# Five density heads on synthetic PASCAL3D+\n\n"

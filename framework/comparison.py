@@ -1,7 +1,7 @@
 """A sweep as one thing: a parent run, and the table and picture that compare its jobs."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +34,22 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     """Compare the finished jobs in `folder`: print the table, write comparison.csv and .png, log them to the parent."""
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)  # a log file has no edge to wrap at
     for path in folder.glob("*/run.json"):
         if _status(path.parent) == "died":
             mark_dead(path.parent)  # a killed process could not close its run
-    rows = [row for row in (_row(path) for path in sorted(folder.glob("*/results.json"))) if row]
+    rows = [row for row in (_row(path) for path in _in_order(folder.glob("*/results.json"))) if row]
     files: list[Path] = []
     compared: list[dict[str, object]] = []
     if rows:
         keys = _varied(overrides)
         by = ["method", "data", *(key for key in keys if key not in ("seed", "experiment", "data.category"))]
         columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
+        # a column that no job has a number for says nothing (what only some classes have, say)
+        columns = {
+            key: heading for key, heading in columns.items() if any(row.get(key) is not None for row in rows)
+        }
         compared = aggregate(rows, by=by, over="seed")
         better = rows[0]["better"]
         console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
@@ -52,6 +58,11 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         files.extend(_picture(compared, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
     _close_parent(folder, files, compared)
+
+
+def _in_order(paths: Iterable[Path]) -> list[Path]:
+    """By job number: 2 before 10."""
+    return sorted(paths, key=lambda path: (len(path.parent.name), path.parent.name))
 
 
 def _status(folder: Path) -> str:
