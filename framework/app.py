@@ -44,10 +44,11 @@ def _run() -> None:
     import hydra
     from omegaconf import DictConfig
 
-    from framework.composition import folder, refuse_logging_overrides, register
+    from framework.composition import folder, refuse_logging_overrides, register, swept_with_experiment
 
     sys.argv[1:] = _with_resumed_folder(sys.argv[1:])
     refuse_logging_overrides(sys.argv[1:])
+    sys.argv[1:] = swept_with_experiment(sys.argv[1:])
     register()
 
     failures: list[BaseException] = []

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -55,6 +56,34 @@ def refuse_logging_overrides(arguments: list[str]) -> None:
                 f"{argument}: refused, since Hydra's logging and callback configs can run code. "
                 "Set the level with hydra.verbose=true instead."
             )
+
+
+def swept_with_experiment(arguments: list[str]) -> list[str]:
+    """The arguments of a sweep over experiments, single values written as sweeps of one.
+
+    Hydra first composes what is not swept, by itself: `data.x=1` beside `experiment=a,b` would meet a config in which
+    no data is chosen yet.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return arguments
+    overrides = [
+        argument for argument in arguments if "=" in argument and not argument.startswith(("-", "~"))
+    ]
+    try:
+        parsed = dict(zip(overrides, OverridesParser.create().parse_overrides(overrides), strict=True))
+    except HydraException:
+        return arguments  # Hydra itself will say what is wrong
+    if not any(one.key_or_group == "experiment" and one.is_sweep_override() for one in parsed.values()):
+        return arguments
+
+    def written(argument: str) -> str:
+        one = parsed.get(argument)
+        if one is None or one.is_sweep_override() or (one.key_or_group or "").startswith("hydra"):
+            return argument
+        key, _, value = argument.partition("=")
+        return f"{key}=choice({value})" if value else argument
+
+    return [written(argument) for argument in arguments]
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -10,7 +10,14 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from framework.app import _with_resumed_folder
-from framework.composition import folder, plain, refuse_logging_overrides, register, sentence
+from framework.composition import (
+    folder,
+    plain,
+    refuse_logging_overrides,
+    register,
+    sentence,
+    swept_with_experiment,
+)
 from framework.errors import ConfigError
 from framework.settings import check_trainer_keys, settings
 
@@ -129,3 +136,33 @@ def test_a_shadowed_plugins_package_is_named(tmp_path: Path) -> None:
     )
     assert done.returncode == 2
     assert "hides it" in done.stderr
+
+
+def test_single_values_beside_a_swept_experiment_are_swept_too() -> None:
+    given = [
+        "-m",
+        "experiment=a,b",
+        "data.x=1",
+        "+y=[1,2]",
+        "seed=0,1",
+        "hydra.sweep.dir=d",
+        "~z",
+        "name='p,q'",
+    ]
+    wanted = [
+        "-m",
+        "experiment=a,b",
+        "data.x=choice(1)",
+        "+y=choice([1,2])",
+        "seed=0,1",
+        "hydra.sweep.dir=d",
+        "~z",
+    ]
+    assert swept_with_experiment(given) == [*wanted, "name=choice('p,q')"]
+
+
+@pytest.mark.parametrize(
+    "given", [["experiment=a,b", "x=1"], ["-m", "experiment=a", "x=1,2", "y=3"], ["-m", "x=[", "e"]]
+)
+def test_other_commands_are_left_as_they_are(given: list[str]) -> None:
+    assert swept_with_experiment(given) == given
