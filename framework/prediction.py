@@ -2,7 +2,6 @@
 
 from functools import cached_property
 
-import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -45,7 +44,3 @@ class Prediction:
     @cached_property
     def _marginals(self) -> dict[int, Distribution]:
         return {}
-
-    @property
-    def device(self) -> torch.device:
-        return self.target.device

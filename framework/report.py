@@ -59,7 +59,6 @@ def report_test(
     results = _results(run, data, found, spent, columns, better)
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
-    run.results.update(results)
     step = 0
     run.tracker.log_metrics({f"test/{key}": value for key, value in found.total.items()}, step, 0)
     for name, numbers in found.groups.items():

@@ -5,7 +5,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,6 @@ class Run:
     tracker: Tracker
     stopper: Stopper
     resumed: bool
-    results: dict[str, Any] = field(default_factory=dict)
 
     @property
     def checkpoints(self) -> Path:
