@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Normal, constraints
+from torch.distributions import Categorical, Distribution, Independent, Normal, constraints
 
 from framework.circular import circular_median, grid
 from framework.errors import UserError
@@ -37,11 +37,16 @@ class Mixture(Distribution):
             )
         self.log_weights = torch.log_softmax(log_weights, -1)
         self.components = components
+        self.has_enumerate_support = components.has_enumerate_support
         super().__init__(components.batch_shape[:-1], components.event_shape, validate_args=False)
 
     @property
     def support(self) -> constraints.Constraint | None:
         return self.components.support
+
+    def enumerate_support(self, expand: bool = True) -> Tensor:
+        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        return self.components.enumerate_support(expand)[..., 0]
 
     def log_prob(self, value: Tensor) -> Tensor:
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
@@ -55,33 +60,43 @@ class Mixture(Distribution):
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape)
+        if self.log_weights.shape[-1] == 1:
+            return self.components.sample(shape).squeeze(-1 - len(self.event_shape))
         which = self._which(shape)
         return pick(self.components, which).sample()
 
     def _which(self, shape: torch.Size) -> Tensor:
         whole = shape + self.batch_shape
-        # torch.multinomial refuses to draw nothing; and one component's draws are its own, bit by bit
-        if whole.numel() == 0 or self.log_weights.shape[-1] == 1:
+        if whole.numel() == 0:  # torch.multinomial refuses to draw nothing
             return torch.zeros(whole, dtype=torch.int64, device=self.log_weights.device)
         weights = self.log_weights.exp().reshape(-1, self.log_weights.shape[-1])
         return torch.multinomial(weights, shape.numel(), replacement=True).T.reshape(whole)
 
     @property
     def mode(self) -> Tensor:
-        """The component mode at which the mixture's density is highest (exact for separated components)."""
+        """The likeliest class; or the component mode at which the density is highest (exact where they are apart)."""
+        if self.has_enumerate_support:
+            support = self.enumerate_support()
+            return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
         modes = self.components.mode.movedim(-1 - len(self.event_shape), 0)  # (K, *batch, *event)
         best = self.log_prob(modes).argmax(0)
         index = best.reshape(1, *best.shape, *(1,) * len(self.event_shape))
         return modes.gather(0, index.expand(1, *best.shape, *self.event_shape)).squeeze(0)
 
     def entropy(self) -> Tensor:
-        """Nats. Of one angle by quadrature; otherwise the mean of -log_prob over about 1000 samples in all, as many
-        of each component, so that only their spread within components is left to chance."""
+        """Nats. Exact for classes, by quadrature for one angle.
+
+        Otherwise the mean of -log_prob over about 1000 samples in all, as many of each component, so that only their
+        spread within components is left to chance.
+        """
         count = self.log_weights.shape[-1]
         if count == 1:
             return self.components.entropy().squeeze(-1)
-        if self.event_shape == (1,) and self.support is circular:
+        if self.event_shape == (1,) and isinstance(self.support, Circular):
             return circular_entropy(self)
+        if self.has_enumerate_support:
+            log_prob = self.log_prob(self.enumerate_support())
+            return -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
         each = max(2, 1024 // count)
         drawn = self.components.sample(torch.Size((each,)))
         values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
@@ -89,17 +104,26 @@ class Mixture(Distribution):
         return (self.log_weights.exp() * surprise).sum(-1)
 
 
-class _Circular(constraints.Constraint):
-    """Real numbers read as angles, radians modulo 2π, in the last dimension."""
+class Circular(constraints.Constraint):
+    """Real numbers read as angles, radians modulo 2π, in the last dimension.
+
+    Args:
+        ranges: (lowest, highest) of each angle within [-π, π], radians, of a density that is spread over a chart of
+            something else (rotations, say) and integrates to 1 there; None for a whole turn of each.
+    """
 
     event_dim = 1
+
+    def __init__(self, ranges: tuple[tuple[float, float], ...] | None = None) -> None:
+        self.ranges = ranges
+        super().__init__()
 
     def check(self, value: Tensor) -> Tensor:
         return value.isfinite().all(-1)
 
 
-circular = _Circular()
-"""The support of a density over angles."""
+circular = Circular()
+"""The support of a density over angles, each a whole turn."""
 
 
 @singledispatch
@@ -129,6 +153,11 @@ class _Picked(Distribution):
         axis = index.dim()
         index = index.reshape(*index.shape, 1, *(1,) * len(self.event_shape))
         return drawn.gather(axis, index.expand((*index.shape[: axis + 1], *self.event_shape))).squeeze(axis)
+
+
+@pick.register
+def _(density: Categorical, index: Tensor) -> Distribution:
+    return Categorical(logits=take(density.logits, index), validate_args=False)
 
 
 @pick.register
@@ -186,8 +215,10 @@ def median(density: Distribution, samples: int) -> Tensor:
 
     A density that knows it in closed form registers its own: `@median.register`, and draws nothing.
     """
+    if density.has_enumerate_support:
+        return density.mode  # of classes: a label is right or wrong, and nothing lies between
     drawn = density.sample(torch.Size((samples,)))
-    if density.support is circular:
+    if isinstance(density.support, Circular):
         return circular_median(drawn)
     return drawn.median(0).values
 

@@ -3,7 +3,7 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import Distribution, constraints, register_kl
 
 from framework.density import circular, marginal, median, pick, take
 from plugins.von_mises import functions
@@ -66,3 +66,11 @@ def _(density: VonMises, index: Tensor) -> VonMises:
 def _(density: VonMises, samples: int) -> Tensor:
     # symmetric about its mean and falling on both sides of it
     return density.location
+
+
+@register_kl(VonMises, VonMises)
+def _(first: VonMises, second: VonMises) -> Tensor:
+    parts = functions.kl_divergence(
+        first.location, first.concentration, second.location, second.concentration
+    )
+    return parts.sum(-1)

@@ -1,4 +1,6 @@
 import math
+import subprocess
+import sys
 from functools import cache
 
 import mpmath
@@ -8,14 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize, stats
+from torch.distributions import kl_divergence
 
-from framework import testing
 from framework.density import marginal, median, pick
 from framework.errors import ConfigError
 from framework.schema import build, resolve
 from framework.target import Target
+from framework.testing.heads import values
 from plugins.von_mises import fit_coefficients, functions
-from plugins.von_mises.coefficients import PIECES
+from plugins.von_mises.coefficients import NODES, TABLES
 from plugins.von_mises.density import VonMises
 
 mpmath.mp.dps = 90
@@ -64,24 +67,31 @@ def error(found, reference, scale, dtype):
     return float(abs(mpmath.mpf(found.item()) - reference) / scale) / torch.finfo(dtype).eps
 
 
-def check_point(value, mean, concentration):
-    """log_prob and its three gradients at one point against 90 digits."""
+def check_points(value, mean, concentration, found, slopes):
+    """log_prob and its three gradients against 90 digits."""
     dtype = value.dtype
+    columns = (value, mean, concentration, found, *slopes)
+    for row in zip(*(column.detach().reshape(-1) for column in columns), strict=True):
+        at, centre, concentrated, log_p, by_value, by_mean, by_concentration = row
+        kappa = mpmath.mpf(concentrated.item())
+        scaled, _, complement, _ = bessel(concentrated.item())
+        difference = mpmath.mpf(at.item()) - mpmath.mpf(centre.item())
+        fall = 2 * mpmath.sin(difference / 2) ** 2
+        height = -mpmath.log(2 * mpmath.pi) - scaled
+        # log p is the difference of two terms, dlogp/dκ of two others: errors are relative to the terms
+        assert error(log_p, height - kappa * fall, max(1, abs(height), kappa * fall), dtype) < LIMIT, row
+        assert error(by_concentration, complement - fall, complement + fall, dtype) < LIMIT, row
+        turning = -kappa * mpmath.sin(difference)
+        # the last term: of a difference that nearly is a multiple of π only eps² is lost
+        scale = abs(turning) + kappa * torch.finfo(dtype).eps + torch.finfo(dtype).tiny
+        assert error(by_value, turning, scale, dtype) < LIMIT, row
+        assert by_mean == -by_value
+
+
+def check_point(value, mean, concentration):
     found = functions.log_prob(value, mean, concentration)
-    by_value, by_mean, by_concentration = torch.autograd.grad(found, (value, mean, concentration))
-    kappa = mpmath.mpf(concentration.item())
-    scaled, _, complement, _ = bessel(concentration.item())
-    difference = mpmath.mpf(value.item()) - mpmath.mpf(mean.item())
-    fall = 2 * mpmath.sin(difference / 2) ** 2
-    height = -mpmath.log(2 * mpmath.pi) - scaled
-    # log p is the difference of two terms, dlogp/dκ of two others: errors are relative to the terms
-    assert error(found, height - kappa * fall, max(1, abs(height), kappa * fall), dtype) < LIMIT
-    assert error(by_concentration, complement - fall, complement + fall, dtype) < LIMIT
-    turning = -kappa * mpmath.sin(difference)
-    # the last term: of a difference that nearly is a multiple of π only eps² is lost
-    scale = abs(turning) + kappa * torch.finfo(dtype).eps + torch.finfo(dtype).tiny
-    assert error(by_value, turning, scale, dtype) < LIMIT
-    assert by_mean == -by_value
+    slopes = torch.autograd.grad(found, (value, mean, concentration))
+    check_points(value, mean, concentration, found, slopes)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -130,14 +140,19 @@ def test_functions_of_the_concentration_agree_with_90_digits(concentration, dtyp
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("name", fit_coefficients.NAMES)
-def test_no_seam_between_two_pieces(name, dtype):
-    pieces = PIECES[str(dtype).removeprefix("torch.")][name]
-    for middle, half_width, _ in pieces[1:]:
-        edge = 2 / (middle - half_width) - 2
-        near = torch.tensor(edge, dtype=dtype) * (1 + torch.finfo(dtype).eps * torch.arange(-40, 41))
-        found = functions._polynomial(name, near.to(dtype))
-        assert (found.diff().abs() <= 4 * torch.finfo(dtype).eps * found[1:].abs()).all()
+def test_no_seam_between_two_pieces(dtype):
+    """Over each border value and derivatives change by no more than their rounding, 40 floats to either side."""
+    pieces = fit_coefficients.PIECES[str(dtype).removeprefix("torch.")]
+    eps = torch.finfo(dtype).eps
+    edges = torch.tensor([[2 * pieces / i - 2] for i in range(1, pieces)], dtype=torch.float64)
+    near = (edges * (1 + eps * torch.arange(-40, 41))).to(dtype)
+    for function, size in (
+        (functions.log_peak, functions.log_peak(near).abs().clamp(min=1)),
+        (functions.mean_deviation, functions.mean_deviation(near)),
+        (functions.mean_resultant_slope, functions.mean_resultant_slope(near)),
+        (functions.mean_resultant, functions.mean_resultant(near)),
+    ):
+        assert (function(near).diff().abs() <= 10 * eps * size[:, 1:]).all()
 
 
 def test_entropy_agrees_with_scipy():
@@ -145,12 +160,10 @@ def test_entropy_agrees_with_scipy():
     np.testing.assert_allclose(functions.entropy(kappa), stats.vonmises.entropy(kappa.numpy()), rtol=1e-11)
 
 
-def test_the_coefficients_are_those_the_script_writes():
-    edges = fit_coefficients.PIECES["float64"]
-    low, high = mpmath.mpf(edges[1]), mpmath.mpf(edges[2])
-    for which, name in enumerate(fit_coefficients.NAMES):
-        written = fit_coefficients.interpolate(low, high, which, fit_coefficients.TOLERANCE["float64"])
-        assert PIECES["float64"][name][1][2] == tuple(float(number) for number in written)
+@pytest.mark.parametrize("which, name", list(enumerate(fit_coefficients.NAMES)))
+def test_the_coefficients_are_those_the_script_writes(which, name):
+    assert tuple(fit_coefficients.table("float32", which)) == TABLES["float32"][name]
+    assert all(tuple(fit_coefficients.gauss_legendre(count)) == pairs for count, pairs in NODES.items())
 
 
 @pytest.mark.parametrize("concentration", [0.0, 1e-6, 0.5, 3.75, 20.0, 1e3])
@@ -177,10 +190,161 @@ def test_gradients_reduce_over_broadcast_arguments():
 
 # raised by the compiler itself
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
-def test_log_prob_is_one_graph():
-    compiled = torch.compile(functions.log_prob, backend="eager", fullgraph=True)
-    arguments = torch.randn(7), torch.randn(7), torch.rand(7)
-    assert torch.equal(compiled(*arguments), functions.log_prob(*arguments))
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_blocks_change_nothing(dtype):
+    count = functions.BLOCK * 2 + 5
+    value, mean, kappa = torch.randn(count, dtype=dtype), torch.randn(count, dtype=dtype), torch.rand(count)
+    arguments = [value, mean.requires_grad_(), kappa.to(dtype).requires_grad_()]
+    whole = functions.log_prob(*arguments)
+    gradients = torch.autograd.grad(whole.sum(), arguments[1:])
+    for part in torch.arange(count).split(1000):
+        few = functions.log_prob(*(argument[part] for argument in arguments))
+        torch.testing.assert_close(whole[part], few, rtol=2e-6, atol=4 * torch.finfo(dtype).eps)
+    one = functions.log_prob(value[:, None], mean[:, None], kappa[:, None].to(dtype))
+    torch.testing.assert_close(whole, one[:, 0])
+    assert gradients[0].shape == gradients[1].shape == (count,)
+
+
+COMPILED = """
+import sys, torch
+from plugins.von_mises import functions
+grid, path = torch.load(sys.argv[1]), sys.argv[2]
+found = []
+for arguments in grid:
+    density = torch.compile(functions.log_prob, fullgraph=True, dynamic=False)(*arguments)
+    found.append((density.detach(), *torch.autograd.grad(density.sum(), arguments)))
+torch.save(found, path)
+"""
+
+
+def test_compiled_log_prob_and_gradients_agree_with_90_digits(tmp_path):
+    """In a process of its own: the type checks that tests switch on cannot be compiled."""
+    columns = list(
+        zip(*((3.0 + off, 3.0, kappa) for off in OFFSETS for kappa in CONCENTRATIONS), strict=True)
+    )
+    grid = [[leaf(column, dtype) for column in columns] for dtype in DTYPES]
+    torch.save(grid, tmp_path / "grid.pt")
+    command = [sys.executable, "-c", COMPILED, str(tmp_path / "grid.pt"), str(tmp_path / "found.pt")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    for arguments, (density, *slopes) in zip(grid, torch.load(tmp_path / "found.pt"), strict=True):
+        check_points(*arguments, density, slopes)
+
+
+many_digits = cache(fit_coefficients.bessel)
+KAPPAS = torch.tensor([0, 1e-30, 1e-8, 1e-3, 0.5, 1, 2, 7.0, 30, 1e3, 1e8, 1e12, 1e30], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_divergence_agrees_with_120_digits(dtype):
+    mpmath.mp.dps = 130
+    factors = torch.tensor([0, 1, 1 + 1e-6, 1.01, 2.7, 2.8], dtype=torch.float64)
+    second = torch.cat([KAPPAS, *(factors * kappa for kappa in KAPPAS[1::3])]).to(dtype)
+    first, second = (grid.flatten() for grid in torch.meshgrid(KAPPAS.to(dtype), second, indexing="ij"))
+    zero = torch.zeros((), dtype=dtype)
+    straight = functions.kl_divergence(zero, first, zero, second)
+    turned = functions.kl_divergence(zero, first, zero + 0.25, second)
+    assert (straight >= 0).all()
+    for row in zip(first, second, straight, turned, strict=True):
+        one, two = (mpmath.mpf(kappa.item()) for kappa in row[:2])
+        logs, complements = zip(*(many_digits(kappa) for kappa in (one, two)), strict=True)
+        bregman = logs[1] + two - logs[0] - one - (1 - complements[0]) * (two - one)
+        turning = (1 - complements[0]) * two * 2 * mpmath.sin(mpmath.mpf("0.125")) ** 2
+        for found, reference in ((row[2], bregman), (row[3], bregman + turning)):
+            assert error(found, reference, abs(reference) + torch.finfo(dtype).tiny, dtype) < 16, row
+    mpmath.mp.dps = 90
+
+
+def test_divergence_of_equals_is_exactly_0_and_of_the_joint_is_the_sum():
+    mean, kappa = torch.randn(13, 2), torch.stack([KAPPAS, KAPPAS], 1).float()
+    assert (functions.kl_divergence(mean, kappa, mean, kappa) == 0).all()
+    first, second = VonMises(mean, kappa), VonMises(mean + 0.1, kappa + 1)
+    parts = functions.kl_divergence(mean, kappa, mean + 0.1, kappa + 1)
+    torch.testing.assert_close(kl_divergence(first, second), parts.sum(-1))
+
+
+@pytest.mark.parametrize("second", [1.5, 1.6, 9.0])
+def test_divergence_has_first_and_second_derivatives(second):
+    arguments = [
+        torch.tensor([number], dtype=torch.float64, requires_grad=True) for number in (0.3, 1.5, -0.4, second)
+    ]
+    assert torch.autograd.gradcheck(functions.kl_divergence, arguments)
+    assert torch.autograd.gradgradcheck(functions.kl_divergence, arguments)
+
+
+def tail(offset, kappa):
+    """Mass beyond `offset` on one side, by quadrature of what is left above exp(-90) of its start."""
+    offset, kappa = mpmath.mpf(offset), mpmath.mpf(kappa)
+    ends = [mpmath.sin(offset / 2) ** 2 + step / (2 * kappa) if kappa else 2 for step in (1, 4, 12, 30, 90)]
+    ends = [2 * mpmath.asin(mpmath.sqrt(min(1, end))) for end in ends]
+    fall = 2 * kappa * mpmath.sin(offset / 2) ** 2
+    # quad stops at an absolute error: what it sees must not be small
+    rest = mpmath.quad(lambda x: mpmath.exp(fall - 2 * kappa * mpmath.sin(x / 2) ** 2), [offset, *ends])
+    return rest / (2 * mpmath.pi) * mpmath.exp(-fall - fit_coefficients.bessel(kappa)[0])
+
+
+@pytest.mark.parametrize("kappa", [0, 1e-30, 1e-3, 0.5, 3.0, 30.0, 1e4, 1e12, 1e30])
+def test_cdf_agrees_with_quadrature_in_both_tails(kappa):
+    mpmath.mp.dps = 40
+    zero, concentration = torch.zeros((), dtype=torch.float64), torch.tensor(kappa, dtype=torch.float64)
+    for deviations in (0.0, 1e-6, 0.3, 0.7, 1.5, 3.0, 8.0, 25.0):
+        offset = min(3.14, deviations / max(1.0, kappa) ** 0.5)
+        reference = tail(offset, kappa)
+        below = functions.cdf(zero - offset, zero, concentration)
+        above = functions.cdf(zero + offset, zero, concentration)
+        assert abs(below.item() - reference) <= 4e-15 * reference * max(1, -mpmath.log(reference))
+        assert abs(above.item() - (1 - reference)) <= 1e-14
+        turned = functions.cdf(zero - offset + 4 * math.pi, zero, concentration)
+        assert abs(turned.item() - reference - 2) <= 1e-14 + 2e-15 * max(1.0, kappa) ** 0.5
+        single = functions.cdf((zero - offset).float(), zero.float(), concentration.float())
+        wide = functions.cdf((zero - offset).float().double(), zero, concentration.float().double())
+        assert single.dtype == torch.float32
+        assert single == wide.float()
+    mpmath.mp.dps = 90
+
+
+@pytest.mark.parametrize("kappa", [1e-3, 1.0, 12.0, 45.0])
+def test_cdf_agrees_with_scipy_and_rises(kappa):
+    value = torch.linspace(-7, 7, 2001, dtype=torch.float64)
+    found = functions.cdf(value, torch.zeros(()), torch.tensor(kappa))
+    np.testing.assert_allclose(
+        found, stats.vonmises.cdf(value.numpy(), np.float32(kappa)), rtol=0, atol=1e-12
+    )
+    assert (found.diff() >= -1e-15).all()
+    assert found[0] < 0 < 1 < found[-1]
+
+
+@pytest.mark.parametrize("kappa", [0.1, 1.0, 20.0])
+def test_cdf_has_first_derivatives(kappa):
+    value = torch.tensor([-3.0, -1.0, -0.05, 0.2, 2.0], dtype=torch.float64, requires_grad=True)
+    mean, kappa = (
+        torch.full((5,), number, dtype=torch.float64, requires_grad=True) for number in (0.1, kappa)
+    )
+    assert torch.autograd.gradcheck(functions.cdf, (value, mean, kappa))
+
+
+@pytest.mark.parametrize("kappa", [0, 1e-30, 1e-3, 0.3, 1, 3, 30, 1e4, 1e12, 1e30])
+def test_arc_holds_its_mass(kappa):
+    mass = torch.tensor(
+        [0, 1e-12, 1e-3, 0.3, 0.5, 0.500001, 0.9, 0.99, 1 - 1e-6, 1 - 1e-9, 1], dtype=torch.float64
+    )
+    zero, concentration = torch.zeros((), dtype=torch.float64), torch.tensor(kappa, dtype=torch.float64)
+    width = functions.half_width(mass, concentration)
+    below = functions.cdf(-width, zero, concentration)
+    np.testing.assert_allclose(functions.cdf(width, zero, concentration) - below, mass, rtol=0, atol=2e-14)
+    # the mass outside keeps its digits down to that of a last digit of π
+    np.testing.assert_allclose(2 * below[5:-1], (1 - mass)[5:-1], rtol=1e-12, atol=4e-16)
+    assert (width.diff() > 0).all()
+    assert width[0] == 0
+    assert width[-1] == math.pi
+    low, high = functions.interval(mass, zero + 2, concentration)
+    torch.testing.assert_close(high - 2, width, rtol=0, atol=1e-15)
+    torch.testing.assert_close(2 - low, width, rtol=0, atol=1e-15)
+
+
+def test_an_arc_of_more_than_all_is_refused():
+    with pytest.raises(ValueError, match=r"between 0 and 1, got 0.5 to 1.5"):
+        functions.half_width(torch.tensor([0.5, 1.5]), torch.ones(2))
 
 
 @pytest.mark.parametrize("concentration", [10.0**power for power in range(-8, 13)] + [1.1, 1.2, 37.0])
@@ -224,47 +388,15 @@ def test_sampling_shifts_by_the_mean():
 
 ONE, TWO, THREE = (Target("angle", ("azimuth", "elevation", "tilt")[:count]) for count in (1, 2, 3))
 PREDICTED, FIXED = "von_mises", {"name": "von_mises", "concentration": "fixed"}
-FLOORED = {"name": "von_mises", "floor": 0.5}
-ROWS = [(PREDICTED, ONE), (PREDICTED, TWO), (PREDICTED, THREE), (FIXED, ONE), (FIXED, TWO), (FLOORED, TWO)]
 
 
 def head(config=PREDICTED, target=ONE):
     return build("density_head", resolve("density_head", config), target=target)
 
 
-@pytest.mark.parametrize("config, target", ROWS)
-def test_contract(config, target):
-    testing.check_head(lambda: head(config, target), target)
-
-
-@pytest.mark.parametrize("config, target", ROWS)
-def test_density(config, target):
-    made = head(config, target).eval()
-    with torch.no_grad():
-        density = made(3 * testing.raws(made, (3,)))
-        testing.check_periodic(
-            VonMises(density.mean.double(), density.concentration.double()),
-            testing.values(target, (3,)).double(),
-            limit=1e-9,
-        )
-        alone = marginal(density, len(target.names) - 1)
-        testing.check_normalised(alone)
-        testing.check_median(alone)
-        testing.check_samples(alone)
-        if target is TWO:
-            testing.check_normalised(density)
-            testing.check_samples(density)
-            testing.check_marginal(density)
-        value = testing.values(target, (3,))
-        reference = stats.vonmises.logpdf(
-            value.double(), density.concentration.double(), density.mean.double()
-        ).sum(-1)
-        testing.check_log_prob(density, value, torch.from_numpy(reference), limit=2e-6)
-
-
 def test_independent_angles_add_up():
-    density = head(target=THREE)(testing.raws(head(target=THREE), (2,)))
-    value = testing.values(THREE, (2,))
+    density = head(target=THREE)(torch.randn(2, 9))
+    value = values(THREE, (2,))
     parts = [marginal(density, index).log_prob(value[:, index : index + 1]) for index in range(3)]
     torch.testing.assert_close(density.log_prob(value), sum(parts))
     torch.testing.assert_close(

@@ -9,8 +9,9 @@ from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.density import circular, median
+from framework.density import circular, marginal, median
 from framework.density_head import DensityHead
+from framework.raw_numbers import require_finite
 from framework.target import Target
 
 
@@ -20,23 +21,23 @@ class WrappedCauchy(Distribution):
     arg_constraints: ClassVar = {}
     support = circular
 
-    def __init__(self, mean: Tensor, length: Tensor) -> None:
+    def __init__(self, mean: Tensor, gap: Tensor) -> None:
         self.location = mean
-        self.length = length
+        self.gap = gap  # 1 - ρ, where ρ is the mean resultant length
         super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        square = self.length**2
-        near = 1 + square - 2 * self.length * (value - self.location).cos()
-        return (torch.log1p(-square) - near.log() - math.log(2 * math.pi)).sum(-1)
+        gap, length = self.gap, 1 - self.gap
+        near = gap**2 + 4 * length * torch.sin((value - self.location) / 2) ** 2  # 1 + ρ² - 2ρ cos(φ-μ)
+        return (torch.log(gap * (1 + length)) - near.log() - math.log(2 * math.pi)).sum(-1)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        uniform = torch.rand(*sample_shape, *self.location.shape)
-        scale = (1 - self.length) / (1 + self.length)
+        uniform = torch.rand(*sample_shape, *self.location.shape, dtype=self.location.dtype)
+        scale = self.gap / (2 - self.gap)
         return self.location + 2 * torch.atan(scale * torch.tan(math.pi * (uniform - 0.5)))
 
     def entropy(self) -> Tensor:
-        return (math.log(2 * math.pi) + torch.log1p(-(self.length**2))).sum(-1)
+        return (math.log(2 * math.pi) + torch.log(self.gap * (2 - self.gap))).sum(-1)
 
     @property
     def mode(self) -> Tensor:
@@ -46,6 +47,12 @@ class WrappedCauchy(Distribution):
 @median.register
 def _(density: WrappedCauchy, samples: int) -> Tensor:
     return density.location
+
+
+@marginal.register
+def _(density: WrappedCauchy, index: int) -> WrappedCauchy:
+    here = slice(index, index + 1)
+    return WrappedCauchy(density.location[..., here], density.gap[..., here])
 
 
 class WrappedCauchyHead(DensityHead):
@@ -63,8 +70,12 @@ title={Directional Statistics}, year={2000}}"""
         self.largest = largest
 
     def forward(self, raw: Tensor) -> WrappedCauchy:
+        raw = require_finite(raw, self.size)
         cos, sin, spread = raw.unflatten(-1, (self.angles, 3)).unbind(-1)
-        return WrappedCauchy(torch.atan2(sin, cos + 1e-12), self.largest * torch.sigmoid(spread))
+        # the squares in atan2's gradient neither over- nor underflow; 1 - length is not a difference
+        mean = torch.atan2(sin.clamp(-1e18, 1e18), cos.clamp(-1e18, 1e18) + 1e-12)
+        gap = (1 - self.largest) + self.largest * torch.sigmoid(-spread)
+        return WrappedCauchy(mean, gap)
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         return -self(raw).log_prob(target)

@@ -1,0 +1,133 @@
+"""mode=check: the contract of installed plugins on stiff and extreme cases; fails where a plugin does."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from framework.errors import ConfigError, UserError
+from framework.settings import Settings
+from framework.table import csv
+from framework.testing.contract import CONTRACTS, Contract, Row, contract
+from framework.testing.finding import Finding
+
+COLUMNS = {
+    "plugin": "plugin",
+    "row": "row",
+    "property": "property",
+    "worst": "worst case",
+    "error": "error",
+    "limit": "limit",
+    "verdict": "verdict",
+}
+
+
+class ContractBroken(UserError):
+    """A plugin does not do what its group's contract promises."""
+
+
+def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+    """Print a table for every plugin chosen on the command line.
+
+    Raises:
+        ConfigError: nothing that has a contract is chosen.
+        ContractBroken: a property does not hold; the table says which and where.
+    """
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    chosen = _chosen(values)
+    if not chosen:
+        raise ConfigError(
+            "mode=check needs something to check: name a plugin, e.g. `mode=check density_head=<name>`; "
+            f"there are contracts for {', '.join(CONTRACTS)}. mode=plugins lists what is installed."
+        )
+    console, lines, failed = Console(), [], []
+    for group, config in chosen:
+        plain = {key: value for key, value in config.items() if key != "name"}
+        table, found, broken = examine(contract(group, config["name"], plain), console)
+        console.print(table)
+        lines += found
+        failed += broken
+    folder.mkdir(parents=True, exist_ok=True)
+    csv(lines, COLUMNS, folder / "check.csv")
+    console.print(f"every finding of every row: {folder / 'check.csv'}", soft_wrap=True)
+    if failed:
+        raise ContractBroken(
+            f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. "
+            "The table says where; the base in framework/ says what is promised."
+        )
+
+
+def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, object]], list[str]]:
+    """The table of one plugin (the worst row of each property), every finding, and what failed."""
+    start = time.perf_counter()
+    worst: dict[str, tuple[Row, Finding]] = {}
+    lines: list[dict[str, object]] = []
+    failed: list[str] = []
+    for row in plugin.rows:
+        with console.status(f"{plugin.group} {plugin.name}: {row.name}"):
+            for finding in plugin.findings(row):
+                lines.append(_line(plugin, row, finding))
+                if not finding.holds:
+                    failed.append(f"{plugin.name}: {finding.name}")
+                before = worst.get(finding.name)
+                if before is None or _excess(finding) > _excess(before[1]):
+                    worst[finding.name] = (row, finding)
+    seconds = time.perf_counter() - start
+    return _table(plugin, worst, seconds), lines, failed
+
+
+def _chosen(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Group and config of every plugin named that has a contract."""
+    found = []
+    for group in CONTRACTS:
+        config = values.get(group)
+        if not config:
+            continue
+        parts = [config] if "name" in config else list(config.values())
+        found += [(group, part) for part in parts]
+    return found
+
+
+def _excess(finding: Finding) -> tuple[bool, float]:
+    """How near to its limit, or beyond."""
+    return not finding.holds, finding.error / finding.limit if finding.limit > 0 else finding.error
+
+
+def _line(plugin: Contract, row: Row, finding: Finding) -> dict[str, object]:
+    return {
+        "plugin": f"{plugin.group} {plugin.name}",
+        "row": row.name,
+        "property": finding.name,
+        "worst": finding.worst,
+        "error": finding.error,
+        "limit": finding.limit,
+        "verdict": "holds" if finding.holds else "FAILS",
+    }
+
+
+def _table(plugin: Contract, worst: Mapping[str, tuple[Row, Finding]], seconds: float) -> Table:
+    count = f"{len(plugin.rows)} row{'s' if len(plugin.rows) > 1 else ''}"
+    title = f"{plugin.group} {plugin.name}: {count}, {seconds:.1f} s"
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    table.add_column("property", no_wrap=True)
+    table.add_column("worst case (row: case)", overflow="fold")
+    for heading in ("error", "limit"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    for name, (row, finding) in worst.items():
+        case = "" if finding.error == 0 else f"{row.name}: {finding.worst}"
+        verdict = Text("holds", "green") if finding.holds else Text("FAILS", "bold red")
+        table.add_row(name, Text(case, "dim"), f"{finding.error:.2g}", f"{finding.limit:g}", verdict)
+    left_out = {
+        name: reason for row in plugin.rows for name, reason in row.leave_out.items() if name not in worst
+    }
+    for name, reason in left_out.items():
+        table.add_row(name, Text(reason, "dim"), "", "", Text("left out", "yellow"))
+    return table

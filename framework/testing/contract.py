@@ -1,0 +1,140 @@
+"""Runs the contract of any installed plugin by name: its rows, each property, one finding at a time."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from framework.errors import ConfigError
+from framework.registry import load
+from framework.schema import build, resolve
+from framework.target import Target
+from framework.testing.finding import Finding
+from framework.testing.rows import EncoderRow, HeadRow, MetricRow, RendererRow
+
+Row = HeadRow | EncoderRow | MetricRow | RendererRow
+TARGETS = (
+    Target("angle", ("azimuth",)),
+    Target("angle", ("azimuth", "elevation", "tilt")),
+    Target("real", ("height",)),
+    Target("real", ("x", "y")),
+    Target("class", ("first", "second", "third")),
+)
+SHAPES = ((3, 64, 64), (1, 96, 80), (16,))
+"""What a plugin without rows is tried with; it may refuse some, with a ConfigError."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """The rows of one plugin and the checks of its group.
+
+    Attributes:
+        group, name: which plugin.
+        rows: its parametrisations.
+    """
+
+    group: str
+    name: str
+    rows: tuple[Row, ...]
+
+    def findings(self, row: Row) -> Iterator[Finding]:
+        """Every property of one row."""
+        yield from _examiner(self.group)(self.name, row)
+
+
+def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> Contract:
+    """The contract of the plugin `name`; `config`, where it is not a row already, is a row of its own.
+
+    Raises:
+        ConfigError: no such plugin, a group without a contract, a config out of range, or no row fits.
+    """
+    _examiner(group)
+    shipped = _shipped(group, name)
+    if config is None:
+        return Contract(group, name, shipped or _defaults(group, name, {}, "defaults"))
+    chosen = resolve(group, {"name": name, **config})
+    if chosen in [resolve(group, {"name": name, **row.config}) for row in shipped]:
+        return Contract(group, name, shipped)
+    plain = {key: value for key, value in chosen.items() if key != "name"}
+    return Contract(group, name, (*_defaults(group, name, plain, "as configured"), *shipped))
+
+
+def _shipped(group: str, name: str) -> tuple[Row, ...]:
+    """The rows a plugin gives in the `rows.py` beside its class; none where there is no such file."""
+    package = load(group, name).__module__.rpartition(".")[0]
+    if not package or find_spec(f"{package}.rows") is None:
+        return ()
+    return tuple(import_module(f"{package}.rows").ROWS.get(name, ()))
+
+
+def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> tuple[Row, ...]:
+    """Rows with `config` on every target or shape that the plugin accepts."""
+    resolved = resolve(group, {"name": name, **config})
+    if group == "renderer":
+        return (RendererRow(label, config),)
+    found: list[Row] = []
+    refused: list[str] = []
+    for option in SHAPES if group == "encoder" else TARGETS:
+        try:
+            if isinstance(option, Target):
+                build(group, resolved, target=option)
+                row = HeadRow if group == "density_head" else MetricRow
+                found.append(row(f"{label}, {len(option.names)} of kind {option.kind}", option, config))
+            else:
+                build(group, resolved, input_shape=option)
+                found.append(EncoderRow(f"{label}, {' × '.join(map(str, option))}", option, config))
+        except ConfigError as error:
+            refused.append(str(error))
+    if not found:
+        raise ConfigError(
+            f"{group} {name!r} accepts none of the {'shapes' if group == 'encoder' else 'targets'} tried: "
+            f"{' '.join(refused)} Give it a rows.py (framework.testing.rows)."
+        )
+    return tuple(found)
+
+
+def _examiner(group: str) -> Callable[[str, Any], Iterator[Finding]]:
+    if group not in CONTRACTS:
+        raise ConfigError(f"No contract is written for the group {group}, only for {', '.join(CONTRACTS)}.")
+    return CONTRACTS[group]
+
+
+def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
+    from framework.testing.densities import examine_densities
+    from framework.testing.heads import HeadSubject, examine_head
+
+    config = resolve("density_head", {"name": name, **row.config})
+    subject = HeadSubject(row, lambda: build("density_head", config, target=row.target))
+    yield from examine_head(subject)
+    yield from examine_densities(subject)
+
+
+def _examine_encoder(name: str, row: EncoderRow) -> Iterator[Finding]:
+    from framework.testing.encoders import examine_encoder
+
+    config = resolve("encoder", {"name": name, **row.config})
+    yield from examine_encoder(row, lambda: build("encoder", config, input_shape=row.input_shape))
+
+
+def _examine_metric(name: str, row: MetricRow) -> Iterator[Finding]:
+    from framework.testing.metrics import examine_metric
+
+    config = resolve("metric", {"name": name, **row.config})
+    yield from examine_metric(row, lambda: build("metric", config, target=row.target))
+
+
+def _examine_renderer(name: str, row: RendererRow) -> Iterator[Finding]:
+    from framework.testing.renderers import examine_renderer
+
+    config = resolve("renderer", {"name": name, **row.config})
+    yield from examine_renderer(row, lambda: build("renderer", config))
+
+
+CONTRACTS: dict[str, Callable[[str, Any], Iterator[Finding]]] = {
+    "density_head": _examine_head,
+    "encoder": _examine_encoder,
+    "metric": _examine_metric,
+    "renderer": _examine_renderer,
+}
+"""Group → name and row → findings."""

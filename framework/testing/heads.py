@@ -1,0 +1,340 @@
+"""The contract of a density head: one function a property, each reporting the worst case it saw.
+
+What the head's densities must satisfy is in framework.testing.densities.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.density import Circular, Mixture, median
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.rows import HeadRow
+
+BATCH_SHAPES = ((), (4,), (3, 2), (0,))
+SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
+"""Raw numbers of these sizes, and of the largest a type holds, are fed in as they may come from a diverging network."""
+
+
+@dataclass(frozen=True)
+class HeadSubject:
+    """A row and how to build the head it describes; every built head has the same parameters."""
+
+    row: HeadRow
+    build: Callable[[], DensityHead]
+
+    def make(self) -> DensityHead:
+        """A fresh head in evaluation mode."""
+        torch.manual_seed(SEED)
+        return self.build().eval()
+
+    def raws(self, *batch: int) -> Tensor:
+        """Seeded normal raw numbers (*batch, size), float32."""
+        generator = torch.Generator().manual_seed(SEED)
+        return torch.randn(*batch, self.make().size, generator=generator)
+
+    def values(self, *batch: int) -> Tensor:
+        """Seeded targets: angles over several turns, reals of size 1, labels."""
+        return values(self.row.target, batch)
+
+
+def values(target: Target, batch: tuple[int, ...]) -> Tensor:
+    """Seeded targets: angles over several turns, reals of size 1, labels."""
+    generator = torch.Generator().manual_seed(SEED + 1)
+    if target.kind == "class":
+        return torch.randint(len(target.names), batch, generator=generator)
+    scale = 6.0 if target.kind == "angle" else 1.0
+    return scale * torch.randn(*batch, len(target.names), generator=generator)
+
+
+def examine_head(subject: HeadSubject) -> Iterator[Finding]:
+    """Every property of the head itself, cheapest first."""
+    checks = (
+        ("batch shapes", 0.0, _shapes),
+        ("number types", 0.0, _number_types),
+        ("NaN and infinity refused", 0.0, _refuses_non_finite),
+        ("same seed, same bits", 0.0, _repeatable),
+        ("rows of a batch apart", 0.0, _rows_apart),
+        ("state-dict round trip", 0.0, _round_trip),
+        ("mixture of one is the component", 0.0, _mixture_of_one),
+        ("knobs turn", 0.0, _knobs),
+        ("finite for any raw numbers", 0.0, _finite_anywhere),
+        ("loss gradient", 1e-6, _gradient),
+        ("float32 against float64", 32.0, _precision),
+        ("log_prob, float64", 1e-12, lambda subject, worst: _reference(subject, worst, torch.float64)),
+        ("log_prob, float32", 1e-5, lambda subject, worst: _reference(subject, worst, torch.float32)),
+    )
+    for name, limit, check in checks:
+        if name in subject.row.leave_out or (name.startswith("log_prob") and subject.row.cases is None):
+            continue
+        yield examined(
+            name, subject.row.limits.get(name, limit), lambda worst, check=check: check(subject, worst)
+        )
+
+
+def _shapes(subject: HeadSubject, worst: Worst) -> None:
+    """Batches of any shape, also empty; losses with finite gradients in the raw numbers."""
+    target = subject.row.target
+    event = () if target.kind == "class" else (len(target.names),)
+    for batch in BATCH_SHAPES:
+        head, raw, value = subject.make(), subject.raws(*batch).requires_grad_(), subject.values(*batch)
+        loss = head.train().loss(raw, value)
+        worst.same(f"shape of the loss of a batch {batch}", tuple(loss.shape), batch)
+        loss.sum().backward()
+        if raw.grad is None:
+            worst.see(math.inf, "the loss does not depend on the raw numbers")
+            return
+        worst.finite(f"gradient of the loss, batch {batch}", raw.grad)
+        with torch.no_grad():
+            density = head.eval()(raw)
+            several = subject.values(5, *batch)
+            shapes = {
+                "batch_shape": (density.batch_shape, batch),
+                "event_shape": (density.event_shape, event),
+                "log_prob": (density.log_prob(value).shape, batch),
+                "log_prob of 5 values": (density.log_prob(several).shape, (5, *batch)),
+                "sample()": (density.sample().shape, (*batch, *event)),
+                "sample((2, 3))": (density.sample(torch.Size((2, 3))).shape, (2, 3, *batch, *event)),
+            }
+            if 0 not in batch:
+                shapes["mode"] = (density.mode.shape, (*batch, *event))
+                shapes["entropy"] = (density.entropy().shape, batch)
+                if target.kind != "class":
+                    shapes["median"] = (median(density, 200).shape, (*batch, *event))
+            if target.kind == "angle":
+                worst.count(
+                    not isinstance(density.support, Circular), f"support: {density.support}, wanted angles"
+                )
+            for what, (found, wanted) in shapes.items():
+                worst.same(f"{what} of a batch {batch}", tuple(found), wanted)
+
+
+def _number_types(subject: HeadSubject, worst: Worst) -> None:
+    """float64 stays float64, half precision is upcast to float32."""
+    float32, float64 = torch.float32, torch.float64
+    wanted = {float64: float64, float32: float32, torch.float16: float32, torch.bfloat16: float32}
+    for given, computed in wanted.items():
+        head = subject.make().to(computed)
+        value = _as(subject.values(4), computed)
+        with torch.no_grad():
+            density = head(subject.raws(4).to(given))
+            worst.same(f"log_prob of {given} raw numbers", density.log_prob(value).dtype, computed)
+            worst.finite(f"log_prob of {given} raw numbers", density.log_prob(value))
+            if value.is_floating_point():
+                worst.same(f"samples of {given} raw numbers", density.sample().dtype, computed)
+
+
+def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
+    """A ValueError that names the first bad batch row."""
+    head = subject.make()
+    for bad in (math.nan, math.inf, -math.inf):
+        for column in range(0, head.size, max(1, head.size // 7)):
+            raw = subject.raws(5)
+            raw[3, column] = bad
+            raw[4] = bad
+            try:
+                head(raw)
+            except ValueError as error:
+                worst.count("3" not in str(error), f"{bad} in row 3, column {column}: {error}")
+            else:
+                worst.count(True, f"{bad} in row 3, column {column} was accepted")
+
+
+def _repeatable(subject: HeadSubject, worst: Worst) -> None:
+    head, raw, value = subject.make(), subject.raws(4), subject.values(4)
+
+    def everything() -> dict[str, Tensor]:
+        torch.manual_seed(SEED)
+        density = head.eval()(raw)
+        return {
+            "log_prob": density.log_prob(value),
+            "sample": density.sample(torch.Size((3,))),
+            "loss": head.train().loss(raw, value),
+        }
+
+    with torch.no_grad():
+        second = everything()
+        for name, first in everything().items():
+            worst.same_bits(f"{name} of two runs", first, second[name])
+
+
+def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
+    """A row's loss has no gradient in another row: no density depends on its neighbours in the batch."""
+    raw = subject.raws(4).requires_grad_()
+    subject.make().train().loss(raw, subject.values(4))[2].backward()
+    if raw.grad is None:
+        worst.see(math.inf, "the loss does not depend on the raw numbers")
+        return
+    worst.see(raw.grad[[0, 1, 3]].abs(), lambda at: f"gradient of row 2's loss in row {[0, 1, 3][at[0]]}")
+
+
+def _round_trip(subject: HeadSubject, worst: Worst) -> None:
+    """calibrate changes buffers only; a fresh head with the stored state gives the same bits."""
+    head, raw, value = subject.make(), subject.raws(32), subject.values(32)
+    before = {name: parameter.clone() for name, parameter in head.named_parameters()}
+    with torch.no_grad():
+        head.calibrate(raw, value)
+        for name, parameter in head.named_parameters():
+            worst.same_bits(f"parameter {name} after calibrate", parameter, before[name])
+        torch.manual_seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
+        other = subject.build().eval()
+        other.load_state_dict(head.state_dict())
+        torch.manual_seed(SEED)
+        first = head(raw).log_prob(value)
+        torch.manual_seed(SEED)
+        worst.same_bits("log_prob of the stored state", other(raw).log_prob(value), first)
+
+
+def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
+    """framework.density.Mixture with one component, which every wrapper and mixture returns."""
+    head, raw, value = subject.make(), subject.raws(4), subject.values(4)
+    with torch.no_grad():
+        found = {}
+        for number in (1, 2):
+            torch.manual_seed(SEED)
+            density = head(raw) if number == 1 else Mixture(torch.zeros(4, 1), head(raw.unsqueeze(-2)))
+            found[number] = {"log_prob": density.log_prob(value), "mode": density.mode}
+            torch.manual_seed(SEED)
+            found[number]["entropy"] = density.entropy()
+            torch.manual_seed(SEED)
+            found[number]["sample"] = density.sample(torch.Size((3,)))
+        for name, alone in found[1].items():
+            worst.same_bits(name, found[2][name], alone)
+
+
+def _knobs(subject: HeadSubject, worst: Worst) -> None:
+    """Attributes that may be set at any time, their declared values ascending; the smallest two work."""
+    head = subject.make()
+    worst.count(False, "none declared")
+    for name, dial in head.knobs.items():
+        worst.same(f"order of {name}", list(dial), sorted(dial))
+        for setting in dial[:2]:
+            setattr(head, name, setting)
+            with torch.no_grad():
+                worst.finite(
+                    f"log_prob with {name} = {setting}", head(subject.raws(3)).log_prob(subject.values(3))
+                )
+
+
+def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
+    """Raw numbers of any finite size: log-densities, losses, their gradients, samples and modes."""
+    for dtype in (torch.float32, torch.float64):
+        head = subject.make().to(dtype)
+        for size in (*SIZES, torch.finfo(dtype).max):
+            raw = subject.raws(16).sign().to(dtype) * size
+            raw[:4], raw[4:8] = size, -size
+            value = _as(subject.values(16), dtype)
+            where = f"{str(dtype)[6:]}, raw numbers of size {size:.3g}"
+            with torch.no_grad():
+                density = head.eval()(raw)
+                worst.finite(f"log_prob: {where}", density.log_prob(value))
+                worst.finite(f"mode: {where}", density.mode)
+                worst.finite(f"samples: {where}", density.sample())
+            raw.requires_grad_()
+            loss = head.train().loss(raw, value)
+            worst.finite(f"loss: {where}", loss)
+            loss.sum().backward()
+            worst.finite(f"gradient of the loss: {where}", torch.zeros(1) if raw.grad is None else raw.grad)
+
+
+def _gradient(subject: HeadSubject, worst: Worst, step: float = 1e-5) -> None:
+    """Directional derivatives of the loss in raw numbers and parameters against central differences."""
+    head = subject.make().double().train()
+    value = _as(subject.values(3), torch.float64)
+    for size in (0.1, 1.0, 3.0):
+        raw = (size * subject.raws(3).double()).requires_grad_()
+        arguments = {"raw numbers": raw}
+        arguments.update((name, part) for name, part in head.named_parameters() if part.requires_grad)
+
+        def loss(raw: Tensor = raw) -> Tensor:
+            torch.manual_seed(SEED)
+            return head.loss(raw, value).sum()
+
+        gradients = torch.autograd.grad(loss(), list(arguments.values()), allow_unused=True)
+        for number, ((name, argument), gradient) in enumerate(zip(arguments.items(), gradients, strict=True)):
+            generator = torch.Generator().manual_seed(number)
+            direction = torch.randn(argument.shape, dtype=argument.dtype, generator=generator)
+            direction = direction / direction.norm()
+            analytic = 0.0 if gradient is None else (gradient * direction).sum().item()
+            ends = []
+            with torch.no_grad():
+                for sign in (1, -1):
+                    argument += sign * step * direction
+                    ends.append(loss().item())
+                    argument -= sign * step * direction
+            numeric = (ends[0] - ends[1]) / (2 * step)
+            worst.see(
+                abs(analytic - numeric) / max(1.0, abs(numeric)),
+                f"in {name} of size {size:g}: {analytic:.9g}, by differences {numeric:.9g}",
+            )
+
+
+def _precision(subject: HeadSubject, worst: Worst) -> None:
+    """log_prob in float32 against the same head in float64, at the same numbers; error in float32 epsilons.
+
+    Relative to max(1, |log p|) and to what a rounding of the raw numbers or of an angle changes, Σ|r ∂log p/∂r| +
+    Σ max(|φ|, π)|∂log p/∂φ|: what is left is cancellation inside.
+    """
+    single = subject.make()
+    double = copy.deepcopy(single).double()
+    for size in (1e-8, 1e-3, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6):
+        raw = size * subject.raws(64)
+        with torch.no_grad():
+            at_mode = _seeded(single, raw).mode
+        for where, value in (("the mode", at_mode), ("a random value", subject.values(64))):
+            with torch.no_grad():
+                found = _seeded(single, raw).log_prob(value).double()
+            exact_raw = raw.double().requires_grad_()
+            arguments = [exact_raw]
+            if value.is_floating_point():
+                value = value.double().requires_grad_()
+                arguments.append(value)
+            exact = _seeded(double, exact_raw).log_prob(value)
+            slopes = torch.autograd.grad(exact.sum(), arguments)
+            scale = exact.detach().abs().clamp(min=1) + (slopes[0] * exact_raw).abs().sum(-1).detach()
+            if len(slopes) > 1:
+                least = math.pi if subject.row.target.kind == "angle" else 0.0
+                scale = scale + (slopes[1].abs() * value.detach().abs().clamp(min=least)).sum(-1)
+            error = (found - exact.detach()).abs() / scale / torch.finfo(torch.float32).eps
+            worst.see(
+                error,
+                lambda at, size=size, where=where, found=found, exact=exact: (
+                    f"at {where}, raw numbers of size {size:g}: {found[at].item():.9g}, "
+                    f"in float64 {exact[at].item():.9g}"
+                ),
+            )
+
+
+def _seeded(head: DensityHead, raw: Tensor) -> Distribution:
+    """The density with the same random numbers, if it draws any, each time."""
+    torch.manual_seed(SEED)
+    return head(raw)
+
+
+def _reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
+    """log_prob of the row's cases; error relative to max(1, |reference|)."""
+    assert subject.row.cases is not None
+    head = subject.make().double()
+    cases = list(subject.row.cases(head))
+    head = head.to(dtype)
+    for case in cases:
+        with torch.no_grad():
+            found = _seeded(head, case.raw.to(dtype)).log_prob(_as(case.value, dtype)).double()
+        error = (found - case.log_prob).abs() / case.log_prob.abs().clamp(min=1)
+        worst.see(
+            error,
+            lambda at, case=case, found=found: (
+                f"{case.name}: {found[at].item():.9g}, reference {case.log_prob[at].item():.9g}"
+            ),
+        )
+
+
+def _as(value: Tensor, dtype: torch.dtype) -> Tensor:
+    return value.to(dtype) if value.is_floating_point() else value

@@ -1,0 +1,227 @@
+"""The contract of a metric: one function a property, each reporting the worst case it saw."""
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Categorical, Distribution, MultivariateNormal, constraints
+
+from framework.density import circular, marginal, median, pick, take
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.heads import values
+from framework.testing.rows import MetricRow
+
+Make = Callable[[], Metric]
+SAMPLES = 24
+
+
+class Cardioid(Distribution):
+    """(1 + cos(φ - μ)) / 2π for each angle (Mardia & Jupp 2000, §3.5.5): the simplest density on the circle."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, location: Tensor) -> None:
+        self.location = location
+        super().__init__(location.shape[:-1], location.shape[-1:], validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return circular
+
+    @property
+    def mode(self) -> Tensor:
+        return self.location
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        # 1 + cos d = 2 cos²(d/2); kept off its zero, where no metric could compare anything
+        near = 2 * torch.cos((value - self.location) / 2).square()
+        return (near.clamp(min=1e-12).log() - math.log(2 * math.pi)).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = self._extended_shape(torch.Size(sample_shape))
+        # with t = tan(θ/2) the density is ∝ 1/(1+t²)²: √3 t is Student's with 3 degrees of freedom
+        normal = torch.randn(4, *shape, dtype=self.location.dtype)
+        return self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
+
+    def entropy(self) -> Tensor:
+        # -∫ p log p = log 4π - 1 each (quadrature: 1.5310)
+        return torch.full(self.batch_shape, self.event_shape[0] * (math.log(4 * math.pi) - 1)).to(
+            self.location
+        )
+
+
+@marginal.register
+def _(density: Cardioid, index: int) -> Cardioid:
+    return Cardioid(density.location[..., index : index + 1])
+
+
+@median.register
+def _(density: Cardioid, samples: int) -> Tensor:
+    return density.location
+
+
+@pick.register
+def _(density: Cardioid, index: Tensor) -> Cardioid:
+    return Cardioid(take(density.location, index))
+
+
+def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
+    """Every property of one metric on predictions of `row.target`."""
+    whole = _predictions(row, SAMPLES)
+    checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
+        "named numbers": (0.0, lambda worst: _named(build, whole, worst)),
+        "nothing seen is NaN": (0.0, lambda worst: _nothing(build, whole, worst)),
+        "batches do not matter": (1e-9, lambda worst: _batches(build, whole, worst)),
+        "order does not matter": (1e-9, lambda worst: _order(build, whole, worst)),
+        "states merge": (1e-9, lambda worst: _merge(build, whole, worst)),
+        "reset and copy": (0.0, lambda worst: _reset(build, whole, worst)),
+        "perfect beats random": (0.0, lambda worst: _perfect(build, row, worst)),
+    }
+    for name, (limit, check) in checks.items():
+        if name not in row.leave_out:
+            yield examined(name, row.limits.get(name, limit), check)
+
+
+Slices = Callable[[Tensor], Prediction]
+
+
+def _predictions(row: MetricRow, count: int) -> Slices:
+    """Indices → the prediction of those samples of one fixed set."""
+    target = values(row.target, (count,))
+    fields = {name: make(count) for name, make in row.fields.items()}
+    generator = torch.Generator().manual_seed(SEED)
+    location = (
+        torch.randn(target.shape, generator=generator) if row.target.kind != "class" else torch.zeros(())
+    )
+    logits = torch.randn(count, len(row.target.names), generator=generator)
+
+    def some(index: Tensor) -> Prediction:
+        density: Distribution
+        if row.target.kind == "angle":
+            density = Cardioid(location[index])
+        elif row.target.kind == "real":
+            density = _normal(location[index])
+        else:
+            density = Categorical(logits=logits[index], validate_args=False)
+        batch = {"target": target[index], "index": index, "group": torch.zeros_like(index)}
+        return Prediction(density, batch | {name: field[index] for name, field in fields.items()})
+
+    return some
+
+
+def _normal(location: Tensor) -> Distribution:
+    # MultivariateNormal, since Independent refuses empty batches
+    identity = torch.eye(location.shape[-1])
+    return MultivariateNormal(location, scale_tril=identity, validate_args=False)
+
+
+def _after(build: Make, some: Slices, parts: list[Tensor]) -> dict[str, Tensor]:
+    metric = build()
+    torch.manual_seed(SEED)
+    for part in parts:
+        metric.update(some(part))
+    return metric.compute()
+
+
+def _compare(what: str, found: dict[str, Tensor], wanted: dict[str, Tensor], worst: Worst) -> None:
+    worst.same(f"{what}: keys", sorted(found), sorted(wanted))
+    for key, value in wanted.items():
+        gap = (found[key].double() - value.double()).abs() / value.double().abs().clamp(min=1)
+        both = found[key].isnan() & value.isnan()
+        worst.see(gap.where(~both, 0), f"{what}: {key} {found[key].item():.9g}, wanted {value.item():.9g}")
+
+
+def _named(build: Make, some: Slices, worst: Worst) -> None:
+    metric = build()
+    found = _after(build, some, [torch.arange(SAMPLES)])
+    worst.count(
+        not set(metric.columns) <= set(found), f"columns {sorted(set(metric.columns) - set(found))} missing"
+    )
+    worst.count(not set(metric.better) <= set(metric.columns), f"better {sorted(metric.better)} of columns")
+    for key, value in found.items():
+        worst.same(f"shape of {key}", tuple(value.shape), ())
+        worst.same(f"{key} is one number", value.numel(), 1)
+    worst.count(
+        all(value.isnan().item() for value in found.values()), "every number is NaN on ordinary predictions"
+    )
+
+
+def _nothing(build: Make, some: Slices, worst: Worst) -> None:
+    for what, parts in {"no update": [], "an empty batch": [torch.arange(0)]}.items():
+        for key, value in _quiet(build, some, parts).items():
+            worst.count(not value.isnan().item(), f"{what}: {key} is {value.item():g}")
+
+
+def _quiet(build: Make, some: Slices, parts: list[Tensor]) -> dict[str, Tensor]:
+    import warnings
+
+    with warnings.catch_warnings():
+        # torchmetrics warns of compute before update, which is what is tried here
+        warnings.filterwarnings("ignore", message=".*compute.*before the.*update.*", category=UserWarning)
+        return _after(build, some, parts)
+
+
+def _batches(build: Make, some: Slices, worst: Worst) -> None:
+    index = torch.arange(SAMPLES)
+    wanted = _after(build, some, [index])
+    _compare("in batches of 7", _after(build, some, list(index.split(7))), wanted, worst)
+    _compare("one by one", _after(build, some, list(index.split(1))), wanted, worst)
+
+
+def _order(build: Make, some: Slices, worst: Worst) -> None:
+    index = torch.arange(SAMPLES)
+    _compare("backwards", _after(build, some, [index.flip(0)]), _after(build, some, [index]), worst)
+
+
+def _merge(build: Make, some: Slices, worst: Worst) -> None:
+    """What two processes saw, merged as torchmetrics merges them."""
+    first, second = build(), build()
+    first.update(some(torch.arange(10)))
+    second.update(some(torch.arange(10, SAMPLES)))
+    first.merge_state(second)
+    _compare("two halves merged", first.compute(), _after(build, some, [torch.arange(SAMPLES)]), worst)
+
+
+def _reset(build: Make, some: Slices, worst: Worst) -> None:
+    index = torch.arange(SAMPLES)
+    metric = build()
+    metric.update(some(index[:5]))
+    metric.reset()
+    metric.update(some(index))
+    wanted = _after(build, some, [index])
+    _compare("after a reset", metric.compute(), wanted, worst)
+    _compare("of a copy", copy.deepcopy(metric).compute(), wanted, worst)
+
+
+def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
+    """A density about the target is judged better, in every column that has a better way, than one about elsewhere."""
+    metric = build()
+    some = _predictions(row, SAMPLES)
+    index = torch.arange(SAMPLES)
+
+    def about(location: Tensor) -> dict[str, Tensor]:
+        prediction = some(index)
+        if row.target.kind == "angle":
+            density: Distribution = Cardioid(location.float())
+        elif row.target.kind == "real":
+            density = _normal(location)
+        else:
+            logits = 3.0 * torch.nn.functional.one_hot(location, len(row.target.names)).float()
+            density = Categorical(logits=logits, validate_args=False)
+        judged = build()
+        judged.update(Prediction(density, prediction.batch))
+        return judged.compute()
+
+    target = some(index).target
+    elsewhere = (target + 1) % len(row.target.names) if row.target.kind == "class" else target + 2.0
+    good, bad = about(target), about(elsewhere)
+    worst.count(False, "no column has a better way")
+    for key, way in metric.better.items():
+        ahead = good[key] - bad[key] if way == "higher" else bad[key] - good[key]
+        told = f"{key}: {good[key].item():.4g} about the target, {bad[key].item():.4g} elsewhere"
+        worst.count(not (ahead > 0 or good[key].isnan().item()), told)

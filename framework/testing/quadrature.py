@@ -1,0 +1,95 @@
+"""Integrals of any density by brute force: cells of its domain with their masses."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.density import Circular
+
+POINTS = {1: 1020, 2: 252, 3: 36}
+"""Grid points a side by the number of angles; spectrally exact for densities that the grid resolves."""
+REAL_POINTS = {1: 1020, 2: 252, 3: 72}
+CELLS = {1: 12, 2: 12, 3: 6}
+"""Cells a side in which samples are counted; divides the points."""
+REAL_SCALE = 3.0
+"""Reals are read on a circle, x = 3 tan(t/2), t uniform: half of the points lie within ±3."""
+
+
+def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
+    """Borders (cells a side + 1,) of each number, and the mass (*cells, *batch) of each cell, float64.
+
+    Covers one to three numbers, and classes, whose borders lie between the labels; more numbers raise a ValueError.
+    """
+    batch = density.batch_shape
+    if density.event_shape == ():
+        classes = density.enumerate_support()
+        return [torch.arange(len(classes) + 1) - 0.5], density.log_prob(classes).double().exp()
+    numbers = density.event_shape[0]
+    if numbers not in POINTS:
+        raise ValueError(f"quadrature covers one to three numbers, got {numbers}; pass a marginal.")
+    points = (POINTS if isinstance(density.support, Circular) else REAL_POINTS)[numbers]
+    count = CELLS[numbers]
+    sides = [side(density, index, points, count) for index in range(numbers)]
+    axes = torch.meshgrid(*[axis for axis, _, _ in sides], indexing="ij")
+    weight = torch.stack(torch.meshgrid(*[slope for _, slope, _ in sides], indexing="ij")).prod(0)
+    mass = density_at(density, torch.stack(axes, -1).reshape(-1, numbers))
+    mass = mass * weight.reshape(-1, *(1,) * len(batch))
+    mass = mass.reshape(*(count, points // count) * numbers, *batch)
+    return [borders for _, _, borders in sides], mass.sum(tuple(range(1, 2 * numbers, 2)))
+
+
+def density_at(density: Distribution, points: Tensor) -> Tensor:
+    """The density at points (points, numbers), (points, *batch), float64."""
+    batch = density.batch_shape
+    like = density.sample(torch.Size((0,)))  # a sample of nothing tells the density's number type
+    value = points.to(like.dtype).reshape(-1, *(1,) * len(batch), points.shape[-1])
+    return density.log_prob(value.expand(-1, *batch, -1)).double().exp()
+
+
+def counted(density: Distribution, borders: list[Tensor], samples: Tensor) -> Tensor:
+    """How many of samples (draws, *batch, *event) fall in each cell, (*cells, *batch), float64."""
+    batch = density.batch_shape
+    if density.event_shape == ():
+        labels = torch.arange(len(borders[0]) - 1).reshape(-1, *(1,) * samples.dim())
+        return (samples == labels).double().sum(1)
+    sides = [len(border) - 1 for border in borders]
+    cell = torch.zeros(samples.shape[:-1], dtype=torch.int64)
+    for number, (border, side) in enumerate(zip(borders, sides, strict=True)):
+        place = samples[..., number].double()
+        if isinstance(density.support, Circular):
+            place = torch.remainder(place + math.pi, 2 * math.pi) - math.pi
+        cell = cell * side + torch.bucketize(place.contiguous(), border[1:-1])
+    found = torch.zeros(math.prod(sides), *batch, dtype=torch.float64)
+    found.scatter_add_(0, cell, torch.ones_like(cell, dtype=torch.float64))
+    return found.reshape(*sides, *batch)
+
+
+def side(density: Distribution, index: int, points: int, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Nodes (points,), their weights, and the borders (count + 1,) of cells, of one number of the density.
+
+    A whole turn has equally spaced nodes; a part of one, at whose ends a density need not close, those of Gauss and
+    Legendre in each cell.
+    """
+    middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
+    border = torch.arange(count + 1, dtype=torch.float64) / count
+    if isinstance(density.support, Circular):
+        ranges = density.support.ranges
+        low, high = (-math.pi, math.pi) if ranges is None else ranges[index]
+        length = high - low
+        weight = torch.full_like(middle, 1 / points)
+        if ranges is not None:
+            node, half = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points // count))
+            middle = (border[:-1, None] + (node + 1) / (2 * count)).flatten()
+            weight = (half / (2 * count)).repeat(count)
+        return low + length * middle, length * weight, low + length * border
+    axis, border = _real(middle), _real(border)
+    border[0], border[-1] = -math.inf, math.inf
+    return axis, math.pi * REAL_SCALE * (1 + (axis / REAL_SCALE).square()) / points, border
+
+
+def _real(part: Tensor) -> Tensor:
+    """(0, 1) → the reals."""
+    return REAL_SCALE * torch.tan(math.pi * (part - 0.5))

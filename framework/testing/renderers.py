@@ -1,0 +1,258 @@
+"""The contract of a renderer: one function a property, each reporting the worst case it saw."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from framework.camera import Camera, look_from
+from framework.renderer import Renderer, Scene
+from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.rows import RendererRow
+
+Make = Callable[[], Renderer]
+SIZE = (48, 64)
+
+
+def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
+    """Every property of one renderer on the scenes below."""
+    checks: dict[str, tuple[float, Callable[[Renderer, Worst], None]]] = {
+        "only the channels asked for": (0.0, _channels),
+        "what it cannot draw is refused": (0.0, _refusals),
+        "same scene, same bits": (0.0, _repeatable),
+        "nothing seen is background": (0.0, _background),
+        "bad triangles are left out": (0.0, _bad_triangles),
+        "lower face wins": (0.0, _ties),
+        "no holes": (0.0, _no_holes),
+        "nearer hides farther": (0.0, _hiding),
+        "sphere: depth, metres": (2e-3, _sphere),
+        "one pixel, one row": (0.0, _small),
+    }
+    for name, (limit, check) in checks.items():
+        if name not in row.leave_out:
+            yield examined(
+                name,
+                row.limits.get(name, limit),
+                lambda worst, check=check: check(build(), worst),
+                seconds=60.0,
+            )
+
+
+def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
+    """A sphere about the origin, coloured by place, seen from four metres."""
+    theta = torch.linspace(0, math.pi, rings + 1, dtype=torch.float64)
+    phi = torch.arange(2 * rings, dtype=torch.float64) * (math.pi / rings)
+    grid = torch.stack(
+        [
+            torch.outer(theta.sin(), phi.cos()),
+            torch.outer(theta.sin(), phi.sin()),
+            theta.cos()[:, None].expand(-1, 2 * rings),
+        ],
+        -1,
+    )
+    row, column = torch.meshgrid(torch.arange(rings), torch.arange(2 * rings), indexing="ij")
+    a, b = row * 2 * rings + column, row * 2 * rings + (column + 1) % (2 * rings)
+    faces = torch.cat(
+        [torch.stack([a, a + 2 * rings, b], -1), torch.stack([b, a + 2 * rings, b + 2 * rings], -1)]
+    )
+    vertices = (radius * grid.reshape(-1, 3)).float()
+    return Scene(vertices, faces.reshape(-1, 3), (vertices / radius + 1) / 2, camera())
+
+
+def camera() -> Camera:
+    return look_from(0.3, 0.2, 0.1, distance=4.0, field_of_view=0.7, size=SIZE)
+
+
+def square(distance: float, side: float = 10.0) -> Scene:
+    """Two triangles across the whole view, `distance` metres in front of the camera, facing it."""
+    seen = camera()
+    corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double() * side / 2
+    corners[:, 2] = distance
+    world = (corners - seen.translation.double()) @ seen.rotation.double()
+    faces = torch.tensor([[0, 2, 1], [0, 3, 2]])
+    return Scene(world.float(), faces, torch.rand(4, 3, generator=torch.Generator().manual_seed(SEED)), seen)
+
+
+def empty(scene: Scene) -> Scene:
+    return replace(scene, faces=scene.faces[:0])
+
+
+def _channels(renderer: Renderer, worst: Worst) -> None:
+    scene, every = sphere(), sorted(renderer.channels)
+    together = renderer(scene, every)
+    worst.same("channels drawn", sorted(together), every)
+    worst.same("channels of none asked", dict(renderer(scene, ())), {})
+    wanted = {
+        "color": (torch.float32, (*SIZE, 3)),
+        "depth": (torch.float32, SIZE),
+        "face": (torch.int32, SIZE),
+        "mask": (torch.bool, SIZE),
+    }
+    for name in every:
+        alone = renderer(replace(scene, colors=scene.colors if name == "color" else None), (name,))
+        worst.same(f"channels when {name} is asked for", sorted(alone), [name])
+        worst.same_bits(f"{name} alone and with the others", alone[name], together[name])
+        if name in wanted:
+            worst.same(f"{name}", (alone[name].dtype, tuple(alone[name].shape)), wanted[name])
+
+
+def _refusals(renderer: Renderer, worst: Worst) -> None:
+    scene, some = sphere(), sorted(renderer.channels)[:1]
+    wrong: dict[str, tuple[Scene, tuple[str, ...]]] = {
+        "a channel that does not exist": (scene, ("colour of the wind",)),
+        "faces beyond the vertices": (replace(scene, faces=scene.faces + len(scene.vertices)), tuple(some)),
+        "negative faces": (replace(scene, faces=-scene.faces - 1), tuple(some)),
+        "vertices of two numbers": (replace(scene, vertices=scene.vertices[:, :2]), tuple(some)),
+    }
+    if "color" in renderer.channels:
+        wrong["colour of a scene without"] = (replace(scene, colors=None), ("color",))
+    for what, (bad, channels) in wrong.items():
+        try:
+            renderer(bad, channels)
+        except ValueError as error:
+            worst.count(len(str(error)) < 10, f"{what}: {error}")
+        else:
+            worst.count(True, f"{what}: drawn, wanted a ValueError")
+
+
+def _repeatable(renderer: Renderer, worst: Worst) -> None:
+    """Also after another scene in between: no state is left."""
+    first = renderer(sphere(), sorted(renderer.channels))
+    renderer(square(2.0), sorted(renderer.channels))
+    for name, again in renderer(sphere(), sorted(renderer.channels)).items():
+        worst.same_bits(name, again, first[name])
+
+
+def _background(renderer: Renderer, worst: Worst) -> None:
+    scene = sphere()
+    away = torch.tensor([1e3, 1e3, 1e3])
+    scenes = {
+        "no faces": empty(scene),
+        "no vertices": replace(empty(scene), vertices=torch.zeros(0, 3), colors=torch.zeros(0, 3)),
+        "behind the camera": square(-3.0),
+        "out of view": replace(scene, vertices=scene.vertices + away),
+        "nearer than the near plane": square(camera().near / 2, side=1e-4),
+    }
+    for what, unseen in scenes.items():
+        _is_background(renderer, unseen, what, worst)
+
+
+def _bad_triangles(renderer: Renderer, worst: Worst) -> None:
+    scene = square(3.0)
+    point = scene.vertices[:1].expand(4, 3)
+    for what, vertices in {
+        "NaN": torch.full_like(scene.vertices, math.nan),
+        "infinite": torch.full_like(scene.vertices, math.inf),
+        "one point": point,
+        "a line": scene.vertices[:1]
+        + torch.arange(4.0)[:, None] * (scene.vertices[1:2] - scene.vertices[:1]) / 3,
+    }.items():
+        _is_background(renderer, replace(scene, vertices=vertices), what, worst)
+    # one bad triangle beside good ones leaves the good ones as they are
+    mixed = replace(
+        scene,
+        vertices=torch.cat([scene.vertices, torch.tensor([[math.nan, 0, 0]])]),
+        colors=None,
+        faces=torch.cat([scene.faces, torch.tensor([[0, 1, 4]])]),
+    )
+    channels = sorted(renderer.channels - {"color"})
+    good = renderer(replace(scene, colors=None), channels)
+    for name, found in renderer(mixed, channels).items():
+        worst.same_bits(f"{name} beside a bad triangle", found, good[name])
+
+
+def _is_background(renderer: Renderer, scene: Scene, what: str, worst: Worst) -> None:
+    drawn = renderer(scene, sorted(renderer.channels))
+    background: dict[str, float] = {"color": 0.0, "depth": math.inf, "face": -1, "mask": 0}
+    for name, value in drawn.items():
+        if name in background:
+            worst.count(value != background[name], f"{name} of a scene {what}")
+
+
+def _ties(renderer: Renderer, worst: Worst) -> None:
+    """Two equal surfaces: the lower face index is seen."""
+    if "face" not in renderer.channels:
+        worst.count(False, "draws no faces")
+        return
+    scene = square(3.0)
+    doubled = replace(scene, faces=scene.faces.repeat(3, 1))
+    face = renderer(doubled, ("face",))["face"]
+    worst.count(~((face == 0) | (face == 1)), "faces seen of three equal squares")
+
+
+def _no_holes(renderer: Renderer, worst: Worst) -> None:
+    """A square of thousands of triangles across the view covers every pixel."""
+    scene = square(3.0)
+    side = 57
+    part = torch.linspace(0, 1, side, dtype=torch.float64)
+    u, v = torch.meshgrid(part, part, indexing="ij")
+    corner = scene.vertices.double()
+    vertices = corner[0] + u[..., None] * (corner[1] - corner[0]) + v[..., None] * (corner[3] - corner[0])
+    row, column = torch.meshgrid(torch.arange(side - 1), torch.arange(side - 1), indexing="ij")
+    a = (row * side + column).reshape(-1)
+    faces = torch.cat(
+        [torch.stack([a, a + side + 1, a + side], -1), torch.stack([a, a + 1, a + side + 1], -1)]
+    )
+    faces = torch.cat([faces, faces.flip(-1)])  # seen from either side
+    mesh = Scene(vertices.reshape(-1, 3).float(), faces, None, scene.camera)
+    if "mask" in renderer.channels:
+        worst.count(~renderer(mesh, ("mask",))["mask"], "pixels of a closed surface not covered")
+    elif "depth" in renderer.channels:
+        worst.count(~renderer(mesh, ("depth",))["depth"].isfinite(), "pixels of a closed surface not covered")
+    else:
+        worst.count(False, "draws neither mask nor depth")
+
+
+def _hiding(renderer: Renderer, worst: Worst) -> None:
+    if "face" not in renderer.channels:
+        worst.count(False, "draws no faces")
+        return
+    far, near = square(5.0), square(2.0)
+    for order, (first, second) in {"far first": (far, near), "near first": (near, far)}.items():
+        both = Scene(
+            torch.cat([first.vertices, second.vertices]),
+            torch.cat([first.faces, second.faces + 4]),
+            None,
+            far.camera,
+        )
+        face = renderer(both, ("face",))["face"]
+        of_near = face >= 2 if first is far else (face >= 0) & (face < 2)
+        worst.count(~of_near, f"pixels that do not show the nearer square, {order}")
+
+
+def _sphere(renderer: Renderer, worst: Worst) -> None:
+    """Depth of a finely cut sphere against the ray's own intersection, away from the outline."""
+    if "depth" not in renderer.channels:
+        worst.count(False, "draws no depth")
+        return
+    scene = sphere(rings=120)
+    depth = renderer(replace(scene, colors=None), ("depth",))["depth"].double()
+    seen = scene.camera
+    y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
+    ray = torch.stack(
+        [
+            (x - seen.principal[0]) / seen.focal[0],
+            (y - seen.principal[1]) / seen.focal[1],
+            torch.ones_like(x),
+        ],
+        -1,
+    )
+    centre = seen.translation.double()  # of the sphere, in the camera's frame
+    along, square_of_ray = ray @ centre, ray.square().sum(-1)
+    inside = along.square() - square_of_ray * (centre.square().sum() - 1)
+    true = (along - inside.clamp(min=0).sqrt()) / square_of_ray
+    clear = inside > 0.3 * inside.max()
+    worst.see((depth - true).abs().where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m")
+
+
+def _small(renderer: Renderer, worst: Worst) -> None:
+    scene = sphere()
+    for height, width in ((1, 1), (1, 64), (64, 1)):
+        view = look_from(0.0, 0.0, 0.0, distance=4.0, field_of_view=0.1, size=(height, width))
+        for name, value in renderer(replace(scene, camera=view), sorted(renderer.channels)).items():
+            shape = (height, width, 3) if name == "color" else (height, width)
+            worst.same(f"{name} of {height} × {width}", tuple(value.shape), shape)
+            if isinstance(value, Tensor) and value.is_floating_point() and name == "color":
+                worst.finite(f"{name} of {height} × {width}", value)

@@ -1,0 +1,107 @@
+"""Rows of the contract: a plugin states parameters and references in its `rows.py`, and every check runs on them.
+
+`rows.py` stands beside the module that holds the plugin's class; its `ROWS` is a dictionary from the plugin's name to
+its rows, of `HeadRow` for a density head, and so on. A plugin without rows is checked with its default parameters and
+no reference.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from framework.density_head import DensityHead
+from framework.target import Target
+
+
+@dataclass(frozen=True)
+class Case:
+    """Stiff or extreme raw numbers of a density head with log-densities from an independent source.
+
+    Attributes:
+        name: what is extreme here: "κ = 1e12".
+        raw: (batch, size) float64 raw numbers that float32 holds exactly.
+        value: (batch, *event) targets that float32 holds exactly, int64 for classes.
+        log_prob: (batch,) float64, the log-density there, nats, to full float64 accuracy.
+    """
+
+    name: str
+    raw: Tensor
+    value: Tensor
+    log_prob: Tensor
+
+
+@dataclass(frozen=True)
+class HeadRow:
+    """One parametrisation of a density head.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        target: what it predicts.
+        config: its parameters.
+        cases: the reference: a built head (evaluation mode, float64) → cases. None where none is known.
+        scale: standard deviation of the normal raw numbers on which densities are integrated, such that they are
+            broad enough for a grid of 1024 angles, or reals within some tens of zero.
+        limits: property → limit, where it is not the contract's own.
+        leave_out: property → why this density cannot have it.
+    """
+
+    name: str
+    target: Target
+    config: Mapping[str, Any] = field(default_factory=dict)
+    cases: Callable[[DensityHead], Iterable[Case]] | None = None
+    scale: float = 1.0
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EncoderRow:
+    """One parametrisation of an encoder: images of 3 or fewer channels, or a vector.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        input_shape: of one sample.
+        config, limits, leave_out: as in HeadRow.
+    """
+
+    name: str
+    input_shape: tuple[int, ...]
+    config: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MetricRow:
+    """One parametrisation of a metric.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        target: what is predicted.
+        fields: further fields of a batch that it reads: number of samples → tensor with that first dimension.
+        config, limits, leave_out: as in HeadRow.
+    """
+
+    name: str
+    target: Target
+    config: Mapping[str, Any] = field(default_factory=dict)
+    fields: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RendererRow:
+    """One parametrisation of a renderer.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        config, limits, leave_out: as in HeadRow.
+    """
+
+    name: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)

@@ -1,0 +1,23 @@
+"""Rows of the contract: objects without, with twofold and with full symmetry."""
+
+import torch
+from torch import Tensor
+
+from framework.target import Target
+from framework.testing.rows import MetricRow
+
+
+def symmetry(count: int) -> Tensor:
+    """0, 1, 2 in turn."""
+    return torch.arange(count) % 3
+
+
+ONE_MODE = {
+    "perfect beats random": "a density about the target alone misses the other modes of a symmetric object"
+}
+ROWS = {
+    "true_posterior": tuple(
+        MetricRow(", ".join(names), Target("angle", names), fields={"symmetry": symmetry}, leave_out=ONE_MODE)
+        for names in (("azimuth",), ("azimuth", "elevation", "tilt"))
+    )
+}

@@ -1,0 +1,106 @@
+"""mode=check: a sound plugin passes by name, an unsound one fails and is told where."""
+
+import math
+
+import pytest
+import torch
+
+from framework.testing.finding import Finding, Worst, examined, require
+from tests.conftest import Framework
+
+
+def test_a_strangers_head_passes_by_name(framework: Framework) -> None:
+    done = framework("mode=check", "density_head=wrapped_cauchy")
+    assert done.code == 0, done.out
+    assert "FAILS" not in done.out
+    findings = (done.folder / "check.csv").read_text(encoding="utf-8").splitlines()
+    assert len(findings) > 30
+    assert sum("log_prob, float32" in line for line in findings) == 1  # only one row has a reference
+
+
+def test_torchs_von_mises_fails_and_the_table_says_where(framework: Framework) -> None:
+    done = framework("mode=check", "density_head=torch_von_mises", "threads=1")
+    assert done.code == 1, done.out
+    failed = {
+        line.split("  ")[1].strip() for line in done.out.splitlines() if line.rstrip().endswith("FAILS")
+    }
+    expected = {
+        "NaN and infinity refused",
+        "finite for any raw numbers",
+        "float32 against float64",
+        "entropy",
+    }
+    assert expected <= failed
+    assert "did not end within" in done.out  # its sampler hangs at large concentrations
+    assert "Traceback" not in done.out
+
+
+def test_parameters_from_the_command_line_are_a_row(framework: Framework) -> None:
+    done = framework("mode=check", "density_head=wrapped_cauchy", "density_head.largest=0.5")
+    assert done.code == 0, done.out
+    assert "as configured" in (done.folder / "check.csv").read_text(encoding="utf-8")
+
+
+def test_nothing_chosen_is_refused(framework: Framework) -> None:
+    done = framework("mode=check")
+    assert done.code == 2
+    assert "mode=check density_head=<name>" in done.out
+
+
+# the instruments
+
+
+def test_the_worst_case_is_kept() -> None:
+    worst = Worst()
+    worst.see(torch.tensor([[0.1, 0.5], [0.2, 0.3]]), lambda at: f"at {at}")
+    worst.see(0.4, "later and smaller")
+    assert worst.finding("property", 1.0) == Finding("property", "at (0, 1)", 0.5, 1.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_nan_is_the_worst_of_all(bad: float) -> None:
+    worst = Worst()
+    worst.see(torch.tensor([0.1, bad, 0.2]), lambda at: f"number {at[0]}")
+    found = worst.finding("property", 1e300)
+    assert (found.error, found.worst, found.holds) == (math.inf, "number 1", False)
+
+
+def test_a_check_that_compares_nothing_fails() -> None:
+    assert not examined("property", 1.0, lambda worst: worst.see(torch.empty(0), "nothing")).holds
+
+
+def test_what_a_check_raises_is_told() -> None:
+    def look(worst: Worst) -> None:
+        raise NotImplementedError("no entropy")
+
+    found = examined("entropy", 1.0, look)
+    assert (found.worst, found.error) == ("NotImplementedError: no entropy", math.inf)
+
+
+def test_a_check_that_hangs_is_ended() -> None:
+    def look(worst: Worst) -> None:
+        while True:
+            torch.zeros(1).add_(1)
+
+    found = examined("sampling", 1.0, look, seconds=0.2)
+    assert not found.holds
+    assert "did not end within 0.2 s" in found.worst
+
+
+def test_require_names_every_failure() -> None:
+    good, bad = Finding("shape", "", 0.0, 0.0), Finding("entropy", "row 3", 2.0, 1.0)
+    require(good)
+    with pytest.raises(AssertionError, match=r"entropy FAILS: error 2, limit 1 \(row 3\)"):
+        require(good, bad)
+    with pytest.raises(AssertionError, match="nothing was examined"):
+        require()
+
+
+def test_bits_that_differ_are_counted_and_nan_equals_nan() -> None:
+    worst = Worst()
+    worst.same_bits("equal", torch.tensor([1.0, math.nan]), torch.tensor([1.0, math.nan]))
+    assert worst.error == 0
+    worst.same_bits("one off", torch.tensor([1.0, 2.0]), torch.tensor([1.0, 2.5]))
+    assert (worst.error, worst.case) == (0.5, "one off")
+    worst.same_bits("shape", torch.zeros(2), torch.zeros(3))
+    assert worst.error == math.inf
