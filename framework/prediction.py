@@ -7,6 +7,7 @@ from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.density import marginal, median
+from framework.monte_carlo import Estimate, estimate
 
 
 class Prediction:
@@ -27,10 +28,15 @@ class Prediction:
     def target(self) -> Tensor:
         return self.batch["target"]
 
-    @cached_property
+    @property
     def log_prob(self) -> Tensor:
         """Log-likelihood of the targets, (batch,), nats."""
-        return self.density.log_prob(self.target)
+        return self.estimate.log_mean
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """The same with its Monte Carlo error and the samples it took; exact of most densities."""
+        return estimate(self.density, self.target)
 
     @cached_property
     def point(self) -> Tensor:

@@ -9,7 +9,16 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.density import Mixture, marginal, median
+from framework.density import marginal, median
+from framework.monte_carlo import (
+    Effort,
+    Estimate,
+    NormalPoints,
+    SampledMixture,
+    estimate,
+    estimate_log_mean,
+    rows_of,
+)
 
 CHUNK = 2**22
 """Most hidden activations held at once without gradient (16 MiB in float32)."""
@@ -24,12 +33,18 @@ class Gaussian:
 
     def draw(self, count: int) -> Tensor:
         """z of shape (count, *batch, latent), differentiable in the parameters."""
-        noise = torch.randn(count, *self.mean.shape, dtype=self.mean.dtype, device=self.mean.device)
+        return self.at(torch.randn(count, *self.mean.shape, dtype=self.mean.dtype, device=self.mean.device))
+
+    def at(self, noise: Tensor) -> Tensor:
+        """z at standard normal numbers (*sample, *batch, latent)."""
         return self.mean + self.log_scale.exp() * noise
 
     def log_prob(self, z: Tensor) -> Tensor:
-        standard = (z - self.mean) * torch.exp(-self.log_scale)
-        return -(standard.square() / 2 + self.log_scale + math.log(2 * math.pi) / 2).sum(-1)
+        return self.log_prob_at((z - self.mean) * torch.exp(-self.log_scale))
+
+    def log_prob_at(self, noise: Tensor) -> Tensor:
+        """log_prob of `at(noise)`, without the cancellation in z - mean where the mean is large."""
+        return -(noise.square() / 2 + self.log_scale + math.log(2 * math.pi) / 2).sum(-1)
 
 
 def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
@@ -37,11 +52,6 @@ def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
     log_ratio = 2 * (first.log_scale - second.log_scale)
     shift = (first.mean - second.mean) * torch.exp(-second.log_scale)
     return ((torch.expm1(log_ratio) - log_ratio + shift.square()) / 2).sum(-1)
-
-
-def log_mean_exp(log_weight: Tensor, dim: int) -> Tensor:
-    """log of the mean of exp; of one number, that number to the last bit."""
-    return torch.logsumexp(log_weight, dim) - math.log(log_weight.shape[dim])
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,7 @@ class Networks:
         posterior: φ of shape (*sample, *batch, *event) → q(z|x,φ) of shape (*sample, *batch, latent).
         decode: z of shape (*sample, *batch, latent) → the component's raw numbers (*sample, *batch, number).
         component: raw numbers → p(φ|x,z).
+        rows: indices (rows,) into the flattened batch → the networks of these inputs.
         width: activations one decoded z holds in memory.
     """
 
@@ -60,15 +71,19 @@ class Networks:
     posterior: Callable[[Tensor], Gaussian]
     decode: Callable[[Tensor], Tensor]
     component: Callable[[Tensor], Distribution]
+    rows: Callable[[Tensor], "Networks"]
     width: int
 
 
-def importance_log_weights(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """log p(φ|x,z) p(z|x) / q(z|x,φ) at z ~ q, (samples, *sample, *batch), nats (terms of eq. 3.19)."""
+def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> Tensor:
+    """log p(φ|x,z) p(z|x) / q(z|x,φ), nats, of z ~ q at standard normal `noise` (terms of eq. 3.19).
+
+    Shapes: value (*sample, *batch, *event), noise (*draw, *sample, *batch, latent), result (*draw, *sample, *batch).
+    """
     posterior = networks.posterior(value)
-    z = posterior.draw(samples)
+    z = posterior.at(noise)
     likelihood = networks.component(networks.decode(z)).log_prob(value)
-    return likelihood + networks.prior.log_prob(z) - posterior.log_prob(z)
+    return likelihood + networks.prior.log_prob(z) - posterior.log_prob_at(noise)
 
 
 def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
@@ -81,56 +96,54 @@ def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
 class CVAEDensity(Distribution):
     """p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12).
 
-    `log_prob` is the importance-weighted bound (eq. 3.19) with `samples` proposals z ~ q(z|x,φ) for every
-    value: it is random, in expectation below the truth, and rises to it with `samples`. `sample` draws a
+    `log_prob` is the importance-weighted bound (eq. 3.19), with z ~ q(z|x,φ) at points that are drawn once: a function
+    of φ, with respect to the draw in expectation below the truth, rising to it with the samples. `sample` draws a
     fresh z from the prior for every value. `entropy`, `mode`, `median` and `marginal` are of `mixture`.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
 
-    def __init__(self, networks: Networks, samples: int) -> None:
+    def __init__(self, networks: Networks, effort: Effort) -> None:
         self.networks = networks
-        self.samples = samples
+        self.effort = effort
+        # drawn now, so that nothing depends on what is asked first
+        self.noise = self._points(effort, kept=effort.first)
+        self._fixed = Effort(effort.samples)
+        self._mixture_noise = self._points(self._fixed)
         self._example = networks.component(networks.decode(networks.prior.mean))
+        self.has_enumerate_support = self._example.has_enumerate_support
         super().__init__(self._example.batch_shape, self._example.event_shape, validate_args=False)
 
     @property
     def support(self) -> constraints.Constraint:
         return self._example.support  # pyright: ignore[reportReturnType]
 
+    def enumerate_support(self, expand: bool = True) -> Tensor:
+        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        return self._example.enumerate_support(expand)
+
     @cached_property
-    def mixture(self) -> Mixture:
-        """Equal weights on `samples` components with z from the prior: drawn on first use, then kept."""
-        z = self.networks.prior.draw(self.samples)
-        parts = [self.networks.decode(part) for part in z.split(self._at_once(self.samples, 1))]
+    def mixture(self) -> SampledMixture:
+        """Equal weights on S components with z from the prior: decoded on first use, then kept."""
+        effort, items = self._fixed, self.batch_shape.numel()
+        noise = self._mixture_noise(
+            torch.arange(items, device=self.networks.prior.mean.device), 0, effort.first
+        )
+        z = self.networks.prior.at(noise.reshape(effort.samples, *self.networks.prior.mean.shape))
+        parts = [self.networks.decode(part) for part in z.split(self._at_once(effort.samples))]
         number = torch.cat(parts).movedim(0, -2)
         weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
-        return Mixture(weights, self.networks.component(number))
+        return SampledMixture(weights, self.networks.component(number), effort.replicates)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        event = len(self.event_shape)
-        shape = torch.Size(torch.broadcast_shapes(value.shape[: value.dim() - event], self.batch_shape))
-        lead = shape[: len(shape) - len(self.batch_shape)]
-        rows = value.expand(shape + self.event_shape).reshape(
-            (lead.numel(), *self.batch_shape, *self.event_shape)
-        )
-        draws = self._at_once(self.samples, 1)
-        step = self._at_once(len(rows), self.samples)
-        found = []
-        for part in rows.split(step):
-            weights = [
-                importance_log_weights(self.networks, part, min(draws, self.samples - done))
-                for done in range(0, self.samples, draws)
-            ]
-            found.append(log_mean_exp(torch.cat(weights), 0))
-        return torch.cat(found).reshape(shape)
+        return estimate(self, value).log_mean
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape)
         count = shape.numel()
-        step = self._at_once(count, 1)
+        step = self._at_once(count)
         parts = [
             self.networks.component(
                 self.networks.decode(self.networks.prior.draw(min(step, count - done)))
@@ -148,11 +161,31 @@ class CVAEDensity(Distribution):
     def entropy(self) -> Tensor:
         return self.mixture.entropy()
 
-    def _at_once(self, count: int, each: int) -> int:
-        """How many of `count` to decode together, each with `each` z per item; under gradient all of them."""
+    def _points(self, effort: Effort, kept: int = 0) -> NormalPoints:
+        mean = self.networks.prior.mean
+        items, latent = mean.shape[:-1].numel(), mean.shape[-1]
+        return NormalPoints(items, effort.replicates, latent, dtype=mean.dtype, device=mean.device, kept=kept)
+
+    def _at_once(self, count: int) -> int:
+        """How many of `count` z of every item to decode together; under gradient all of them."""
         if torch.is_grad_enabled():
             return max(1, count)
-        return max(1, CHUNK // (max(1, self.batch_shape.numel()) * each * self.networks.width))
+        return max(1, CHUNK // (max(1, self.batch_shape.numel()) * self.networks.width))
+
+
+@estimate.register
+def _(density: CVAEDensity, value: Tensor) -> Estimate:
+    values, items, shape = rows_of(value, density.batch_shape, density.event_shape)
+
+    def log_weights(rows: Tensor, start: int, count: int) -> Tensor:
+        noise = density.noise(items[rows], start, count)
+        return importance_log_weights(density.networks.rows(items[rows]), values[rows], noise)
+
+    at_once = CHUNK // density.networks.width
+    found = estimate_log_mean(
+        log_weights, len(items), density.effort, at_once=at_once, device=density.networks.prior.mean.device
+    )
+    return found.reshape(shape)
 
 
 @marginal.register

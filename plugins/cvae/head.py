@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from framework.density_head import DensityHead
 from framework.latent_decoder import LARGEST_FEATURE, LatentDecoder
+from framework.monte_carlo import Effort
 from framework.raw_numbers import require_finite, require_trained
 from framework.target import Target
 from plugins.cvae.density import CVAEDensity, Gaussian, Networks, evidence_bound
@@ -32,6 +33,8 @@ class CVAEHead(DensityHead):
         hidden: width of each of the three networks.
         training_samples: S of the training loss.
         samples: S in evaluation, of the bound and of the mixture it is drawn as; may be set at any time.
+        tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
+            estimated error is below. None: S it is.
         component: the head whose densities are mixed.
     """
 
@@ -57,6 +60,7 @@ class CVAEHead(DensityHead):
         hidden: Annotated[int, Field(ge=1)] = 128,
         training_samples: Annotated[int, Field(ge=1)] = 10,
         samples: Annotated[int, Field(ge=1)] = 500,
+        tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
@@ -64,6 +68,7 @@ class CVAEHead(DensityHead):
         self.hidden = hidden
         self.training_samples = training_samples
         self.samples = samples
+        self.tolerance = tolerance
         self.component = require_trained(component)
         self.prior = _rest(hidden, 2 * latent)
         self.from_value = nn.Linear(
@@ -74,7 +79,8 @@ class CVAEHead(DensityHead):
         self.size = 2 * hidden + self.decoder.size
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> CVAEDensity:
-        return CVAEDensity(self.networks(raw), self.training_samples if self.training else self.samples)
+        effort = Effort(self.training_samples) if self.training else Effort(self.samples, self.tolerance)
+        return CVAEDensity(self.networks(raw), effort)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         return -evidence_bound(self.networks(raw), target, self.training_samples)
@@ -85,19 +91,23 @@ class CVAEHead(DensityHead):
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
         """Prior, encoder and decoder, given the features."""
         raw = require_finite(raw, self.size)
-        kind = self.from_value.weight.dtype
         # so that no raw number, however large, overflows in the layers behind
-        features = raw.to(kind).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
+        features = raw.to(self.from_value.weight.dtype).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
+        return self._networks(features)
+
+    def _networks(self, features: Float[Tensor, "*batch size"]) -> Networks:
         for_prior, for_posterior, for_decoder = features.split(
             [self.hidden, self.hidden, self.decoder.size], -1
         )
+        flat = features.reshape(-1, self.size)
         return Networks(
             prior=_gaussian(self.prior(for_prior)),
             posterior=lambda value: _gaussian(
-                self.posterior(for_posterior + self.from_value(self.encode(value).to(kind)))
+                self.posterior(for_posterior + self.from_value(self.encode(value).to(features.dtype)))
             ),
             decode=lambda z: self.decoder(for_decoder, z),
             component=self.component,
+            rows=lambda index: self._networks(flat[index]),
             width=self.hidden,
         )
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from framework.metric import Metric
+from framework.monte_carlo import Estimate
 from framework.prediction import Prediction
 
 
@@ -14,6 +15,10 @@ class LogLikelihood(Metric):
     """Mean log-likelihood of the targets, nats, with its standard error (thesis Tables 3.1 to 3.3).
 
     A target the density rules out has log-likelihood -inf; the mean is then -inf and the error NaN.
+
+    Of densities whose log_prob is a Monte Carlo estimate also: the mean without its first-order bias, the standard
+    error that the sampling alone gives it, the samples an item took (mean and most), and how many items did not reach
+    the tolerance asked for. Where a single replicate says nothing of its error, both are NaN.
     """
 
     bibtex = """@article{gneiting2007strictly,
@@ -28,22 +33,36 @@ class LogLikelihood(Metric):
     columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
     moments: Tensor
+    sampling: Tensor
 
     def __init__(self) -> None:
         super().__init__()
         # One state, not three: count, mean and squared deviations can only be merged together.
         self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
+        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
 
     def update(self, prediction: Prediction) -> None:
         self.moments = merged_moments(torch.stack([self.moments, moments_of(prediction.log_prob)]))
+        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
 
     def compute(self) -> dict[str, Tensor]:
         count, mean, squares = self.moments
         seen = count > 0
-        return {
+        found = {
             "log_likelihood": torch.where(seen, mean, torch.nan),
             # σ/√n with the sample deviation σ² = Σ(x - x̄)² / (n - 1); one sample has none: 0/0
             "log_likelihood_sem": torch.where(seen, (squares / (count - 1) / count).sqrt(), torch.nan),
+        }
+        debiased, variance, samples, above, most = self.sampling
+        if samples == 0:
+            return found
+        return found | {
+            "log_likelihood_debiased": debiased / count,
+            # the items' points are independent: the variance of a mean
+            "log_likelihood_mc_error": variance.sqrt() / count,
+            "samples_mean": samples / count,
+            "samples_max": most,
+            "items_above_tolerance": above,
         }
 
 
@@ -55,6 +74,26 @@ def moments_of(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
         return values.new_zeros(3)
     mean = values.mean()
     return torch.stack([count, mean, (values - mean).square().sum()])
+
+
+def sampling_of(found: Estimate) -> Float[Tensor, "5"]:
+    """Σ debiased log-likelihoods, Σ squared errors, Σ samples, items above tolerance, most samples; float64."""
+    if found.samples.numel() == 0:
+        return torch.zeros(5, dtype=torch.float64, device=found.samples.device)
+    return torch.stack(
+        [
+            found.debiased.detach().double().sum(),
+            found.standard_error.double().square().sum(),
+            found.samples.double().sum(),
+            found.unresolved.double().sum(),
+            found.samples.double().max(),
+        ]
+    )
+
+
+def merged_sampling(parts: Float[Tensor, "parts 5"]) -> Float[Tensor, "5"]:
+    """The same of all items from those of disjoint parts."""
+    return torch.cat([parts[:, :4].sum(0), parts[:, 4:].amax(0)])
 
 
 def merged_moments(parts: Float[Tensor, "parts 3"]) -> Float[Tensor, "3"]:

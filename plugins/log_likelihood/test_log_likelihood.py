@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm, sem
 from torch.distributions import Distribution, Independent, Normal
 
+from framework.monte_carlo import Estimate, estimate
 from framework.prediction import Prediction
 from framework.schema import build, resolve
 from plugins.log_likelihood.metric import LogLikelihood, merged_moments, moments_of
@@ -25,6 +26,17 @@ class Known(Distribution):
 
     def log_prob(self, value):
         return self.values
+
+
+class Drawn(Known):
+    """A density whose log-likelihoods are estimates: with standard errors 0.1, 0.2, ... from 10, 20, ... samples."""
+
+
+@estimate.register
+def _(density: Drawn, value):
+    number = torch.arange(1, len(density.values) + 1)
+    error = 0.1 * number.double()
+    return Estimate(density.values, density.values + error.square() / 2, error, 10 * number, number == 2)
 
 
 def prediction(values, dtype=torch.float64):
@@ -110,7 +122,8 @@ def test_two_processes_are_the_whole():
     idle = LogLikelihood()  # a process that saw no sample
 
     def gather(state, group=None):
-        return [state, second.moments, idle.moments]
+        name = "moments" if len(state) == 3 else "sampling"
+        return [state, getattr(second, name), getattr(idle, name)]
 
     first.dist_sync_fn, first.distributed_available_fn = gather, lambda: True
     for name, value in first.compute().items():
@@ -130,3 +143,37 @@ def test_reset_forgets_and_a_copy_keeps():
 def test_moments_of_parts_in_any_order():
     parts = torch.stack([moments_of(torch.randn(size, dtype=torch.float64)) for size in (3, 0, 1, 20)])
     torch.testing.assert_close(merged_moments(parts), merged_moments(parts.flip(0)))
+
+
+def drawn(values):
+    log_prob = torch.tensor(values, dtype=torch.float64)
+    return Prediction(Drawn(log_prob), {"target": torch.zeros(len(values), 1)})
+
+
+def test_exact_densities_have_nothing_more_to_say():
+    assert set(measured([1.0, 2.0])) == {"log_likelihood", "log_likelihood_sem"}
+
+
+def test_estimates_tell_their_error_and_their_samples():
+    metric = LogLikelihood()
+    for values in ([1.0, 2.0, 6.0], [], [3.0]):
+        metric.update(drawn(values))
+    found = {name: value.item() for name, value in metric.compute().items()}
+    assert found["log_likelihood"] == 3.0
+    squares = [0.01, 0.04, 0.09, 0.01]
+    assert found["log_likelihood_debiased"] == pytest.approx(3 + sum(squares) / 8)
+    assert found["log_likelihood_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
+    assert found["samples_mean"] == pytest.approx((10 + 20 + 30 + 10) / 4)
+    assert found["samples_max"] == 30
+    assert found["items_above_tolerance"] == 1
+
+
+def test_estimates_of_merged_halves_are_those_of_the_whole():
+    first, second, whole = LogLikelihood(), LogLikelihood(), LogLikelihood()
+    first.update(drawn([1.0, -1e3]))
+    second.update(drawn([2.0, -3.0, 5.0]))
+    for values in ([1.0, -1e3], [2.0, -3.0, 5.0]):
+        whole.update(drawn(values))
+    first.merge_state(second)
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, whole.compute()[name], rtol=1e-12, atol=0)

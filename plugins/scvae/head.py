@@ -7,15 +7,16 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
+from torch.distributions import Distribution
 
 from framework.density import Mixture
 from framework.density_head import DensityHead
 from framework.latent_decoder import LatentDecoder
+from framework.monte_carlo import Effort
 from framework.raw_numbers import require_finite, require_trained
 from framework.target import Target
+from plugins.scvae.density import Networks, SCVAEDensity, sampled_mixture
 
-CHUNK = 2**22
-"""Most hidden activations held at once in evaluation (16 MiB in float32)."""
 MODERATE = {"name": "von_mises", "floor": 1.0}
 """A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
 
@@ -31,6 +32,8 @@ class SCVAEHead(DensityHead):
         training_samples: S of the training loss.
         samples: S in evaluation; may be set at any time. The density keeps S components per item, so memory
             grows as batch × S × (numbers of a component).
+        tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
+            estimated error is below. None: S it is, and the density is a mixture of S components.
         component: the head whose densities are mixed.
     """
 
@@ -50,25 +53,34 @@ class SCVAEHead(DensityHead):
         hidden: Annotated[int, Field(ge=1)] = 128,
         training_samples: Annotated[int, Field(ge=1)] = 50,
         samples: Annotated[int, Field(ge=1)] = 500,
+        tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
         self.latent = latent
         self.training_samples = training_samples
         self.samples = samples
+        self.tolerance = tolerance
+        self.hidden = hidden
         self.component = require_trained(component)
         self.decoder = LatentDecoder(latent, hidden, component.size)
         self.size = self.decoder.size
 
-    def forward(self, raw: Float[Tensor, "*batch size"]) -> Mixture:
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         raw = require_finite(raw, self.size)
-        count = self.training_samples if self.training else self.samples
         kind = self.decoder.from_latent.weight.dtype
-        z = torch.randn(*raw.shape[:-1], count, self.latent, dtype=kind, device=raw.device)
-        step = count if torch.is_grad_enabled() else max(1, CHUNK // max(1, raw.numel()))
-        number = torch.cat([self.decode(raw, part) for part in z.split(step, -2)], -2)
-        weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
-        return Mixture(weights, self.component(number))
+        if self.training:
+            z = torch.randn(
+                *raw.shape[:-1], self.training_samples, self.latent, dtype=kind, device=raw.device
+            )
+            number = self.decode(raw, z)
+            weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
+            return Mixture(weights, self.component(number))
+        networks = Networks(raw, self.decoder, self.component, self.latent, self.hidden, kind)
+        effort = Effort(self.samples, self.tolerance)
+        if self.tolerance is None:
+            return sampled_mixture(networks, networks.points(effort), effort)
+        return SCVAEDensity(networks, effort)
 
     def decode(
         self, raw: Float[Tensor, "*batch size"], z: Float[Tensor, "*batch sample latent"]

@@ -1,0 +1,309 @@
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Independent, Normal
+
+from framework import monte_carlo
+from framework.errors import ConfigError
+from framework.monte_carlo import (
+    Effort,
+    NormalPoints,
+    SampledMixture,
+    estimate,
+    estimate_log_mean,
+    estimated,
+    estimated_error,
+    lattice,
+    normal_quantile,
+    rows_of,
+)
+
+CPU = torch.device("cpu")
+ITEMS = 60
+FALL = torch.linspace(0.5, 40, ITEMS, dtype=torch.float64)  # how narrow the weights are
+TRUTH = -FALL * 0.16 / (2 * (1 + FALL)) - torch.log1p(FALL) / 2  # log E w, by completing the square
+
+
+def bump(z, items):
+    """log w(z) = -a (t - 0.4)²/2 of items with different a, t ~ N(0, 1) in the direction (1, 1, …)."""
+    return -FALL[items] * (z.sum(-1) / z.shape[-1] ** 0.5 - 0.4).square() / 2
+
+
+def sampled(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
+    torch.manual_seed(seed)
+    points = NormalPoints(ITEMS, effort.replicates, dimensions, dtype=torch.float64, device=CPU)
+
+    def log_weights(items, start, count):
+        return log_weight(points(items, start, count), items)
+
+    with torch.no_grad():
+        return estimate_log_mean(log_weights, ITEMS, effort, at_once=at_once, device=CPU)
+
+
+def test_the_lattice_mirrors_digits_and_continues():
+    found = lattice(0, 40, 3)
+    for number in range(40):
+        inverse = int(format(number, "032b")[::-1], 2) / 2**32
+        expected = [math.fmod(inverse * pow(1267, power, 2**20), 1.0) for power in range(3)]
+        assert found[number].tolist() == expected
+    assert torch.equal(lattice(13, 27, 3), found[13:])
+    far = lattice(2**30, 4, 8)
+    assert ((far >= 0) & (far < 1)).all()
+    assert len(far.unique(dim=0)) == 4
+
+
+@pytest.mark.parametrize("power", [3, 6, 9])
+def test_powers_of_two_fill_every_cell_of_a_line_once(power):
+    places = lattice(0, 2**power, 5)
+    for dimension in range(5):
+        assert (places[:, dimension] * 2**power).sort().values.tolist() == list(range(2**power))
+
+
+def test_the_quantile_agrees_with_40_digits_and_is_never_infinite():
+    places = [2.0**-50, 1e-12, 1e-5, 0.02425, 0.3, 0.5, 0.8, 1 - 1e-9, 1 - 2.0**-53]
+    found = normal_quantile(torch.tensor(places, dtype=torch.float64))
+    with mpmath.workdps(40):
+        for z, place in zip(found.tolist(), places, strict=True):
+            # through Φ, relative to the smaller tail: a rounding of the place near 1 is not z's error
+            tail, back = (
+                (mpmath.mpf(place), mpmath.ncdf(z))
+                if place <= 0.5
+                else (1 - mpmath.mpf(place), mpmath.ncdf(-mpmath.mpf(z)))
+            )
+            assert abs(back / tail - 1) < 1e-13 * max(1, z * z)
+    ends = normal_quantile(torch.tensor([0.0, 1.0], dtype=torch.float64))
+    assert ends.abs().tolist() == pytest.approx([8.3, 8.2], abs=0.1)
+
+
+def test_points_are_normal_apart_and_the_same_in_both_precisions():
+    torch.manual_seed(3)
+    points = NormalPoints(500, 4, 2, dtype=torch.float64, device=CPU)
+    items = torch.arange(500)
+    z = points(items, 0, 64)
+    assert z.shape == (4, 64, 500, 2)
+    assert z.mean().abs() < 0.01
+    assert z.square().mean() == pytest.approx(1, abs=0.02)
+    # the means of replicates and items do not vary together
+    means = z.square().mean(1)[..., 0]
+    assert abs(np.corrcoef(means.numpy())[0, 1:]).max() < 4 / 500**0.5
+    torch.manual_seed(3)
+    kept = NormalPoints(500, 4, 2, dtype=torch.float32, device=CPU, kept=40)
+    some = torch.tensor([7, 7, 0])
+    for start, count in ((0, 40), (10, 7), (30, 34)):  # held and computed anew
+        assert torch.equal(kept(some, start, count), z[:, start : start + count, some].float())
+
+
+def test_replicates_divide_the_samples():
+    for samples, replicates, first in (
+        (1, 1, 1),
+        (2, 2, 1),
+        (11, 1, 11),
+        (50, 5, 10),
+        (500, 5, 100),
+        (1000, 8, 125),
+    ):
+        assert (Effort(samples).replicates, Effort(samples).first) == (replicates, first)
+    for samples, first in ((1, 1), (8, 1), (9, 2), (64, 8), (500, 64), (1000, 128)):
+        assert (Effort(samples, 0.1).replicates, Effort(samples, 0.1).first) == (8, first)
+
+
+@pytest.mark.parametrize(
+    "samples, tolerance", [(0, None), (10, 0.0), (10, -1.0), (10, math.nan), (10, math.inf)]
+)
+def test_an_effort_that_makes_no_sense_is_refused(samples, tolerance):
+    with pytest.raises(ConfigError, match="wanted"):
+        Effort(samples, tolerance)
+
+
+def test_an_estimate_of_given_sums():
+    weights = np.array([[1.0, 5.0], [2.0, 5.0], [6.0, 5.0]])  # (replicate, item), sums of 4
+    found = estimated(torch.from_numpy(np.log(weights)), 4)
+    np.testing.assert_allclose(found.log_mean, np.log(weights.mean(0) / 4), rtol=1e-14)
+    error = weights.std(0, ddof=1) / 3**0.5 / weights.mean(0)
+    np.testing.assert_allclose(found.standard_error, error, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(found.debiased - found.log_mean, error**2 / 2, rtol=1e-13, atol=1e-15)
+    assert found.samples.tolist() == [12, 12]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extreme_sums(dtype):
+    inf = math.inf
+    sums = torch.tensor([[-1e4, 1e4, -inf, -1e4, -1e30], [-1e4 + 1, 1e4, -inf, 1e4, -inf]], dtype=dtype)
+    found = estimated(sums, 1)
+    assert found.log_mean.tolist()[2] == found.debiased.tolist()[2] == -inf
+    # weights 1 and e: the ratio of their half difference to their mean
+    assert found.standard_error.tolist() == pytest.approx([math.tanh(0.5), 0, inf, 1, 1], rel=1e-3)
+    assert found.log_mean[[0, 1, 3]].tolist() == pytest.approx(
+        [-1e4 + math.log((1 + math.e) / 2), 1e4, 1e4 - math.log(2)], rel=1e-6
+    )
+    assert (found.debiased - found.log_mean)[[0, 1, 3, 4]].max() <= 0.5 + 1e-2
+    one = estimated(sums[:1], 1)
+    assert one.standard_error[:2].isnan().all()
+    assert torch.equal(one.log_mean, sums[0])
+
+
+@pytest.mark.parametrize("shift", [-1e4, 1e4])
+@pytest.mark.parametrize("effort", [Effort(64), Effort(64, 0.01)])
+def test_a_factor_of_all_weights_changes_nothing_else(shift, effort):
+    plain = sampled(effort)
+    moved = sampled(effort, log_weight=lambda z, items: bump(z, items) + shift)
+    torch.testing.assert_close(moved.log_mean - shift, plain.log_mean, rtol=0, atol=1e-10)
+    torch.testing.assert_close(moved.standard_error, plain.standard_error, rtol=1e-6, atol=1e-10)
+    assert torch.equal(moved.samples, plain.samples)
+
+
+def test_chunks_change_nothing():
+    for effort in (Effort(60), Effort(64, 0.02)):
+        whole, chunked = sampled(effort), sampled(effort, at_once=50)
+        torch.testing.assert_close(chunked.log_mean, whole.log_mean, rtol=1e-12, atol=1e-12)
+        assert torch.equal(chunked.samples, whole.samples)
+
+
+def test_no_more_is_asked_for_at_once_than_allowed():
+    asked = []
+
+    def log_weight(z, items):
+        asked.append(z[..., 0].numel())
+        return bump(z, items)
+
+    sampled(Effort(64, 0.01), at_once=200, log_weight=log_weight)
+    assert max(asked) <= 200
+    assert sum(asked) > 20 * 200
+
+
+def test_the_estimate_is_the_mean_over_the_points():
+    torch.manual_seed(0)
+    points = NormalPoints(ITEMS, 5, 2, dtype=torch.float64, device=CPU)
+    weights = bump(points(torch.arange(ITEMS), 0, 10), torch.arange(ITEMS)).exp()
+    torch.testing.assert_close(sampled(Effort(50)).log_mean, weights.mean((0, 1)).log())
+
+
+@pytest.mark.parametrize("samples", [64, 500])
+def test_the_standard_error_is_that_of_many_seeds(samples):
+    found = [sampled(Effort(samples), seed=seed) for seed in range(200)]
+    errors = torch.stack([one.log_mean for one in found]) - TRUTH
+    told = torch.stack([one.standard_error for one in found])
+    ratio = errors.square().mean(0).sqrt() / told.square().mean(0).sqrt()
+    assert ratio.median() == pytest.approx(1, abs=0.1)
+    assert ratio.min() > 0.7
+    assert ratio.max() < 1.5
+    # five or eight replicates: Student's t with 4 or 7 degrees of freedom has 88 % to 92 % within 2
+    within = ((torch.stack([one.debiased for one in found]) - TRUTH).abs() < 2 * told).double().mean()
+    assert 0.83 < within < 0.96
+
+
+def test_debiasing_takes_most_of_the_bias():
+    found = [sampled(Effort(32), seed=seed) for seed in range(1000)]
+    bias = (torch.stack([one.log_mean for one in found]) - TRUTH).mean(0)
+    debiased = (torch.stack([one.debiased for one in found]) - TRUTH).mean(0)
+    assert bias.mean() < -0.05
+    assert debiased.mean().abs() < bias.mean().abs() / 2, (bias.mean(), debiased.mean())
+
+
+@pytest.mark.parametrize("dimensions, factor", [(1, 30), (2, 5)])
+def test_lattice_points_are_better_than_independent_ones(dimensions, factor):
+    def by_chance(seed):
+        torch.manual_seed(seed)
+        weights = bump(torch.randn(512, ITEMS, 1, dtype=torch.float64), torch.arange(ITEMS))
+        return torch.logsumexp(weights, 0) - math.log(512)
+
+    independent = torch.stack([by_chance(seed) for seed in range(40)]) - TRUTH
+    ours = torch.stack([sampled(Effort(512), dimensions, seed).log_mean for seed in range(40)]) - TRUTH
+    assert ours.square().mean() < independent.square().mean() / factor
+
+
+@pytest.mark.parametrize("tolerance", [0.1, 0.01, 0.001])
+def test_the_tolerance_is_reached(tolerance):
+    found = [sampled(Effort(64, tolerance), seed=seed) for seed in range(30)]
+    error = (torch.stack([one.log_mean for one in found]) - TRUTH).abs()
+    assert not any(one.unresolved.any() for one in found)
+    assert all((estimated_error(one) <= tolerance).all() for one in found)
+    # the estimated error is a standard error, with eight replicates' uncertainty: 75 % within one, 99 % within three
+    assert (error < tolerance).double().mean() > 0.75
+    assert (error < 3 * tolerance).double().mean() > 0.97
+    samples = torch.stack([one.samples for one in found])
+    assert samples.min() >= 64
+    assert (samples & (samples - 1) == 0).all()  # doubled
+    assert samples[:, -1].double().mean() > samples[:, 0].double().mean()  # narrow weights take more
+
+
+def test_what_cannot_be_resolved_is_given_up_and_said(monkeypatch):
+    monkeypatch.setattr(monte_carlo, "MOST", 1000)
+
+    def log_weight(z, items):
+        weights = bump(z, items)
+        weights = torch.where(items == 3, -math.inf, weights)
+        return torch.where(items == 5, math.nan, weights)
+
+    found = sampled(Effort(64, 1e-12), log_weight=log_weight)
+    assert found.samples.max() == 512
+    assert found.unresolved.all()
+    assert found.log_mean[3] == -math.inf
+    assert found.log_mean[5].isnan()
+    assert found.samples[5] == 64  # nothing can mend it
+    good = torch.tensor([item for item in range(ITEMS) if item not in (3, 5)])
+    torch.testing.assert_close(found.log_mean[good], TRUTH[good], rtol=0, atol=0.2)
+
+
+def test_an_estimate_is_differentiable():
+    torch.manual_seed(0)
+    points = NormalPoints(3, 8, 1, dtype=torch.float64, device=CPU)
+    center = torch.tensor([0.1, 0.4, -0.5], dtype=torch.float64, requires_grad=True)
+
+    def log_mean(center, effort):
+        def log_weights(items, start, count):
+            return -3 * (points(items, start, count)[..., 0] - center[items]).square()
+
+        return estimate_log_mean(log_weights, 3, effort, at_once=16, device=CPU).log_mean
+
+    for effort in (Effort(40), Effort(40, 0.05)):
+        assert torch.autograd.gradcheck(lambda center, effort=effort: log_mean(center, effort), center)
+
+
+def test_nothing_is_estimated_of_no_items():
+    for effort in (Effort(10), Effort(10, 0.1)):
+
+        def nothing(items, start, count, replicates=effort.replicates):
+            return torch.zeros(replicates, count, len(items))
+
+        found = estimate_log_mean(nothing, 0, effort, at_once=10, device=CPU)
+        assert found.log_mean.shape == found.samples.shape == (0,)
+
+
+def test_a_density_is_exact_unless_it_says_otherwise():
+    density = Independent(Normal(torch.zeros(4, 1), torch.ones(4, 1)), 1)
+    value = torch.randn(4, 1)
+    found = estimate(density, value)
+    assert torch.equal(found.log_mean, density.log_prob(value))
+    assert torch.equal(found.debiased, found.log_mean)
+    assert found.standard_error.tolist() == found.samples.tolist() == [0] * 4
+    assert not found.unresolved.any()
+
+
+def test_a_sampled_mixture_tells_its_error():
+    torch.manual_seed(0)
+    components = Independent(Normal(torch.randn(3, 40, 1), torch.ones(3, 40, 1)), 1)
+    density = SampledMixture(torch.zeros(3, 40), components, 8)
+    value = torch.randn(7, 3, 1)
+    found = estimate(density, value)
+    torch.testing.assert_close(found.log_mean, density.log_prob(value))
+    weights = components.log_prob(value[:, :, None]).exp().reshape(7, 3, 8, 5).mean(-1)
+    torch.testing.assert_close(found.standard_error, weights.std(-1) / 8**0.5 / weights.mean(-1))
+    with torch.no_grad():  # in parts
+        many = torch.randn(2**20 // 120 + 5, 3, 1)
+        torch.testing.assert_close(estimate(density, many).log_mean, density.log_prob(many))
+
+
+def test_rows_of_values():
+    value = torch.arange(24.0).reshape(4, 2, 3, 1)
+    values, items, shape = rows_of(value, torch.Size((2, 3)), torch.Size((1,)))
+    assert values.flatten().tolist() == list(range(24))
+    assert items.tolist() == list(range(6)) * 4
+    assert shape == (4, 2, 3)
+    values, items, shape = rows_of(torch.tensor([2, 0]), torch.Size((3, 2)), torch.Size(()))
+    assert values.tolist() == [2, 0] * 3
+    assert items.tolist() == list(range(6))
+    assert shape == (3, 2)
