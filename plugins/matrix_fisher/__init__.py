@@ -1,0 +1,1 @@
+"""The matrix Fisher density of rotations: azimuth, elevation and tilt jointly (thesis §3.7)."""

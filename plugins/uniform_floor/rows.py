@@ -1,0 +1,32 @@
+"""Rows of the contract: floors under densities of angles and of classes."""
+
+import math
+from collections.abc import Iterator
+
+import torch
+
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.rows import Case, HeadRow
+
+ONE = Target("angle", ("azimuth",))
+THREE = Target("angle", ("azimuth", "elevation", "tilt"))
+CLASSES = Target("class", ("a", "b", "c"))
+
+
+def outlier(head: DensityHead) -> Iterator[Case]:
+    """Half a turn from a density of κ = 1e6 only the floor is left: log γ - log 2π."""
+    raw = torch.tensor([[1e6, 0.0, 0.0]], dtype=torch.float64)
+    value = torch.tensor([[3.0]], dtype=torch.float64)
+    log_prob = torch.tensor([math.log(0.125 / (2 * math.pi))], dtype=torch.float64)
+    yield Case("κ = 1e6, 3 rad off", raw, value, log_prob)
+
+
+ROWS = {
+    "uniform_floor": (
+        HeadRow("one angle", ONE, {"weight": 0.125}, cases=outlier),
+        HeadRow("three angles", THREE, {"weight": 0.01}),
+        HeadRow("classes", CLASSES, {"weight": 0.01, "component": {"name": "categorical"}}),
+        HeadRow("no floor", ONE, {"weight": 0.0}),
+    )
+}
