@@ -1,17 +1,41 @@
 """A sweep as one thing: a parent run, and the table and picture that compare its jobs."""
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 
-from framework.report import COST_COLUMNS
+from framework.errors import ConfigError, did_you_mean
 from framework.settings import store_experiment
 from framework.sweep import RECORD
-from framework.table import aggregate, csv, results_table
+from framework.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
 from framework.tracking import MlflowTracker, mark_dead
+
+_DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
+RETURNED = "best validation loss (nats)"
+"""What a training returns to its sweep."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A job of a search; `value` is what it returned, None where it returned nothing."""
+
+    folder: Path
+    overrides: list[str]
+    value: float | None
+    completed: bool
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The best trial of a search, None where no trial has a finite value, and a line that says what it reached."""
+
+    best: Trial | None
+    said: str
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
@@ -33,9 +57,7 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 
 def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     """Compare the finished jobs in `folder`: print the table, write comparison.csv and .png, log them to the parent."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=160)  # a log file has no edge to wrap at
+    console = _console()
     for path in folder.glob("*/run.json"):
         if _status(path.parent) == "died":
             mark_dead(path.parent)  # a killed process could not close its run
@@ -43,7 +65,9 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     files: list[Path] = []
     compared: list[dict[str, object]] = []
     if rows:
-        keys = _varied(overrides)
+        # also those of another command's jobs in this folder: what tells rows apart must be told
+        keys = _varied([*overrides, *(row["overrides"] for row in rows)])
+        rows = [{**dict.fromkeys(keys), **row} for row in rows]
         by = ["method", "data", *(key for key in keys if key not in ("seed", "experiment", "data.category"))]
         columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
         # a column that no job has a number for says nothing (what only some classes have, say)
@@ -58,6 +82,124 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         files.extend(_picture(compared, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
     _close_parent(folder, files, compared)
+
+
+def rank(
+    folder: Path,
+    trials: Sequence[Trial],
+    keys: Sequence[str],
+    metric: str | None = None,
+    direction: str | None = None,
+) -> Ranking:
+    """Print the trials of a search, the best first and those without a finite value last; write ranking.csv.
+
+    Args:
+        keys: the overridden keys to show, each a column.
+        metric: a key of results.json; None is the value the trials returned.
+        direction: "minimize" or "maximize"; None is what the metric itself says.
+
+    Raises:
+        ConfigError: no trial has the metric, or nothing says which way it is better.
+    """
+    results = {trial.folder: _results(trial) for trial in trials}
+    known = [one for one in results.values() if one]
+    heading, better = RETURNED, _DIRECTIONS[direction or "minimize"]
+    if metric is not None:
+        heading = next((one["columns"][metric] for one in known if metric in one["columns"]), metric)
+        better = _better(metric, known, direction, folder) if known else better
+    rows = [_trial_row(trial, results[trial.folder], keys, metric) for trial in trials]
+    synthetic = any(row["synthetic"] for row in rows)
+    sign = 1 if better == "lower" else -1
+    ranks = [sign * row["value"] if math.isfinite(row["value"]) else math.inf for row in rows]
+    order = sorted(range(len(rows)), key=ranks.__getitem__)  # stable: of equals the one drawn first
+    # of a trial that failed nothing is known: it is labelled as soon as any is
+    shown = [
+        {**row, "synthetic": synthetic if row["synthetic"] is None else row["synthetic"]} for row in rows
+    ]
+    shown = [shown[index] for index in order]
+    columns = {
+        "trial": "trial",
+        "value": heading,
+        **{key: key.lstrip("+").rpartition(".")[2] for key in keys},
+    }
+    columns |= {key: head for key, head in COST_COLUMNS.items() if any(row[key] is not None for row in rows)}
+    console = _console()
+    title = f"{len(trials)} trials in {folder}, best first"
+    console.print(results_table(shown, columns, title=title, better={"value": better}))
+    csv(shown, columns, folder / "ranking.csv")
+    last = [
+        f"#{row['trial']} "
+        + (f"(its value is {row['value']:g})" if trial.completed else "(did not complete)")
+        for trial, row, rank in zip(trials, rows, ranks, strict=True)
+        if rank == math.inf
+    ]
+    if last:
+        console.print(f"last, for want of a finite value: {', '.join(last)}", soft_wrap=True)
+    if metric is not None:
+        console.print(
+            f"{metric} is of the test split, which now has chosen: its best value is no estimate on new data.",
+            soft_wrap=True,
+        )
+    if len(last) == len(trials):
+        return Ranking(None, "")
+    best = rows[order[0]]
+    said = f"{heading}: {best['value']:.6g}" + (" (synthetic data)" if best["synthetic"] else "")
+    return Ranking(trials[order[0]], said)
+
+
+def close_ranking(folder: Path) -> None:
+    """Log to the parent run what a search found."""
+    paths = (folder / name for name in ("ranking.csv", "best.yaml"))
+    _close_parent(folder, [path for path in paths if path.is_file()], [])
+
+
+def _results(trial: Trial) -> dict[str, Any]:
+    path = trial.folder / "results.json"
+    return json.loads(path.read_text(encoding="utf-8")) if trial.completed and path.is_file() else {}
+
+
+def _trial_row(
+    trial: Trial, results: Mapping[str, Any], keys: Sequence[str], metric: str | None
+) -> dict[str, Any]:
+    """A trial's line: NaN where it has no value, "synthetic" None where that is not known."""
+    found = trial.value if metric is None else results.get(metric)
+    given = {key: value for key, _, value in (override.partition("=") for override in trial.overrides)}
+    return {
+        "trial": trial.folder.name,
+        "value": float(found) if isinstance(found, int | float) and trial.completed else math.nan,
+        **{key: given.get(key) for key in keys},
+        **{key: results.get(key) for key in COST_COLUMNS},
+        "synthetic": results.get("synthetic"),
+    }
+
+
+def _better(
+    metric: str, results: Sequence[Mapping[str, Any]], direction: str | None, folder: Path
+) -> Literal["higher", "lower"]:
+    again = f"The same command with hydra.sweep.dir={folder} ranks again and runs nothing twice."
+    numbers = {
+        key: None
+        for one in results
+        for key, value in one.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    if metric not in numbers:
+        raise ConfigError(
+            f"hydra.sweeper.metric = {metric!r}: no trial has it.{did_you_mean(metric, numbers)} They have: "
+            f"{', '.join(numbers)}; null is the {RETURNED}. {again}"
+        )
+    ways: Better = {**COST_BETTER, **next((one["better"] for one in results if metric in one["better"]), {})}
+    if metric not in ways and direction is None:
+        raise ConfigError(
+            f"hydra.sweeper.metric = {metric!r} does not say which way it is better. Set "
+            f"hydra.sweeper.direction to minimize or maximize. {again}"
+        )
+    return _DIRECTIONS[direction] if direction is not None else ways[metric]
+
+
+def _console() -> Console:
+    console = Console()
+    return console if console.is_terminal else Console(width=160)  # a log file has no edge to wrap at
 
 
 def _in_order(paths: Iterable[Path]) -> list[Path]:
@@ -75,7 +217,7 @@ def _row(path: Path) -> dict[str, Any] | None:
     results = json.loads(path.read_text(encoding="utf-8"))
     record = json.loads((path.parent / RECORD).read_text(encoding="utf-8"))
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
-    return {**swept, **results}
+    return {**swept, **results, "overrides": record["overrides"]}
 
 
 def _varied(overrides: Sequence[Sequence[str]]) -> list[str]:

@@ -13,15 +13,6 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-COLUMNS = {
-    "milliseconds_per_sample": "ms / sample",
-    "latency_milliseconds": "ms, batch of one",
-    "flops_per_sample": "FLOPs / sample",
-    "parameters": "parameters",
-    "peak_memory_mib": "memory MiB",
-}
-"""The numbers of a `Cost` that belong in a result table, with their headings."""
-
 
 @dataclass(frozen=True)
 class Cost:

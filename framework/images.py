@@ -43,6 +43,7 @@ class Crop:
         side: of the result, pixels.
         channels: 3 for colour, 1 for grey.
         upright: turn the image as its EXIF entry says, as photo viewers do.
+        blur: standard deviation of a Gaussian the result is blurred with, pixels of the result; 0: none.
     """
 
     file: Path
@@ -51,6 +52,7 @@ class Crop:
     side: int
     channels: int = 3
     upright: bool = False
+    blur: float = 0.0
 
     def read(self) -> UInt8[Tensor, "channels side side"]:
         """The pixels.
@@ -64,7 +66,7 @@ class Crop:
         pixels = square(image, self.box or whole, self.margin, self.side)
         if pixels is None:
             raise self._outside(image.size)
-        return torch.from_numpy(pixels)
+        return blurred(torch.from_numpy(pixels), self.blur)
 
     def check(self) -> None:
         """Look at the file's header only.
@@ -284,6 +286,36 @@ def _interpolated(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor
         for row in (first, second)
     )
     return above.lerp_(below, (rows - first)[:, None, :, None])
+
+
+def blurred(
+    images: Shaped[Tensor, "*batch height width"], deviation: float
+) -> Shaped[Tensor, "*batch height width"]:
+    """Images convolved with a Gaussian of standard deviation `deviation` pixels, 0 or more; 0: the images themselves.
+
+    The kernel ends at four deviations and sums to 1; beyond the border the image is mirrored about its edge
+    (d c b a | a b c d | d c b a). The result has the images' type; whole numbers are rounded.
+    """
+    if deviation == 0:
+        return images
+    exact = images if images.is_floating_point() else images.float()
+    height, width = images.shape[-2:]
+    down = _smoothing(height, deviation).to(exact)
+    across = _smoothing(width, deviation).to(exact)
+    smooth = down @ exact @ across.mT  # separable: G(x, y) = g(x) g(y)
+    return smooth if images.is_floating_point() else smooth.round_().to(images.dtype)
+
+
+def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
+    """The Gaussian filter of a line of `length` pixels as a matrix, float64."""
+    reach = int(4 * deviation + 0.5)
+    offsets = torch.arange(-reach, reach + 1)
+    weights = (-0.5 * (offsets.double() / deviation).square()).exp()
+    # Mirrored about its edges again and again, a line repeats after twice its length.
+    source = (torch.arange(length)[:, None] + offsets) % (2 * length)
+    source = torch.minimum(source, 2 * length - 1 - source)
+    matrix = torch.zeros(length, length, dtype=torch.float64)
+    return matrix.scatter_add_(1, source, (weights / weights.sum()).expand(length, -1))
 
 
 def picture(image: Tensor) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from framework.batches import Batches
 from framework.circular import angular_distance
-from framework.cost import COLUMNS, Cost
+from framework.cost import Cost
 from framework.data import Batch, Data
 from framework.density import circular_entropy, circular_grid
 from framework.evaluation import Evaluation, cost, evaluate, on_device
@@ -21,13 +21,11 @@ from framework.metric import Metric
 from framework.model import Predictor
 from framework.prediction import Prediction
 from framework.run import Run
-from framework.table import Better, results_table
+from framework.table import COST_BETTER, COST_COLUMNS, Better, results_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COST_COLUMNS = {key: COLUMNS[key] for key in ("milliseconds_per_sample", "flops_per_sample", "parameters")}
-COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
 PICTURED = 128
 """How many test samples the gallery of predicted densities is chosen from."""
 

@@ -24,6 +24,13 @@ were generated."""
 Better = Mapping[str, Literal["higher", "lower"]]
 """Which way a column is better; its best value stands in bold."""
 
+COST_COLUMNS = {
+    "milliseconds_per_sample": "ms / sample",
+    "flops_per_sample": "FLOPs / sample",
+    "parameters": "parameters",
+}
+"""What every result table says of cost (framework.cost.Cost), with the headings."""
+COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
 NOT_AVAILABLE = "not available"
 NO_BREAK = "\u00a0"
 WIDTH = 100

@@ -15,11 +15,12 @@ from torch.utils.data import Dataset
 from framework import cache, images, schema
 from framework.data import Batch, Data
 from framework.errors import DataError, did_you_mean
+from framework.generated import read_mark
 from framework.images import Box, Crop
 from framework.renderer import Renderer
 from framework.target import Target
 from plugins.pascal3d import layout
-from plugins.pascal3d.generator import VERSION, generated, read_mark
+from plugins.pascal3d.generator import VERSION, generated
 from plugins.pascal3d.layout import CLASSES, Annotation
 
 SPLIT_SEED = 13  # that of the thesis authors' code
@@ -118,12 +119,7 @@ class Pascal3D(Data):
         renderer = self.renderer
         if isinstance(renderer, str):
             renderer = schema.build("renderer", schema.resolve("renderer", renderer))
-        try:
-            parent = cache.folder("pascal3d")
-        except OSError as error:
-            raise DataError(
-                f"The cache cannot be made ({error}). Set FRAMEWORK_CACHE to another folder."
-            ) from error
+        parent = cache.folder("pascal3d")
         return {
             category: generated(parent, category, self.images, self.generator_seed, renderer)
             for category in categories

@@ -4,14 +4,8 @@ A root is a function of class, number of images, seed and renderer, to the byte:
 random stream, whichever thread draws it. It is written beside its place and renamed when whole.
 """
 
-import fcntl
 import io
-import json
-import shutil
-import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -19,10 +13,10 @@ from typing import Any
 import numpy as np
 import scipy.io
 from PIL import Image
-from rich.console import Console
-from rich.progress import Progress
 
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError
+from framework.generated import draw_all
+from framework.generated import generated as whole
 from framework.renderer import Renderer
 from plugins.pascal3d.families import FAMILIES
 from plugins.pascal3d.layout import VOC_LISTS
@@ -30,9 +24,6 @@ from plugins.pascal3d.scene import Shot, Thing, shoot
 
 VERSION = 1
 """Of the generator; a change in what it draws or writes takes a new number, and with it a new folder."""
-MARK = "synthetic.json"
-PAINTERS = 2
-"""Threads that draw at once."""
 SHARES = {"imagenet_train": 0.4, "imagenet_val": 0.2, "pascal_train": 0.2, "pascal_val": 0.2}
 HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)  # SciPy's holds the date
 
@@ -59,58 +50,7 @@ def generated(parent: Path, category: str, images: int, seed: int, renderer: Ren
         "renderer": drawn_by,
     }
     folder = parent / f"v{VERSION}-{drawn_by}-seed{seed}-images{images}"
-    root = folder / category
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not root.exists():
-            with _alone(folder / f".{category}.lock"):
-                if not root.exists():  # another process may have drawn it while this one waited
-                    _write(root, category, mark, renderer)
-    except OSError as error:
-        raise DataError(
-            f"The synthetic default of {category!r} cannot be written to {folder} ({error}). "
-            "Free space there, or set FRAMEWORK_CACHE to another folder."
-        ) from error
-    if read_mark(root) != mark:
-        raise DataError(
-            f"{root / MARK} does not describe {mark}; it was changed. Delete {root}: it is drawn anew."
-        )
-    return root
-
-
-def read_mark(root: Path) -> dict[str, Any] | None:
-    """What `synthetic.json` says of a root; None where there is none: the data are real.
-
-    Raises:
-        DataError: the file cannot be read.
-    """
-    try:
-        return json.loads((root / MARK).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise DataError(
-            f"{root / MARK}: cannot be read ({error}). Delete {root}: it is drawn anew."
-        ) from error
-
-
-@contextmanager
-def _alone(file: Path) -> Iterator[None]:
-    """Hold a lock that ends with the process, whatever ends it."""
-    with file.open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-def _write(root: Path, category: str, mark: dict[str, Any], renderer: Renderer) -> None:
-    part = root.with_name(f".{category}.part")
-    shutil.rmtree(part, ignore_errors=True)  # of a process that was killed: the lock is ours
-    try:
-        _draw_all(part, category, mark["images"], mark["seed"], renderer)
-        (part / MARK).write_text(json.dumps(mark, indent=2) + "\n", encoding="utf-8")
-        part.rename(root)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    return whole(folder / category, mark, lambda root: _draw_all(root, category, images, seed, renderer))
 
 
 def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Renderer) -> None:
@@ -124,25 +64,16 @@ def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Rende
         with one_at_a_time:
             return renderer(*arguments)
 
-    def draw(number: int) -> bool:
+    flags = [False] * images
+
+    def draw(number: int) -> None:
         split, name = names[number]
         random = np.random.default_rng([seed, sorted(FAMILIES).index(category), number])
         shot = shoot(category, random, render)
         _save(part, f"{category}_{split.partition('_')[0]}", name, shot)
-        bar.advance(task)
-        return any(thing.category == category and not thing.difficult for thing in shot.things)
+        flags[number] = any(thing.category == category and not thing.difficult for thing in shot.things)
 
-    console = Console(stderr=True)
-    with (
-        Progress(console=console, transient=True, disable=not sys.stderr.isatty()) as bar,
-        ThreadPoolExecutor(PAINTERS) as painters,
-    ):
-        task = bar.add_task(f"Drawing the synthetic {category} images", total=images)
-        try:
-            flags = list(painters.map(draw, range(images)))
-        except BaseException:
-            painters.shutdown(cancel_futures=True)
-            raise
+    draw_all(images, draw, f"the synthetic {category} images")
     _save_lists(part, category, names, flags)
 
 

@@ -15,7 +15,7 @@ from scipy.io.matlab import mat_struct
 
 from framework.errors import DataError
 from framework.images import Box
-from plugins.pascal3d.matlab import read_variables
+from framework.matlab import read_variables
 
 CLASSES = (
     "aeroplane", "bicycle", "boat", "bottle", "bus", "car",

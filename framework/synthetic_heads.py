@@ -1,0 +1,354 @@
+"""Synthetic photographs of heads: ellipsoids cast by parallel rays, over clutter, through a poor camera.
+
+The camera looks along -z, x is right in the picture, y up. A head's own frame has x towards its left, y towards its
+crown, z out of its face; at pan, tilt and roll 0 both frames agree and the face looks into the camera. Lengths are in
+half heights of a head.
+
+`no_type_check` keeps the type checks that tests switch on from wrapping the kernel before it is compiled.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+from numpy.random import Generator
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+VERSION = 1
+"""Of what is drawn; a change takes a new number, which the marks of generated data hold."""
+Array = NDArray[np.float64]
+SAMPLES = 2
+"""Rays along each side of a pixel."""
+CLOTH, SKIN, HAIR = 0, 1, 2
+EYE, EYE_HEIGHT, MOUTH_HEIGHT = 0.31, 0.12, -0.52
+SKINS = ((0.93, 0.76, 0.66), (0.85, 0.65, 0.52), (0.70, 0.50, 0.38), (0.52, 0.35, 0.26), (0.40, 0.27, 0.20))
+HAIRS = ((0.08, 0.07, 0.06), (0.20, 0.13, 0.09), (0.36, 0.24, 0.14), (0.62, 0.47, 0.28), (0.55, 0.54, 0.53))
+
+
+class Pose(NamedTuple):
+    """Degrees. Pan > 0 turns the nose towards the picture's right, tilt > 0 lifts it, roll > 0 leans the crown to the
+    picture's left. A mirror image negates pan and roll."""
+
+    pan: float
+    tilt: float = 0.0
+    roll: float = 0.0
+
+
+@dataclass(frozen=True)
+class Person:
+    """What stays the same from picture to picture; colours (3,) in 0…1.
+
+    Attributes:
+        axes: half width, height and depth of the skull.
+        face_tilt, face_reach: how far below the forehead the hair's opening points, radians, and the cosine of its
+            angular radius; a reach of -1 leaves no hair.
+        long_hair, bun, hat: what else is on the head.
+        glasses, beard: the darkness of either, 0…1.
+        ears: size; 0 where hair hides them.
+    """
+
+    skin: Array
+    hair: Array
+    cloth: Array
+    hat_color: Array
+    axes: Array
+    face_tilt: float
+    face_reach: float
+    long_hair: bool
+    bun: bool
+    hat: bool
+    glasses: float
+    beard: float
+    ears: float
+
+
+class Conditions(NamedTuple):
+    """How pictures are taken; ranges are drawn from uniformly.
+
+    Attributes:
+        pixels: range of the camera's own pixels along a side; the picture is scaled to the side asked for.
+        height: range of the head's height, as a share of the side.
+        offset: largest shift of the head's middle from the picture's, as a share of the side.
+        blur: largest standard deviation of the camera's blur, camera pixels.
+        noise: largest standard deviation of its noise, of values in 0…1.
+        clutter: how many shapes stand in the background at most.
+        occluded: share of pictures in which something hides part of the head.
+    """
+
+    pixels: tuple[int, int]
+    height: tuple[float, float]
+    offset: float
+    blur: float
+    noise: float
+    clutter: int
+    occluded: float
+
+
+def person(random: Generator) -> Person:
+    """Anybody."""
+    tone = int(random.integers(5))
+    long_hair, bald, hat = random.random() < 0.3, random.random() < 0.1, random.random() < 0.15
+    covered = long_hair and not bald
+    return Person(
+        skin=np.clip(np.array(SKINS[tone]) + random.normal(0, 0.03) + random.normal(0, 0.01, 3), 0, 1),
+        hair=np.clip(
+            np.array(HAIRS[random.integers(1 if tone > 2 else 5)]) + random.normal(0, 0.02, 3), 0.02, 1
+        ),
+        cloth=_muted(random),
+        hat_color=_muted(random),
+        axes=np.array([0.76, 1.0, 0.88]) * random.uniform(0.94, 1.06, 3),
+        face_tilt=random.uniform(0.4, 0.7) if covered else random.uniform(0.75, 0.95),
+        face_reach=-1.0 if bald and not hat else random.uniform(0.25, 0.4),
+        long_hair=covered,
+        bun=not bald and random.random() < 0.12,
+        hat=hat,
+        glasses=random.uniform(0.5, 0.9) if random.random() < 0.25 else 0.0,
+        beard=random.uniform(0.3, 0.85) if not covered and random.random() < 0.35 else 0.0,
+        ears=0.0 if covered else random.uniform(0.8, 1.2),
+    )
+
+
+def rotation(pose: Pose) -> Array:
+    """(3, 3): from the head's frame to the camera's, R_y(pan) R_x(-tilt) R_z(roll)."""
+    pan, tilt, roll = (math.radians(angle) for angle in pose)
+    about_y = [[math.cos(pan), 0, math.sin(pan)], [0, 1, 0], [-math.sin(pan), 0, math.cos(pan)]]
+    about_x = [[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]]
+    about_z = [[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]]
+    return np.array(about_y) @ np.array(about_x) @ np.array(about_z)
+
+
+def photograph(
+    random: Generator, who: Person, pose: Pose, side: int, conditions: Conditions
+) -> NDArray[np.uint8]:
+    """A picture of somebody's head, (side, side, 3)."""
+    pixels = int(random.integers(conditions.pixels[0], conditions.pixels[1] + 1))
+    scale = 0.5 * pixels * random.uniform(*conditions.height)  # camera pixels per half height
+    middle = 0.5 * pixels + pixels * random.uniform(-1, 1, 2) * conditions.offset
+    light = np.array([random.normal(0, 0.7), random.uniform(0.1, 1.2), random.uniform(0.1, 1.0)])
+    strength = random.uniform(0.2, 0.6)
+    body = Pose(pose.pan + random.normal(0, 25))
+    picture = background(random, pixels, conditions.clutter)
+    layer = rendered(who, pose, body, pixels, scale, (middle[0], middle[1]), light, strength)
+    picture = layer[..., :3] + (1 - layer[..., 3:]) * picture
+    if random.random() < conditions.occluded:
+        picture = _hidden(random, picture, middle, scale)
+    picture = gaussian_filter(picture, (*2 * (random.uniform(0, conditions.blur),), 0))
+    picture = (picture - 0.5) * random.uniform(0.75, 1.15) + 0.5 + random.uniform(-0.1, 0.1)
+    picture = picture + random.normal(0, random.uniform(0, conditions.noise), picture.shape)
+    seen = Image.fromarray((255 * picture.clip(0, 1)).round().astype(np.uint8))
+    return np.asarray(seen.resize((side, side), Image.Resampling.BICUBIC))
+
+
+def rendered(
+    who: Person,
+    pose: Pose,
+    body: Pose,
+    pixels: int,
+    scale: float,
+    middle: tuple[float, float],
+    light: Array,
+    strength: float,
+) -> Array:
+    """Head, neck and shoulders alone, (pixels, pixels, 4): colour times cover, and cover, 0…1.
+
+    Args:
+        scale: pixels per half height.
+        middle: of the head (column, row), pixels from the picture's corner.
+        light: towards the lamp, any length.
+        strength: the lamp's share of the light, 0…1.
+    """
+    head, torso = rotation(pose), rotation(body)
+    parts = _ellipsoids(who, head, torso)
+    centers = np.array([center for center, _, _, _ in parts])
+    frames = np.array([frame for _, frame, _, _ in parts])
+    # of |F (p - c)| = 1 along an axis of the camera: the length of that row of the inverse of F
+    reaches = np.linalg.norm(np.linalg.inv(frames), axis=2)
+    colors = np.array([color for _, _, color, _ in parts])
+    kinds = np.array([kind for _, _, _, kind in parts])
+    opening = np.array([0.0, -math.sin(who.face_tilt), math.cos(who.face_tilt), who.face_reach])
+    look = np.array([who.glasses, who.beard, *who.hair])
+    image = np.zeros((pixels, pixels, 4))
+    lamp = light / np.linalg.norm(light)
+    _cast(centers, frames, reaches, colors, kinds, head, opening, look, lamp, strength, scale, *middle, image)
+    return image
+
+
+def _ellipsoids(who: Person, head: Array, torso: Array) -> list[tuple[Array, Array, Array, int]]:
+    """Centre, matrix to the unit ball, colour and kind of every part."""
+    parts: list[tuple[Array, Array, Array, int]] = []
+
+    def add(
+        turn: Array, center: tuple[float, ...], axes: Array | tuple[float, ...], color: Array, kind: int
+    ) -> None:
+        parts.append((turn @ np.array(center), turn.T / np.array(axes)[:, None], color, kind))
+
+    width, height, depth = who.axes
+    still = np.eye(3)
+    add(torso, (0.0, -2.35, -0.1), (1.75, 0.95, 0.75), who.cloth, CLOTH)
+    add(still, (0.0, -1.2, -0.1), (0.40, 0.75, 0.42), who.skin * 0.9, CLOTH)
+    add(head, (0.0, 0.0, 0.0), who.axes, who.skin, SKIN)
+    add(head, (0.0, -0.55 * height, 0.28 * depth), (0.50, 0.47, 0.52), who.skin, SKIN)  # jaw
+    add(head, (0.0, -0.12, 0.93 * depth), (0.11, 0.23, 0.21), who.skin * 1.03, SKIN)  # nose
+    for sign in (-1.0, 1.0) if who.ears else ():
+        size = who.ears
+        add(
+            head,
+            (sign * 1.02 * width, -0.03, -0.08),
+            (0.08, 0.22 * size, 0.14 * size),
+            who.skin * 0.92,
+            CLOTH,
+        )
+    if who.face_reach > -1:
+        add(head, (0.0, 0.04, -0.03), 1.07 * who.axes, who.hat_color if who.hat else who.hair, HAIR)
+    if who.hat:
+        add(head, (0.0, 0.42 * height, 0.85 * depth), (0.58, 0.07, 0.55), who.hat_color * 0.8, CLOTH)
+    if who.long_hair:
+        add(head, (0.0, -0.4, -0.35), (0.88 * width / 0.76, 1.05, 0.62), who.hair, CLOTH)
+    if who.bun:
+        add(head, (0.0, 0.35, -1.05 * depth), (0.30, 0.30, 0.28), who.hair * 0.9, CLOTH)
+    return parts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _cast(
+    centers, frames, reaches, colors, kinds, head, opening, look, lamp, strength, scale, column0, row0, image
+):
+    """Fill `image` with the nearest surface along each ray, shaded after Lambert."""
+    size = image.shape[0]
+    point = np.zeros(3)
+    unit = np.zeros(3)
+    color = np.zeros(3)
+    best_unit = np.zeros(3)
+    share = 1.0 / (SAMPLES * SAMPLES)
+    for sample in range(size * SAMPLES * size * SAMPLES):
+        fine_row, fine_column = sample // (size * SAMPLES), sample % (size * SAMPLES)
+        row, column = fine_row // SAMPLES, fine_column // SAMPLES
+        x = ((fine_column + 0.5) / SAMPLES - column0) / scale
+        y = (row0 - (fine_row + 0.5) / SAMPLES) / scale
+        nearest, chosen = -np.inf, -1
+        for part in range(centers.shape[0]):
+            right, up = x - centers[part, 0], y - centers[part, 1]
+            if abs(right) > reaches[part, 0] or abs(up) > reaches[part, 1]:
+                continue
+            # |F (p - c)| = 1 with p = (x, y, z): a quadratic equation in z - c_z, its larger root is nearer
+            a = b = c = 0.0
+            for axis in range(3):
+                across = frames[part, axis, 0] * right + frames[part, axis, 1] * up
+                along = frames[part, axis, 2]
+                unit[axis] = across
+                a += along * along
+                b += along * across
+                c += across * across
+            root = b * b - a * (c - 1.0)
+            if root <= 0.0:
+                continue
+            depth = (np.sqrt(root) - b) / a
+            if centers[part, 2] + depth <= nearest:
+                continue
+            for axis in range(3):
+                unit[axis] += frames[part, axis, 2] * depth
+            if kinds[part] == HAIR:
+                ahead = opening[0] * unit[0] + opening[1] * unit[1] + opening[2] * unit[2]
+                if ahead > opening[3]:
+                    continue
+            nearest, chosen = centers[part, 2] + depth, part
+            best_unit[:] = unit
+        if chosen < 0:
+            continue
+        length = facing = 0.0
+        for axis in range(3):
+            normal = 0.0
+            for inner in range(3):
+                normal += frames[chosen, inner, axis] * best_unit[inner]
+            length += normal * normal
+            facing += normal * lamp[axis]
+        shade = 1.0 - strength + 1.4 * strength * max(facing / np.sqrt(length), 0.0)
+        color[:] = colors[chosen]
+        if kinds[chosen] == SKIN:
+            for axis in range(3):
+                point[axis] = head[0, axis] * x + head[1, axis] * y + head[2, axis] * nearest
+            _paint_face(point, look, color)
+        for channel in range(3):
+            image[row, column, channel] += share * min(color[channel] * shade, 1.0)
+        image[row, column, 3] += share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _paint_face(point, look, color):
+    """Change the skin's colour where a feature lies; `point` in the head's frame, features seen from its front."""
+    x, y = abs(point[0]), point[1]
+    if point[2] < 0.15:
+        return
+    glasses, beard = look[0], look[1]
+    if beard > 0 and y < -0.38 and not (x < 0.2 and abs(y - MOUTH_HEIGHT) < 0.06):
+        for channel in range(3):
+            color[channel] += beard * (look[2 + channel] - color[channel])
+    eye = ((x - EYE) / 0.17) ** 2 + ((y - EYE_HEIGHT) / 0.085) ** 2
+    if ((x - EYE) / 0.25) ** 2 + ((y - EYE_HEIGHT - 0.03) / 0.17) ** 2 < 1:
+        for channel in range(3):
+            color[channel] *= 0.72  # the socket
+    if eye < 1:
+        pupil = ((x - EYE) / 0.085) ** 2 + ((y - EYE_HEIGHT) / 0.085) ** 2 < 1
+        for channel in range(3):
+            color[channel] = 0.07 if pupil else 0.75
+    if abs(x - EYE) < 0.2 and abs(y - EYE_HEIGHT - 0.21) < 0.045:
+        for channel in range(3):
+            color[channel] = 0.75 * look[2 + channel]
+    if (x / 0.24) ** 2 + ((y - MOUTH_HEIGHT) / 0.06) ** 2 < 1:
+        color[0] *= 0.72
+        color[1] *= 0.42
+        color[2] *= 0.45
+    if glasses > 0 and y > EYE_HEIGHT - 0.2 and y < EYE_HEIGHT + 0.17:
+        rim = ((x - EYE) / 0.24) ** 2 + ((y - EYE_HEIGHT) / 0.19) ** 2
+        if (rim < 1 and rim > 0.6) or (abs(y - EYE_HEIGHT) < 0.035 and rim > 1):
+            for channel in range(3):
+                color[channel] *= 1 - glasses
+        elif rim < 1:
+            for channel in range(3):
+                color[channel] *= 1 - 0.3 * glasses
+
+
+def _muted(random: Generator) -> Array:
+    """A colour (3,) of any brightness and little saturation, as most things have."""
+    return np.clip(random.uniform(0.1, 0.9) + random.normal(0, 0.05, 3), 0, 1)
+
+
+def background(random: Generator, pixels: int, clutter: int) -> Array:
+    """Smooth noise between two colours with up to `clutter` shapes before it, (pixels, pixels, 3)."""
+    first = _muted(random)
+    second = np.clip(first + random.normal(0, 0.2) + random.normal(0, 0.04, 3), 0, 1)
+    cells = int(random.integers(2, 7))
+    grid = Image.fromarray(random.random((cells, cells), dtype=np.float32))
+    share = np.asarray(grid.resize((pixels, pixels), Image.Resampling.BICUBIC), dtype=np.float64)[..., None]
+    picture = first + share.clip(0, 1) * (second - first)
+    for _ in range(int(random.integers(0, clutter + 1))):
+        place, size = random.uniform(0, pixels, 2), random.uniform(0.08, 0.45, 2) * pixels
+        mask = _shape(random, pixels, place, size)
+        picture = np.where(mask, _muted(random), picture)
+    return picture
+
+
+def _hidden(random: Generator, picture: Array, middle: Array, scale: float) -> Array:
+    """The picture with something before part of the head; `scale` pixels per half height, `middle` of the head."""
+    pixels = len(picture)
+    turn, reach = random.uniform(0, 2 * math.pi), random.uniform(0.8, 1.3)
+    place = middle + reach * scale * np.array([0.8 * math.cos(turn), math.sin(turn)])
+    mask = _shape(random, pixels, place, random.uniform(0.6, 1.1, 2) * scale)
+    return np.where(mask, _muted(random), picture)
+
+
+def _shape(random: Generator, pixels: int, place: Array, size: Array) -> NDArray[np.bool_]:
+    """The mask of an ellipse or rectangle of half lengths `size` about `place` (column, row), turned."""
+    rows, columns = np.mgrid[:pixels, :pixels] + 0.5
+    turn = random.uniform(0, math.pi)
+    right, down = columns - place[0], rows - place[1]
+    along = (right * math.cos(turn) + down * math.sin(turn)) / size[0]
+    across = (down * math.cos(turn) - right * math.sin(turn)) / size[1]
+    inside = along**2 + across**2 if random.random() < 0.5 else np.maximum(abs(along), abs(across))
+    return inside[..., None] < 1

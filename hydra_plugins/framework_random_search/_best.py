@@ -1,0 +1,78 @@
+"""The best trial of a search as an experiment file."""
+
+import os
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
+from rich.console import Console
+
+OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
+"""Keys that say how a trial was run, not what it was; they stay on the command line."""
+
+
+def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: str) -> None:
+    """Write best.yaml into `folder`, and a link by which `--config-dir=<folder>` finds it as an experiment."""
+    name, content = experiment(overrides, loader, found)
+    path = folder / "best.yaml"
+    path.write_text(content, encoding="utf-8")
+    for old in (folder / "experiment").rglob("*.yaml"):  # of an earlier search in this folder
+        if old.is_symlink():
+            old.unlink()
+    link = folder / "experiment" / f"{name}.yaml"
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(os.path.relpath(path, link.parent))
+    command = content.splitlines()[1].removeprefix("# python -m framework ")
+    Console().print(
+        f"best trial: {path}\n"
+        f"run it:     python -m framework --config-dir={shlex.quote(str(folder))} {command}\n"
+        f"keep it:    copy it to conf/experiment/{name}.yaml",
+        soft_wrap=True,
+        highlight=False,
+        markup=False,
+    )
+
+
+def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tuple[str, str]:
+    """Name and content of an experiment that is what `overrides` make of theirs.
+
+    Args:
+        overrides: of one job, nothing swept.
+        loader: knows which keys are config groups.
+        found: a line on where it comes from.
+    """
+    base: str | None = None
+    added: list[Any] = []
+    chosen: list[Any] = []
+    values = OmegaConf.create({})
+    kept: list[str] = []
+    for text, one in zip(overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True):
+        key, value = one.key_or_group, one.value()
+        if key == "experiment":
+            base = None if value is None else str(value)
+        elif key.partition(".")[0] in OF_THE_RUN or _only_on_a_command_line(one):
+            kept.append(text)
+        elif not isinstance(value, dict) and loader.get_group_options(key, results_filter=None):
+            (added if one.is_add() else chosen).append(
+                {f"{'' if one.is_add() else 'override '}/{key}": value}
+            )
+        else:
+            OmegaConf.update(values, key, value, merge=True, force_add=True)
+    name = f"{base}_best" if base else "best"
+    # As a group of its own package: a plain name would have its own defaults looked for beside itself, and
+    # plain "experiment" would be taken for the choice on the command line.
+    defaults = [*([{"/experiment@_global_": base}] if base else []), *added, *chosen]
+    body = OmegaConf.create({"defaults": defaults} if defaults else {})
+    body.update(values)
+    command = shlex.join(["python", "-m", "framework", f"experiment={name}", *kept])
+    return name, f"# @package _global_\n# {command}\n# {found}\n{OmegaConf.to_yaml(body)}"
+
+
+def _only_on_a_command_line(one: Override) -> bool:
+    """Deletions, moved packages and items of lists have no word in an experiment file."""
+    return one.is_delete() or one.package is not None or any(map(str.isdigit, one.key_or_group.split(".")))

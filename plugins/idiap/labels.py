@@ -1,0 +1,136 @@
+"""The folder of the IDIAP crops and its label file, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
+
+In it the groups `or_label_train` and `or_label_test` are struct arrays: each of their fields pan, tilt, roll and name
+holds one reference an image, to a number or to UTF-16 text.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import h5py
+import numpy as np
+
+from framework.errors import DataError
+
+LABELS = "or_label_full.mat"
+SPLITS = ("train", "test")
+ANGLES = ("pan", "tilt", "roll")
+ENOUGH = 20
+"""With more labels than this, none beyond ±2π is taken for radians."""
+HEADER = b"MATLAB 7.3 MAT-file, synthetic labels".ljust(116) + bytes(8) + b"\x00\x02IM"
+
+
+class Label(NamedTuple):
+    """An image's name and its angles pan, tilt and roll, in the file's unit."""
+
+    name: str
+    angles: tuple[float, float, float]
+
+
+def check_root(root: Path) -> None:
+    """Refuse a folder that does not hold the crops.
+
+    Raises:
+        DataError: it is missing, or a part of it is; says which.
+    """
+    if not root.is_dir():
+        raise DataError(f"data.root = {root}: no such folder; wanted the unpacked IHDPHeadPose, or null.")
+    missing = [f"{split}/" for split in SPLITS if not (root / split).is_dir()]
+    missing += [LABELS] if not (root / LABELS).is_file() else []
+    if missing:
+        inner = root / "IHDPHeadPose"
+        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
+        raise DataError(
+            f"data.root = {root} is not laid out as IHDPHeadPose: no {', no '.join(missing)}.{hint}"
+        )
+
+
+def read_labels(file: Path, angles_in: Literal["radians", "degrees"]) -> dict[str, list[Label]]:
+    """The labels of "train" and "test", in the file's order, angles in radians.
+
+    Raises:
+        DataError: it is no such file, a field is missing or of another length, or the angles are not `angles_in`.
+    """
+    try:
+        with h5py.File(file, "r") as content:
+            labels = {split: _read_struct(content, f"or_label_{split}") for split in SPLITS}
+    except Exception as error:  # nearly any, where the file is damaged
+        raise DataError(
+            f"{file}: cannot be read as the MATLAB 7.3 (HDF5) file of structs or_label_train and or_label_test "
+            f"with the fields pan, tilt, roll and name ({error}). Restore it from its source."
+        ) from error
+    _refuse_unit(file, labels, angles_in)
+    if angles_in == "degrees":
+        labels = {split: [_in_radians(label) for label in found] for split, found in labels.items()}
+    return labels
+
+
+def _in_radians(label: Label) -> Label:
+    pan, tilt, roll = map(math.radians, label.angles)
+    return Label(label.name, (pan, tilt, roll))
+
+
+def _read_struct(content: h5py.File, name: str) -> list[Label]:
+    struct: Any = content[name]
+    fields = {field: _read_cells(content, struct[field]) for field in (*ANGLES, "name")}
+    lengths = {field: len(cells) for field, cells in fields.items()}
+    if len(set(lengths.values())) != 1:
+        raise ValueError(f"{name} holds fields of different lengths: {lengths}")
+    texts = ["".join(map(chr, cell.ravel())) for cell in fields["name"]]
+    pan, tilt, roll = ([float(cell.item()) for cell in fields[angle]] for angle in ANGLES)
+    return [
+        Label(text, angles) for text, angles in zip(texts, zip(pan, tilt, roll, strict=True), strict=True)
+    ]
+
+
+def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
+    """What a field's references lead to; a struct of one element holds its value itself."""
+    values = field[()]
+    if field.dtype != h5py.ref_dtype:
+        return [values]
+    return [content[reference][()] for reference in values.ravel()]
+
+
+def _refuse_unit(
+    file: Path, labels: Mapping[str, Sequence[Label]], angles_in: Literal["radians", "degrees"]
+) -> None:
+    sizes = [abs(angle) for found in labels.values() for label in found for angle in label.angles]
+    largest = max(filter(math.isfinite, sizes), default=0.0)
+    if angles_in == "radians" and largest > 2 * math.pi:
+        raise DataError(
+            f"{file}: angles up to {largest:.4g} look like degrees; wanted radians. Set data.angles_in=degrees."
+        )
+    if angles_in == "degrees" and len(sizes) > 3 * ENOUGH and 0 < largest <= 2 * math.pi:
+        raise DataError(
+            f"{file}: no angle of {len(sizes)} exceeds {largest:.4g}: this looks like radians; wanted degrees. "
+            "Set data.angles_in=radians."
+        )
+
+
+def write_labels(file: Path, labels: Mapping[str, Sequence[Label]]) -> None:
+    """Write a label file as MATLAB 7.3 lays it out; the same labels give the same bytes."""
+    with h5py.File(file, "w", userblock_size=512, libver="earliest") as content:
+        cells = content.create_group("#refs#")
+
+        def refer(value: np.ndarray, kind: str) -> h5py.Reference:
+            cell = cells.create_dataset(f"{len(cells):07d}", data=value, track_times=False)
+            cell.attrs["MATLAB_class"] = np.bytes_(kind)
+            return cell.ref
+
+        for split, found in labels.items():
+            struct = content.create_group(f"or_label_{split}")
+            struct.attrs["MATLAB_class"] = np.bytes_("struct")
+            columns = {
+                angle: [refer(np.array([[label.angles[index]]]), "double") for label in found]
+                for index, angle in enumerate(ANGLES)
+            }
+            texts = [np.frombuffer(label.name.encode("utf-16-le"), np.uint16)[:, None] for label in found]
+            columns["name"] = [refer(text, "char") for text in texts]
+            for field, references in columns.items():
+                struct.create_dataset(
+                    field, data=np.array(references, dtype=h5py.ref_dtype)[:, None], track_times=False
+                )
+    with file.open("r+b") as stream:
+        stream.write(HEADER)

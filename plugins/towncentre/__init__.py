@@ -1,0 +1,1 @@
+"""TownCentre: pan of pedestrians' heads; the published layout, and a generator that writes it."""

@@ -1,0 +1,105 @@
+"""Generated data in the cache (framework.generated): whole or absent, once, marked."""
+
+import json
+import threading
+from pathlib import Path
+
+import pytest
+
+from framework import generated
+from framework.cache import folder
+from framework.errors import DataError
+from framework.generated import MARK, draw_all, read_mark
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path
+
+
+def write(root: Path) -> None:
+    (root / "content").write_text("whole", encoding="utf-8")
+
+
+def test_it_is_written_once_and_marked(cache: Path) -> None:
+    root = generated.generated(cache / "things" / "seed0", {"seed": 0}, write)
+    assert root == cache / "things" / "seed0"
+    assert (root / "content").read_text(encoding="utf-8") == "whole"
+    assert read_mark(root) == {"seed": 0}
+    assert read_mark(cache) is None
+
+    def again(root: Path) -> None:
+        raise AssertionError("it is there")
+
+    assert generated.generated(cache / "things" / "seed0", {"seed": 0}, again) == root
+
+
+def test_interrupted_writing_leaves_nothing_and_is_done_again(cache: Path) -> None:
+    def interrupted(root: Path) -> None:
+        write(root)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generated.generated(cache / "things" / "a", {}, interrupted)
+    assert [path.name for path in cache.rglob("*") if path.is_file()] == [".a.lock"]
+    left = cache / "things" / ".a.part"  # what a killed process would leave
+    left.mkdir()
+    (left / "half").write_bytes(b"")
+    root = generated.generated(cache / "things" / "a", {}, write)
+    assert sorted(path.name for path in root.iterdir()) == ["content", MARK]
+    assert not left.exists()
+
+
+def test_two_at_once_write_it_once(cache: Path) -> None:
+    written: list[Path] = []
+    both_wait = threading.Barrier(2)
+
+    def counted(root: Path) -> None:
+        written.append(root)
+        write(root)
+
+    def ask() -> None:
+        both_wait.wait()
+        generated.generated(cache / "things" / "b", {}, counted)
+
+    askers = [threading.Thread(target=ask) for _ in range(2)]
+    for asker in askers:
+        asker.start()
+    for asker in askers:
+        asker.join()
+    assert len(written) == 1
+
+
+def test_a_changed_mark_is_refused(cache: Path) -> None:
+    root = generated.generated(cache / "things" / "c", {"seed": 1}, write)
+    (root / MARK).write_text(json.dumps({"seed": 2}), encoding="utf-8")
+    with pytest.raises(DataError, match=r"does not describe \{'seed': 1\}; it was changed\. Delete"):
+        generated.generated(cache / "things" / "c", {"seed": 1}, write)
+    (root / MARK).write_text("{", encoding="utf-8")
+    with pytest.raises(DataError, match=r"synthetic\.json: cannot be read .* Delete"):
+        generated.generated(cache / "things" / "c", {"seed": 1}, write)
+    (root / MARK).unlink()
+    with pytest.raises(DataError, match="does not describe"):
+        generated.generated(cache / "things" / "c", {"seed": 1}, write)
+
+
+def test_a_cache_that_cannot_be_written_is_said(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (cache / "file").write_bytes(b"")
+    with pytest.raises(DataError, match=r"cannot be written to .*file.d .* set FRAMEWORK_CACHE"):
+        generated.generated(cache / "file" / "d", {}, write)
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(cache / "file"))
+    with pytest.raises(DataError, match=r"cannot be made .* Set FRAMEWORK_CACHE to another folder"):
+        folder("things")
+
+
+def test_everything_is_drawn_and_a_fault_is_passed_on() -> None:
+    drawn: list[int] = []
+    draw_all(50, drawn.append, "numbers")
+    assert sorted(drawn) == list(range(50))
+
+    def until_ten(number: int) -> None:
+        if number == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        draw_all(50, until_ten, "numbers")

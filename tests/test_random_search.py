@@ -1,0 +1,469 @@
+"""A random search draws what it should, can be repeated and extended, and leaves its best trial as an experiment."""
+
+import csv
+import json
+import math
+import os
+import shlex
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from framework import comparison
+from framework.composition import folder, register
+from framework.errors import ConfigError
+from hydra_plugins.framework_random_search import _best, _draws
+from tests.conftest import TINY, Framework
+
+SEARCH = ["-m", "hydra/sweeper=random_search"]
+SCVAE = {"/experiment@_global_": "pascal3d/scvae"}
+LEARNING_RATE = "optimizer.learning_rate=tag(log,interval(1e-4,1e-2))"
+
+
+def space(*overrides: str) -> dict[str, _draws.Domain]:
+    return _draws.space(OverridesParser.create().parse_overrides(list(overrides)))
+
+
+def drawn(*overrides: str, trials: int = 20, seed: int = 0) -> list[dict[str, str]]:
+    found, _ = _draws.draw(space(*overrides), trials, seed)
+    return [dict(override.split("=", 1) for override in trial) for trial in found]
+
+
+def column(override: str, trials: int = 400) -> list[str]:
+    key = override.partition("=")[0]
+    return [trial[key] for trial in drawn(override, "other=interval(0.0,1.0)", trials=trials)]
+
+
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [
+        ("x=a,b,c", {"a", "b", "c"}),
+        ("x=choice([1,2],{a:1})", {"[1,2]", "{a:1}"}),
+        ("x='p, q',\"it's\"", {"'p, q'", '"it\'s"'}),
+        ("x=range(1,9)", {"1", "2", "3", "4", "5", "6", "7", "8"}),
+        ("x=range(0,1,0.25)", {"0.0", "0.25", "0.5", "0.75"}),
+        ("x=sort(3,1,2,reverse=true)", {"1", "2", "3"}),
+        ("x=shuffle(range(1,4))", {"1", "2", "3"}),
+        ("x=interval(2,5)", {"2", "3", "4"}),
+        ("x=interval(start=-1,end=2)", {"-1", "0", "1"}),
+        ("x=int(interval(1.5,4))", {"1", "2", "3"}),
+        ("x=tag(log,interval(1,5))", {"1", "2", "3", "4"}),
+        ("+x=null,true", {"null", "True"}),
+    ],
+)
+def test_a_finite_sweep_gives_each_of_its_values_and_no_other(override: str, wanted: set[str]) -> None:
+    assert set(column(override)) == wanted
+
+
+def test_choices_are_equally_likely() -> None:
+    counts = Counter(column("x=a,b,c,d", trials=4000))
+    # 5 standard deviations of a binomial count with p = 1/4
+    assert all(abs(count - 1000) < 5 * math.sqrt(4000 * 0.25 * 0.75) for count in counts.values())
+
+
+@pytest.mark.parametrize(
+    ("override", "least", "most", "distribution"),
+    [
+        ("x=interval(-2.0,6)", -2.0, 6.0, lambda value: (value + 2) / 8),
+        ("x=float(interval(1,9))", 1.0, 9.0, lambda value: (value - 1) / 8),
+        ("x=tag(log,interval(1e-5,1e-1))", 1e-5, 1e-1, lambda value: (math.log10(value) + 5) / 4),
+        ("x=interval(1.0,1.0001)", 1.0, 1.0001, lambda value: (value - 1) / 0.0001),
+        ("x=tag(log,interval(1e-300,1e300))", 1e-300, 1e300, lambda value: math.log10(value) / 600 + 0.5),
+    ],
+)
+def test_an_interval_is_drawn_from_uniformly(
+    override: str, least: float, most: float, distribution: Any
+) -> None:
+    values = sorted(map(float, column(override, trials=1000)))
+    assert least <= values[0]
+    assert values[-1] < most
+    distances = [abs(distribution(value) - (rank + 0.5) / 1000) for rank, value in enumerate(values)]
+    assert max(distances) < 1.95 / math.sqrt(1000), "Kolmogorov-Smirnov at 1e-3"
+
+
+def test_whole_numbers_of_a_log_interval_have_log_uniform_shares() -> None:
+    counts = Counter(column("x=tag(log,interval(1,8))", trials=4000))
+    for number in range(1, 8):
+        share = math.log((number + 1) / number) / math.log(8)
+        assert abs(counts[str(number)] - 4000 * share) < 5 * math.sqrt(4000 * share * (1 - share))
+
+
+def test_more_trials_extend_a_search_and_another_parameter_changes_no_draw() -> None:
+    few = drawn(LEARNING_RATE, "h=64,128,256", trials=10)
+    assert drawn(LEARNING_RATE, "h=64,128,256", trials=30)[:10] == few
+    more = drawn("d=interval(0.0,0.5)", LEARNING_RATE, "fixed=3", "h=64,128,256", trials=10)
+    assert [{key: trial[key] for key in few[0]} for trial in more] == few
+    assert len({trial["d"] for trial in more}) == 10
+    assert drawn(LEARNING_RATE, "h=64,128,256", trials=10, seed=1) != few
+
+
+def test_draws_are_the_same_on_every_machine() -> None:
+    # 0.9437... is int(sha256(b"0\x000\x00x").hexdigest()[:16], 16) / 2**64, as any tool gives it
+    done = subprocess.run(["sha256sum"], input=b"0\x000\x00x", capture_output=True, check=True)
+    assert _draws.quantile(0, 0, "x") == pytest.approx(int(done.stdout[:16], 16) / 2**64, abs=2**-52)
+
+
+def test_floats_are_short_and_come_back_from_hydra_as_they_went() -> None:
+    for text in column(LEARNING_RATE):
+        [override] = OverridesParser.create().parse_overrides([f"{LEARNING_RATE.partition('=')[0]}={text}"])
+        assert override.value() == float(text)
+        assert override.get_value_element_as_str() == text
+        assert len(text) <= len("0.000123456")
+
+
+def test_a_small_space_is_run_whole_and_then_ends() -> None:
+    whole, repeated = _draws.draw(space("x=1,2,3", "y=range(0,4)", "z=5", "w=1,1"), 100, 0)
+    assert len({tuple(trial) for trial in whole}) == len(whole) == 12
+    assert repeated > 0
+    assert all(trial[2:] == ["z=5", "w=1"] for trial in whole)
+    some, _ = _draws.draw(space("x=1,2,3", "y=range(0,4)", "z=5", "w=1,1"), 7, 0)
+    assert some == whole[:7], "a shorter search is the beginning of a longer one"
+
+
+def test_the_last_override_of_a_key_counts() -> None:
+    assert {trial["x"] for trial in drawn("x=1,2", "x=7", "y=1,2")} == {"7"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["x=1", "~y"], "nothing to search: no override is a sweep. Give one"),
+        (["x=interval(2,2)"], r"x=interval\(2,2\): wanted the smaller end first"),
+        (["x=interval(3.0,2)"], "wanted the smaller end first"),
+        (["x=interval(0,inf)"], "wanted two finite ends"),
+        (["x=interval(0,1)"], r"only whole number in it is 0. Write interval\(0.0,1.0\)"),
+        (["x=tag(log,interval(0.0,1))"], "0 has no logarithm. Start above 0"),
+        (["x=tag(log,interval(-3,2))"], "-3 has no logarithm"),
+        (["x=tag(lgo,interval(1.0,2))"], "only tag is log, not lgo. Did you mean 'log'"),
+        (["x=tag(log,range(1,9))"], "the tag log means nothing on it"),
+        (["x=range(9,1)"], "nothing in it to draw"),
+        (["x=range(1,9,0)"], "its step is 0"),
+    ],
+)
+def test_a_sweep_that_makes_no_sense_is_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        space(*overrides)
+
+
+# ---------------------------------------------------------------- the best trial as an experiment
+
+
+def composed(*overrides: str) -> DictConfig:
+    return compose("config", overrides=["experiment_name=test", *overrides])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name", "defaults"),
+    [
+        (
+            ["experiment=pascal3d/scvae", "optimizer.learning_rate=1.2672e-05", "density_head.latent=7"],
+            "pascal3d/scvae_best",
+            [SCVAE],
+        ),
+        (
+            ["experiment=pascal3d/scvae", "density_head=mixture", "optimizer=adam", "data.category=car"],
+            "pascal3d/scvae_best",
+            [SCVAE, {"override /density_head": "mixture"}, {"override /optimizer": "adam"}],
+        ),
+        (
+            ["experiment=pascal3d/mixture", "+preset=thesis", "data.image_size=64", "encoder=[mlp]"],
+            "pascal3d/mixture_best",
+            [
+                {"/experiment@_global_": "pascal3d/mixture"},
+                {"/preset": "thesis"},
+                {"override /encoder": ["mlp"]},
+            ],
+        ),
+        (
+            ["data=pascal3d", "metric=[log_likelihood]", "trainer={max_epochs:3}", "+trainer.max_steps=2"],
+            "best",
+            [{"override /data": "pascal3d"}, {"override /metric": ["log_likelihood"]}],
+        ),
+        (
+            ["experiment=pascal3d/scvae", "data.category='1e-3'", "seed=4", "~batch_size", "logger=none"],
+            "pascal3d/scvae_best",
+            [SCVAE],
+        ),
+    ],
+)
+def test_the_experiment_composes_to_the_config_of_the_trial(
+    overrides: list[str], name: str, defaults: list[Any], tmp_path: Path
+) -> None:
+    register()
+    with initialize_config_dir(str(folder()), version_base="1.3"):
+        wanted = composed(*overrides)
+        found, content = _best.experiment(overrides, GlobalHydra.instance().config_loader(), "trial 3")
+        assert found == name
+        header, command, comment = content.splitlines()[:3]
+        assert (header, comment) == ("# @package _global_", "# trial 3")
+        assert command.startswith(f"# python -m framework experiment={name}")
+        assert yaml.safe_load(content)["defaults"] == defaults
+        path = tmp_path / "experiment" / f"{name}.yaml"
+        path.parent.mkdir(parents=True)
+        path.write_text(content)
+        arguments = shlex.split(command)[4:]
+        given = composed(f"hydra.searchpath=[file://{tmp_path}]", *arguments)
+    assert OmegaConf.to_container(given) == OmegaConf.to_container(wanted)
+
+
+# ---------------------------------------------------------------- multiruns
+
+# The framework's command line, but for what runs a job: a script that returns a value without training.
+APP = """
+import sys
+from pathlib import Path
+from framework import sweep
+sweep.COMMAND = [sys.executable, "-S", str(Path(__file__).with_name("job.py"))]
+sys.argv[0] = "framework"
+from framework.app import main
+main()
+"""
+JOB = """
+import json, math, sys
+from pathlib import Path
+
+given = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
+folder = Path(given["hydra.run.dir"][1:-1])
+with (folder / "started").open("a") as file:
+    file.write("x")
+if given["batch_size"] == "8":
+    raise ValueError("batches too small")
+rate, width = float(given["optimizer.learning_rate"]), int(given["density_head.hidden"])
+value = math.nan if given["batch_size"] == "16" else abs(math.log10(rate) + 3) + width / 1e6
+(folder / "value.json").write_text(json.dumps(value))
+results = {
+    "method": "scvae", "data": "car", "seed": 0, "synthetic": True, "folder": str(folder),
+    "milliseconds_per_sample": 1.0, "parameters": width, "columns": {}, "better": {},
+}
+(folder / "results.json").write_text(json.dumps(results))
+"""
+SPACE = [LEARNING_RATE, "density_head.hidden=64,128", "batch_size=8,16,32,32"]
+
+
+class Search:
+    """Searches in one folder."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self.folder = home / "search"
+        (home / "app.py").write_text(APP)
+        (home / "job.py").write_text(JOB)
+
+    def __call__(self, *arguments: str) -> tuple[int, str]:
+        """Exit code and output."""
+        done = subprocess.run(
+            [sys.executable, "app.py", *SEARCH, "hydra.sweep.dir=search", *arguments],
+            cwd=self.home,
+            env={**os.environ, "COLUMNS": "160"},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    def ranking(self) -> list[dict[str, str]]:
+        with (self.folder / "ranking.csv").open(encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    def jobs(self) -> list[dict[str, Any]]:
+        paths = sorted(self.folder.glob("*/job.json"), key=lambda path: int(path.parent.name))
+        return [json.loads(path.read_text()) for path in paths]
+
+    def tries(self) -> list[int]:
+        return [record["tries"] for record in self.jobs()]
+
+
+def test_a_search_ranks_its_trials_and_goes_on_where_it_was(tmp_path: Path) -> None:
+    search = Search(tmp_path)
+    arguments = ["experiment=pascal3d/scvae", "logger=none", "data.category=car", *SPACE]
+    code, output = search(*arguments, "hydra.sweeper.trials=8")
+    assert code == 1, output
+    statuses = Counter(record["status"] for record in search.jobs())
+    assert len(search.jobs()) == 8
+    assert min(statuses["completed"], statuses["failed"]) >= 1
+    assert f"{statuses['failed']} of 8 jobs did not complete" in output
+    assert "Traceback" not in output
+    rows = search.ranking()
+    finite = [float(row["value"]) for row in rows if row["value"]]
+    assert [bool(row["value"]) for row in rows] == sorted((bool(row["value"]) for row in rows), reverse=True)
+    assert finite == sorted(finite)
+    assert {row["batch_size"] for row in rows[: len(finite)]} == {"32"}
+    assert {row["batch_size"] for row in rows[len(finite) :]} == {"8", "16"}
+    assert "(did not complete)" in output
+    assert "(its value is nan)" in output
+
+    best = yaml.safe_load((search.folder / "best.yaml").read_text())
+    assert best["defaults"] == [SCVAE]
+    assert f"{best['optimizer']['learning_rate']}" == rows[0]["optimizer.learning_rate"]
+    assert best["data"] == {"category": "car"}
+    assert f"trial {rows[0]['trial']} of 8 (seed 0)" in (search.folder / "best.yaml").read_text()
+    assert "logger" not in best
+
+    first = [record["overrides"] for record in search.jobs()]
+    code, output = search(*arguments, "hydra.sweeper.trials=12", "hydra.launcher.jobs=2")
+    assert [record["overrides"] for record in search.jobs()][:8] == first
+    assert search.tries() == [2 if "batch_size=8" in one else 1 for one in first] + [1] * 4
+    assert len(search.ranking()) == 12
+
+
+def test_a_launcher_that_runs_jobs_in_this_process_will_do(tmp_path: Path) -> None:
+    search = Search(tmp_path)
+    modes = (
+        "import types\n"
+        "sys.modules['framework.modes'] = types.SimpleNamespace(run=lambda config: float(config.seed))\n"
+    )
+    (tmp_path / "app.py").write_text(APP.replace("from framework.app", modes + "from framework.app"))
+    code, output = search("hydra/launcher=basic", "seed=range(3,9)", "hydra.sweeper.trials=6")
+    assert code == 0, output
+    rows = search.ranking()
+    assert [row["seed"] for row in rows] == ["3", "4", "5", "6", "7", "8"]
+    assert sorted(row["trial"] for row in rows) == ["0", "1", "2", "3", "4", "5"]
+    assert yaml.safe_load((search.folder / "best.yaml").read_text()) == {"seed": 3}
+
+
+def trials(folder: Path, *values: float | None, **more: list[float]) -> list[comparison.Trial]:
+    """Trials that returned `values` (None: that failed), and measured what `more` holds."""
+    found = []
+    for number, value in enumerate(values):
+        home = folder / str(number)
+        home.mkdir()
+        results = {
+            **{key: column[number] for key, column in more.items()},
+            "columns": {"accuracy": "accuracy (share)"},
+            "better": {"accuracy": "higher"},
+        }
+        (home / "results.json").write_text(json.dumps(results))
+        found.append(comparison.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None))
+    return found
+
+
+def ranked(folder: Path) -> list[str]:
+    with (folder / "ranking.csv").open(encoding="utf-8") as file:
+        return [row["trial"] for row in csv.DictReader(file)]
+
+
+def test_the_best_is_first_and_what_has_no_finite_value_last(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = trials(tmp_path, math.nan, 2.0, None, -1.5, math.inf, 2.0)
+    ranking = comparison.rank(tmp_path, given, ["+x"])
+    assert ranked(tmp_path) == ["3", "1", "5", "0", "2", "4"]
+    assert ranking.best == given[3]
+    assert ranking.said == "best validation loss (nats): -1.5"
+    said = " ".join(capsys.readouterr().out.split())
+    assert "#0 (its value is nan), #2 (did not complete), #4 (its value is inf)" in said
+    assert comparison.rank(tmp_path, given, ["+x"], direction="maximize").best == given[1]
+
+
+def test_a_search_without_any_value_has_no_best(tmp_path: Path) -> None:
+    assert comparison.rank(tmp_path, trials(tmp_path, math.nan, None), ["+x"]).best is None
+
+
+def test_a_metric_of_the_results_ranks_its_own_way(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    numbers = {"accuracy": [0.5, 0.7, 0.9], "parameters": [3, 1, 2], "odd": [0.1, 0.3, 0.2]}
+    given = trials(tmp_path, 1.0, 2.0, None, **numbers)
+    assert comparison.rank(tmp_path, given, [], "accuracy").best == given[1], "that of a failed trial is none"
+    assert "accuracy is of the test split" in capsys.readouterr().out
+    assert comparison.rank(tmp_path, given, [], "accuracy", "minimize").best == given[0]
+    assert comparison.rank(tmp_path, given, [], "parameters").best == given[1], "costs are to be low"
+    assert comparison.rank(tmp_path, given, [], "odd", "maximize").best == given[1]
+    with pytest.raises(
+        ConfigError, match=r"does not say which way it is better\. Set hydra\.sweeper\.direction"
+    ):
+        comparison.rank(tmp_path, given, [], "odd")
+    with pytest.raises(
+        ConfigError, match=r"no trial has it\. Did you mean 'accuracy'\? They have: accuracy, "
+    ):
+        comparison.rank(tmp_path, given, [], "acuracy")
+
+
+def test_jobs_of_two_commands_in_one_folder_are_told_apart(tmp_path: Path) -> None:
+    given = [["x=1", "size=32"], ["x=1", "size=16"], ["x=1"]]
+    for number, overrides in enumerate(given):
+        results = {"method": "m", "data": "d", "seed": 0, "milliseconds_per_sample": number + 1.0}
+        home = tmp_path / str(number)
+        home.mkdir()
+        (home / "results.json").write_text(json.dumps({**results, "columns": {}, "better": {}}))
+        (home / "job.json").write_text(json.dumps({"status": "completed", "overrides": overrides}))
+    comparison.summarise(tmp_path, given[1:2])
+    with (tmp_path / "comparison.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["size"] for row in rows] == ["32", "16", ""]
+    assert [float(row["milliseconds_per_sample"]) for row in rows] == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["seed=3"], "has nothing to search"),
+        (
+            ["seed=1,2", "hydra.sweeper.trials=0"],
+            "hydra.sweeper.trials = 0: wanted a whole number of at least 1",
+        ),
+        (["seed=1,2", "hydra.sweeper.trials=many"], "hydra.sweeper.trials = 'many': wanted"),
+        (["seed=1,2", "hydra.sweeper.seed=-1"], "hydra.sweeper.seed = -1"),
+        (["seed=1,2", "hydra.sweeper.direction=minimise"], "Did you mean 'minimize'"),
+        (["seed=interval(5,1)"], "seed=interval(5,1): wanted the smaller end first"),
+        (["sed=1,2"], "Did you mean 'seed'"),
+    ],
+)
+def test_bad_input_gets_a_sentence_and_runs_nothing(
+    arguments: list[str], message: str, tmp_path: Path
+) -> None:
+    search = Search(tmp_path)
+    code, output = search("experiment=pascal3d/scvae", *arguments)
+    assert code == 2, output
+    assert message in output
+    assert "Traceback" not in output
+    assert not search.jobs()
+
+
+def test_the_best_of_a_real_search_can_be_run_and_repeats_its_trial(
+    framework: Framework, tmp_path: Path
+) -> None:
+    searched = framework(
+        *SEARCH,
+        *TINY,
+        "logger=none",
+        "trainer.max_epochs=1",
+        "hydra.sweep.dir=a search",
+        "hydra.sweeper.trials=2",
+        "hydra.launcher.jobs=2",
+        "hydra.sweeper.params={optimizer.learning_rate:'tag(log,interval(1e-4,1e-2))'}",
+    )
+    assert searched.code == 0, searched.out
+    home = tmp_path / "a search"
+    with (home / "ranking.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    values = [json.loads((home / row["trial"] / "value.json").read_text()) for row in rows]
+    assert values == sorted(values)
+    assert [float(row["value"]) for row in rows] == values
+    again = framework("--config-dir=a search", "experiment=best", "logger=none", "hydra.run.dir=again")
+    assert again.code == 0, again.out
+    again.folder = tmp_path / "again"
+    repeated, trial = (
+        yaml.safe_load((one / "config.yaml").read_text()) for one in (again.folder, home / rows[0]["trial"])
+    )
+    assert {key for key in trial if repeated[key] != trial[key]} <= {"experiment_name", "threads"}
+    results = [
+        json.loads((one / "results.json").read_text()) for one in (again.folder, home / rows[0]["trial"])
+    ]
+    assert results[0]["log_likelihood"] == results[1]["log_likelihood"]
+
+
+def test_the_sweeper_costs_other_commands_nothing() -> None:
+    heavy = {"torch", "numpy", "pytorch_lightning", "mlflow", "matplotlib", "rich", "framework.comparison"}
+    script = "import sys, hydra_plugins.framework_random_search; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert not heavy & set(done.stdout.split())
