@@ -71,7 +71,7 @@ def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: P
     grid = figure.subplots(2, len(shown), height_ratios=(1, 1.2))
     for column, deviation in enumerate(shown):
         seen = blurred(image, deviation)
-        grid[0, column].imshow(picture(seen[None])[0])
+        grid[0, column].imshow(picture(seen))
         grid[0, column].set_axis_off()
         grid[0, column].set_title(f"σ = {deviation:g} px")
         axes = grid[1, column]

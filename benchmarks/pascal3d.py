@@ -5,15 +5,22 @@
         hydra.sweep.dir=outputs/sweeps/pascal3d
     python benchmarks/pascal3d.py outputs/sweeps/pascal3d
 
-Writes pascal3d.md beside this file.
+The run time of one prediction is measured again by this script, every model alone on the machine: in a sweep the jobs
+disturb each other. Writes pascal3d.md beside this file.
 """
 
 import json
 import sys
 from pathlib import Path
 
+import torch
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
+from framework.assembly import build_data
+from framework.batches import Batches
+from framework.evaluation import cost
+from framework.loading import load_with_description
 from framework.table import aggregate, markdown
 
 METHODS = ("fixed_kappa", "von_mises", "mixture", "cvae", "scvae")
@@ -33,9 +40,25 @@ COLUMNS = {
 }
 
 
+def milliseconds(run: Path, loaders: dict[str, Batches]) -> float:
+    """Run time of one prediction of a trained model, one thread."""
+    model, described = load_with_description(run)
+    category = str(described["config"]["data"]["category"])
+    if category not in loaders:
+        data = build_data(described["config"])
+        data.prepare()
+        loaders[category] = Batches(data, batch_size=16, workers=0, seed=0)
+    batch = next(iter(loaders[category].test_dataloader()))
+    return cost(model, batch, samples=1000, device=torch.device("cpu")).milliseconds_per_sample
+
+
 def main() -> None:
-    folder = Path(sys.argv[1])
-    rows = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*/results.json")]
+    torch.set_num_threads(1)
+    loaders: dict[str, Batches] = {}
+    rows = []
+    for path in Path(sys.argv[1]).glob("*/results.json"):
+        row = json.loads(path.read_text(encoding="utf-8"))
+        rows.append({**row, "milliseconds_per_sample": milliseconds(path.parent, loaders)})
     rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))
     compared = aggregate(rows, by=["data", "method"])
     threads = sorted({row["threads"] for row in rows})

@@ -104,7 +104,6 @@ def _refusals(renderer: Renderer, worst: Worst) -> None:
         "a channel that does not exist": (scene, ("colour of the wind",)),
         "faces beyond the vertices": (replace(scene, faces=scene.faces + len(scene.vertices)), tuple(some)),
         "negative faces": (replace(scene, faces=-scene.faces - 1), tuple(some)),
-        "vertices of two numbers": (replace(scene, vertices=scene.vertices[:, :2]), tuple(some)),
     }
     if "color" in renderer.channels:
         wrong["colour of a scene without"] = (replace(scene, colors=None), ("color",))

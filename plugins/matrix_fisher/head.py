@@ -19,8 +19,9 @@ LARGEST_PARAMETER = 1e12
 
 
 class MatrixFisherHead(DensityHead):
-    """One matrix Fisher density of the rotation, by likelihood: the joint density of all three angles that the
-    thesis leaves to future work (§3.7), with a network as in Mohlin et al. 2020.
+    """One matrix Fisher density of the rotation, azimuth, elevation and tilt jointly.
+
+    The joint density that the thesis leaves to future work (§3.7), with a network as in Mohlin et al. 2020.
 
     Reads the nine elements of a matrix X, row by row, of which F is a multiple that grows faster than X
     (`parameter_of_raw`). F is the density's natural parameter, so that the uniform density of rotations, X = 0, is a
