@@ -14,7 +14,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.circular import circular_median, wrap
-from plugins.von_mises import functions
+from plugins.von_mises import functions, integrals
 from plugins.von_mises.fit_coefficients import bessel
 
 COUNT = 10**6
@@ -141,7 +141,7 @@ def sampling() -> list[str]:
             drawn = functions.sample(zero, concentration).double()
             exact = concentration[:1].double()
             result = stats.kstest(
-                drawn.numpy(), lambda at, k=exact: functions.cdf(torch.from_numpy(at), k * 0, k).numpy()
+                drawn.numpy(), lambda at, k=exact: integrals.cdf(torch.from_numpy(at), k * 0, k).numpy()
             )
             cells.append(f"{result.statistic:.1e} | {result.pvalue:.2f}")
         ours = milliseconds(lambda k=concentration, m=zero: functions.sample(m, k), 0.3)
@@ -172,7 +172,7 @@ def distribution() -> float:
     """Worst absolute difference of the distribution function from the normal one of z = 2√κ sin(θ/2) at κ = 1e30."""
     kappa = torch.tensor(1e30, dtype=torch.float64)
     z = torch.linspace(-8, 8, 401, dtype=torch.float64)
-    found = functions.cdf(z * 1e-15, 0 * kappa, kappa)
+    found = integrals.cdf(z * 1e-15, 0 * kappa, kappa)
     return float(abs(found.numpy() - special.ndtr(z.numpy())).max())
 
 

@@ -22,8 +22,9 @@ COMPONENT = {"name": "von_mises"}
 class UniformFloorHead(DensityHead):
     """A declared uniform floor under a component's density: (1 - γ) p + γ u, so that no target is impossible.
 
-    No loss exceeds log(1/(γu)). The authors' original code adds such a floor to its mixtures without a word. Here it is a head of its own: it
-    stands in the config, in the run's parameters and in the method's name, and with γ = 0 it is its component.
+    No loss exceeds log(1/(γu)). The authors' original code adds such a floor to its mixtures without a word. Here it
+    is a head of its own: it stands in the config, in the run's parameters and in the method's name, and with γ = 0 it
+    is its component.
 
     Args:
         weight: γ.

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints, register_kl
 
 from framework.density import circular, marginal, median, pick, take
-from plugins.von_mises import functions
+from plugins.von_mises import functions, integrals
 
 
 class VonMises(Distribution):
@@ -70,7 +70,7 @@ def _(density: VonMises, samples: int) -> Tensor:
 
 @register_kl(VonMises, VonMises)
 def _(first: VonMises, second: VonMises) -> Tensor:
-    parts = functions.kl_divergence(
+    parts = integrals.kl_divergence(
         first.location, first.concentration, second.location, second.concentration
     )
     return parts.sum(-1)

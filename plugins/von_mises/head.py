@@ -12,6 +12,7 @@ from framework.density_head import DensityHead
 from framework.raw_numbers import require_finite
 from framework.target import Target
 from plugins.von_mises import functions
+from plugins.von_mises.angles import half_angle
 from plugins.von_mises.density import VonMises
 
 LARGEST_CONCENTRATION = 1e12
@@ -80,7 +81,7 @@ class VonMisesHead(DensityHead):
             return
         if len(raw) == 0:
             raise ValueError("a fixed concentration is calibrated on validation data, but got none of it.")
-        sine, _ = functions.half_angle(target.double(), self(raw).mean.double())
+        sine, _ = half_angle(target.double(), self(raw).mean.double())
         deviation = 2 * sine.square()
         found = functions.concentration_of_moments((1 - deviation).mean(0), deviation.mean(0))
         self.concentration.copy_(found.clamp(self.floor, LARGEST_CONCENTRATION))

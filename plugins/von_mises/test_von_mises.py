@@ -17,7 +17,7 @@ from framework.errors import ConfigError
 from framework.schema import build, resolve
 from framework.target import Target
 from framework.testing.heads import values
-from plugins.von_mises import fit_coefficients, functions
+from plugins.von_mises import blocks, fit_coefficients, functions, integrals
 from plugins.von_mises.coefficients import NODES, TABLES
 from plugins.von_mises.density import VonMises
 
@@ -192,7 +192,7 @@ def test_gradients_reduce_over_broadcast_arguments():
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_blocks_change_nothing(dtype):
-    count = functions.BLOCK * 2 + 5
+    count = blocks.BLOCK * 2 + 5
     value, mean, kappa = torch.randn(count, dtype=dtype), torch.randn(count, dtype=dtype), torch.rand(count)
     arguments = [value, mean.requires_grad_(), kappa.to(dtype).requires_grad_()]
     whole = functions.log_prob(*arguments)
@@ -242,8 +242,8 @@ def test_divergence_agrees_with_120_digits(dtype):
     second = torch.cat([KAPPAS, *(factors * kappa for kappa in KAPPAS[1::3])]).to(dtype)
     first, second = (grid.flatten() for grid in torch.meshgrid(KAPPAS.to(dtype), second, indexing="ij"))
     zero = torch.zeros((), dtype=dtype)
-    straight = functions.kl_divergence(zero, first, zero, second)
-    turned = functions.kl_divergence(zero, first, zero + 0.25, second)
+    straight = integrals.kl_divergence(zero, first, zero, second)
+    turned = integrals.kl_divergence(zero, first, zero + 0.25, second)
     assert (straight >= 0).all()
     for row in zip(first, second, straight, turned, strict=True):
         one, two = (mpmath.mpf(kappa.item()) for kappa in row[:2])
@@ -257,9 +257,9 @@ def test_divergence_agrees_with_120_digits(dtype):
 
 def test_divergence_of_equals_is_exactly_0_and_of_the_joint_is_the_sum():
     mean, kappa = torch.randn(13, 2), torch.stack([KAPPAS, KAPPAS], 1).float()
-    assert (functions.kl_divergence(mean, kappa, mean, kappa) == 0).all()
+    assert (integrals.kl_divergence(mean, kappa, mean, kappa) == 0).all()
     first, second = VonMises(mean, kappa), VonMises(mean + 0.1, kappa + 1)
-    parts = functions.kl_divergence(mean, kappa, mean + 0.1, kappa + 1)
+    parts = integrals.kl_divergence(mean, kappa, mean + 0.1, kappa + 1)
     torch.testing.assert_close(kl_divergence(first, second), parts.sum(-1))
 
 
@@ -268,8 +268,8 @@ def test_divergence_has_first_and_second_derivatives(second):
     arguments = [
         torch.tensor([number], dtype=torch.float64, requires_grad=True) for number in (0.3, 1.5, -0.4, second)
     ]
-    assert torch.autograd.gradcheck(functions.kl_divergence, arguments)
-    assert torch.autograd.gradgradcheck(functions.kl_divergence, arguments)
+    assert torch.autograd.gradcheck(integrals.kl_divergence, arguments)
+    assert torch.autograd.gradgradcheck(integrals.kl_divergence, arguments)
 
 
 def tail(offset, kappa):
@@ -290,14 +290,14 @@ def test_cdf_agrees_with_quadrature_in_both_tails(kappa):
     for deviations in (0.0, 1e-6, 0.3, 0.7, 1.5, 3.0, 8.0, 25.0):
         offset = min(3.14, deviations / max(1.0, kappa) ** 0.5)
         reference = tail(offset, kappa)
-        below = functions.cdf(zero - offset, zero, concentration)
-        above = functions.cdf(zero + offset, zero, concentration)
+        below = integrals.cdf(zero - offset, zero, concentration)
+        above = integrals.cdf(zero + offset, zero, concentration)
         assert abs(below.item() - reference) <= 4e-15 * reference * max(1, -mpmath.log(reference))
         assert abs(above.item() - (1 - reference)) <= 1e-14
-        turned = functions.cdf(zero - offset + 4 * math.pi, zero, concentration)
+        turned = integrals.cdf(zero - offset + 4 * math.pi, zero, concentration)
         assert abs(turned.item() - reference - 2) <= 1e-14 + 2e-15 * max(1.0, kappa) ** 0.5
-        single = functions.cdf((zero - offset).float(), zero.float(), concentration.float())
-        wide = functions.cdf((zero - offset).float().double(), zero, concentration.float().double())
+        single = integrals.cdf((zero - offset).float(), zero.float(), concentration.float())
+        wide = integrals.cdf((zero - offset).float().double(), zero, concentration.float().double())
         assert single.dtype == torch.float32
         assert single == wide.float()
     mpmath.mp.dps = 90
@@ -306,7 +306,7 @@ def test_cdf_agrees_with_quadrature_in_both_tails(kappa):
 @pytest.mark.parametrize("kappa", [1e-3, 1.0, 12.0, 45.0])
 def test_cdf_agrees_with_scipy_and_rises(kappa):
     value = torch.linspace(-7, 7, 2001, dtype=torch.float64)
-    found = functions.cdf(value, torch.zeros(()), torch.tensor(kappa))
+    found = integrals.cdf(value, torch.zeros(()), torch.tensor(kappa))
     np.testing.assert_allclose(
         found, stats.vonmises.cdf(value.numpy(), np.float32(kappa)), rtol=0, atol=1e-12
     )
@@ -320,7 +320,7 @@ def test_cdf_has_first_derivatives(kappa):
     mean, kappa = (
         torch.full((5,), number, dtype=torch.float64, requires_grad=True) for number in (0.1, kappa)
     )
-    assert torch.autograd.gradcheck(functions.cdf, (value, mean, kappa))
+    assert torch.autograd.gradcheck(integrals.cdf, (value, mean, kappa))
 
 
 @pytest.mark.parametrize("kappa", [0, 1e-30, 1e-3, 0.3, 1, 3, 30, 1e4, 1e12, 1e30])
@@ -329,22 +329,22 @@ def test_arc_holds_its_mass(kappa):
         [0, 1e-12, 1e-3, 0.3, 0.5, 0.500001, 0.9, 0.99, 1 - 1e-6, 1 - 1e-9, 1], dtype=torch.float64
     )
     zero, concentration = torch.zeros((), dtype=torch.float64), torch.tensor(kappa, dtype=torch.float64)
-    width = functions.half_width(mass, concentration)
-    below = functions.cdf(-width, zero, concentration)
-    np.testing.assert_allclose(functions.cdf(width, zero, concentration) - below, mass, rtol=0, atol=2e-14)
+    width = integrals.half_width(mass, concentration)
+    below = integrals.cdf(-width, zero, concentration)
+    np.testing.assert_allclose(integrals.cdf(width, zero, concentration) - below, mass, rtol=0, atol=2e-14)
     # the mass outside keeps its digits down to that of a last digit of π
     np.testing.assert_allclose(2 * below[5:-1], (1 - mass)[5:-1], rtol=1e-12, atol=4e-16)
     assert (width.diff() > 0).all()
     assert width[0] == 0
     assert width[-1] == math.pi
-    low, high = functions.interval(mass, zero + 2, concentration)
+    low, high = integrals.interval(mass, zero + 2, concentration)
     torch.testing.assert_close(high - 2, width, rtol=0, atol=1e-15)
     torch.testing.assert_close(2 - low, width, rtol=0, atol=1e-15)
 
 
 def test_an_arc_of_more_than_all_is_refused():
     with pytest.raises(ValueError, match=r"between 0 and 1, got 0.5 to 1.5"):
-        functions.half_width(torch.tensor([0.5, 1.5]), torch.ones(2))
+        integrals.half_width(torch.tensor([0.5, 1.5]), torch.ones(2))
 
 
 @pytest.mark.parametrize("concentration", [10.0**power for power in range(-8, 13)] + [1.1, 1.2, 37.0])

@@ -1,0 +1,93 @@
+"""Half of the difference of two angles, taken without rounding, however many turns they are apart."""
+
+import math
+
+import torch
+from torch import Tensor
+
+_PI = tuple(
+    float.fromhex(part)
+    for part in ("0x1.921fb54p+1", "0x1.10b461p-29", "0x1.a62633p-57", "0x1.45c06e0e68948p-85")
+)
+"""π in three parts of 27 bits, of which a whole number below 2^26 has exact multiples, and a rest."""
+
+
+def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """sin and cos of (φ-μ)/2 up to one common sign, the difference taken without rounding."""
+    if in_single(value, mean):
+        return _half_angle_in_single(value, mean)
+    sine, cosine, odd = _reduced(value, mean)
+    return torch.where(odd > 0, cosine, sine), torch.where(odd > 0, -sine, cosine)
+
+
+def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """sin²((φ-μ)/2) and sin((φ-μ)/2) cos((φ-μ)/2)."""
+    if in_single(value, mean):
+        sine, cosine = _half_angle_in_single(value, mean)
+        return sine * sine, sine * cosine
+    sine, cosine, odd = _reduced(value, mean)
+    # by arithmetic: a compiler that splits value and gradient would store a mask, at several times the cost of all else
+    square = sine * sine
+    return square + odd * (cosine * cosine - square), (1 - 2 * odd) * (sine * cosine)
+
+
+def in_single(value: Tensor, mean: Tensor) -> bool:
+    return value.dtype == mean.dtype == torch.float32 and not torch.compiler.is_compiling()
+
+
+def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """As `half_angle`, in float32 alone."""
+    sine, cosine, small_sine, small_cosine = parts_in_single(value, mean)
+    return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
+
+
+def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """sin and cos of half of the rounded difference and of what rounding took: fewer operations than `_reduced`.
+
+    float32's sine and cosine read large angles exactly.
+    """
+    high = value - mean
+    with torch.no_grad():
+        low = _lost(value, mean, high) / 2
+        square = low * low  # below 2^-10 for angles up to 2e6 rad
+        small_sine, small_cosine = low - low * square / 6, 1 - square / 2
+    half = high / 2
+    return torch.sin(half), torch.cos(half), small_sine, small_cosine
+
+
+def _lost(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
+    """What rounding took from φ-μ: with it `high` is the exact difference (Knuth's two-sum)."""
+    back = value - high
+    return (value - (high + back)) + (back - mean)
+
+
+def _reduced(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin and cos of half of what φ-μ is beyond the nearest multiple of π, and that multiple's parity, 0 or 1."""
+    if value.dtype == torch.float32 and mean.dtype == torch.float32:
+        high = value.double() - mean.double()
+        low = None
+    else:
+        high = value - mean
+        with torch.no_grad():
+            low = _lost(value, mean, high)
+    with torch.no_grad():
+        count = torch.round(high * (1 / math.pi))
+        odd = 2 * torch.frac(count * 0.5).abs().to(value.dtype)
+    rest = high - count * _PI[0] - count * _PI[1] - count * _PI[2]
+    rest = (rest.float() if low is None else rest - count * _PI[3] + low) * 0.5
+    sine, cosine = _sine_and_cosine(rest)
+    return sine, cosine, odd
+
+
+def _sine_and_cosine(angle: Tensor) -> tuple[Tensor, Tensor]:
+    """Of an angle in [-π/4, π/4]."""
+    if not torch.compiler.is_compiling():
+        return torch.sin(angle), torch.cos(angle)
+    # Taylor's series, to 1e-17 and 2e-9: what the compiler calls instead reduces the angle once more
+    square = angle * angle
+    count = 8 if angle.dtype == torch.float64 else 4
+    sine, cosine = torch.zeros_like(square), torch.zeros_like(square)
+    for j in range(count, 0, -1):
+        sine = (sine + (-1) ** j / math.factorial(2 * j + 1)) * square
+        cosine = (cosine + (-1) ** j / math.factorial(2 * j)) * square
+    return sine * angle + angle, 1 + cosine
