@@ -35,6 +35,17 @@ def test_torchs_von_mises_fails_and_the_table_says_where(framework: Framework) -
     assert "Traceback" not in done.out
 
 
+def test_a_wrapper_that_mixes_densities_passes_and_one_that_averages_parameters_fails(
+    framework: Framework,
+) -> None:
+    done = framework("mode=check", "uncertainty=[committee]")
+    assert done.code == 0, done.out
+    assert "one member is the member" in done.out
+    done = framework("mode=check", "uncertainty=[averaged_committee]")
+    assert done.code == 1, done.out
+    assert "averaged_committee: one member is the member" in done.out
+
+
 def test_parameters_from_the_command_line_are_a_row(framework: Framework) -> None:
     done = framework("mode=check", "density_head=wrapped_cauchy", "density_head.largest=0.5")
     assert done.code == 0, done.out

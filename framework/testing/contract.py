@@ -11,9 +11,9 @@ from framework.registry import load
 from framework.schema import build, resolve
 from framework.target import Target
 from framework.testing.finding import Finding
-from framework.testing.rows import EncoderRow, HeadRow, MetricRow, RendererRow
+from framework.testing.rows import EncoderRow, HeadRow, MetricRow, RendererRow, WrapperRow
 
-Row = HeadRow | EncoderRow | MetricRow | RendererRow
+Row = HeadRow | EncoderRow | MetricRow | RendererRow | WrapperRow
 TARGETS = (
     Target("angle", ("azimuth",)),
     Target("angle", ("azimuth", "elevation", "tilt")),
@@ -78,8 +78,8 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
     for option in SHAPES if group == "encoder" else TARGETS:
         try:
             if isinstance(option, Target):
-                build(group, resolved, target=option)
-                row = HeadRow if group == "density_head" else MetricRow
+                _tried(group, resolved, option)
+                row = {"density_head": HeadRow, "metric": MetricRow, "uncertainty": WrapperRow}[group]
                 found.append(row(f"{label}, {len(option.names)} of kind {option.kind}", option, config))
             else:
                 build(group, resolved, input_shape=option)
@@ -92,6 +92,16 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
             f"{' '.join(refused)} Give it a rows.py (framework.testing.rows)."
         )
     return tuple(found)
+
+
+def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
+    """Build the plugin for a target, which it may refuse."""
+    if group == "uncertainty":
+        from framework.testing.wrappers import Plain
+
+        build(group, resolved, model=lambda: Plain(target), target=target)
+    else:
+        build(group, resolved, target=target)
 
 
 def _examiner(group: str) -> Callable[[str, Any], Iterator[Finding]]:
@@ -124,6 +134,19 @@ def _examine_metric(name: str, row: MetricRow) -> Iterator[Finding]:
     yield from examine_metric(row, lambda: build("metric", config, target=row.target))
 
 
+def _examine_wrapper(name: str, row: WrapperRow) -> Iterator[Finding]:
+    from framework.model import Predictor
+    from framework.testing.wrappers import Plain, examine_wrapper
+
+    def around(config: Mapping[str, Any], model: Callable[[], Predictor]) -> Any:
+        resolved = resolve("uncertainty", {"name": name, **config})
+        return build("uncertainty", resolved, model=model, target=row.target)
+
+    same = row.identity
+    identity = None if same is None else lambda model: around({**row.config, **same}, model)
+    yield from examine_wrapper(row, lambda: around(row.config, lambda: Plain(row.target)), identity)
+
+
 def _examine_renderer(name: str, row: RendererRow) -> Iterator[Finding]:
     from framework.testing.renderers import examine_renderer
 
@@ -134,6 +157,7 @@ def _examine_renderer(name: str, row: RendererRow) -> Iterator[Finding]:
 CONTRACTS: dict[str, Callable[[str, Any], Iterator[Finding]]] = {
     "density_head": _examine_head,
     "encoder": _examine_encoder,
+    "uncertainty": _examine_wrapper,
     "metric": _examine_metric,
     "renderer": _examine_renderer,
 }

@@ -12,6 +12,7 @@ from torch.distributions import Categorical, Distribution, MultivariateNormal, c
 from framework.density import circular, marginal, median, pick, take
 from framework.metric import Metric
 from framework.prediction import Prediction
+from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
 from framework.testing.rows import MetricRow
@@ -70,6 +71,17 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
     return Cardioid(take(density.location, index))
 
 
+def density_about(target: Target, place: Tensor) -> Distribution:
+    """The simplest density of the target's kind about a place (*batch, number); for classes their logits."""
+    if target.kind == "angle":
+        return Cardioid(place)
+    if target.kind == "real":
+        # MultivariateNormal, since Independent refuses empty batches
+        identity = torch.eye(place.shape[-1], dtype=place.dtype)
+        return MultivariateNormal(place, scale_tril=identity, validate_args=False)
+    return Categorical(logits=place, validate_args=False)
+
+
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
     """Every property of one metric on predictions of `row.target`."""
     whole = _predictions(row, SAMPLES)
@@ -101,23 +113,12 @@ def _predictions(row: MetricRow, count: int) -> Slices:
     logits = torch.randn(count, len(row.target.names), generator=generator)
 
     def some(index: Tensor) -> Prediction:
-        density: Distribution
-        if row.target.kind == "angle":
-            density = Cardioid(location[index])
-        elif row.target.kind == "real":
-            density = _normal(location[index])
-        else:
-            density = Categorical(logits=logits[index], validate_args=False)
+        about = logits[index] if row.target.kind == "class" else location[index]
+        density = density_about(row.target, about)
         batch = {"target": target[index], "index": index, "group": torch.zeros_like(index)}
         return Prediction(density, batch | {name: field[index] for name, field in fields.items()})
 
     return some
-
-
-def _normal(location: Tensor) -> Distribution:
-    # MultivariateNormal, since Independent refuses empty batches
-    identity = torch.eye(location.shape[-1])
-    return MultivariateNormal(location, scale_tril=identity, validate_args=False)
 
 
 def _after(build: Make, some: Slices, parts: list[Tensor]) -> dict[str, Tensor]:
@@ -206,13 +207,9 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
 
     def about(location: Tensor) -> dict[str, Tensor]:
         prediction = some(index)
-        if row.target.kind == "angle":
-            density: Distribution = Cardioid(location.float())
-        elif row.target.kind == "real":
-            density = _normal(location)
-        else:
-            logits = 3.0 * torch.nn.functional.one_hot(location, len(row.target.names)).float()
-            density = Categorical(logits=logits, validate_args=False)
+        if row.target.kind == "class":
+            location = 3.0 * torch.nn.functional.one_hot(location, len(row.target.names))
+        density = density_about(row.target, location.float())
         judged = build()
         judged.update(Prediction(density, prediction.batch))
         return judged.compute()

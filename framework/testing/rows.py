@@ -93,6 +93,26 @@ class MetricRow:
 
 
 @dataclass(frozen=True)
+class WrapperRow:
+    """One parametrisation of an uncertainty wrapper.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        target: what is predicted.
+        identity: parameters with which it must be the model it wraps, to the last bit ({"members": 1}); None where
+            there are none.
+        config, limits, leave_out: as in HeadRow.
+    """
+
+    name: str
+    target: Target
+    config: Mapping[str, Any] = field(default_factory=dict)
+    identity: Mapping[str, Any] | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class RendererRow:
     """One parametrisation of a renderer.
 

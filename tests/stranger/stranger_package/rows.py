@@ -5,7 +5,7 @@ import torch
 from scipy import stats
 
 from framework.target import Target
-from framework.testing.rows import Case, HeadRow
+from framework.testing.rows import Case, HeadRow, WrapperRow
 
 
 def cases(head):
@@ -18,9 +18,12 @@ def cases(head):
         yield Case(f"length {length:.3g}", raw, torch.from_numpy(value)[:, None], log_prob)
 
 
+AZIMUTH = Target("angle", ("azimuth",))
 ROWS = {
+    "committee": (WrapperRow("three", AZIMUTH, identity={"members": 1}),),
+    "averaged_committee": (WrapperRow("three", AZIMUTH, identity={"members": 1}),),
     "wrapped_cauchy": (
         HeadRow("one angle", Target("angle", ("azimuth",)), cases=cases),
         HeadRow("two angles", Target("angle", ("azimuth", "elevation")), {"largest": 0.9}),
-    )
+    ),
 }
