@@ -1,7 +1,7 @@
 """Runs the contract of any installed plugin by name: its rows, each property, one finding at a time."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -44,7 +44,10 @@ class Contract:
 
 
 def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> Contract:
-    """The contract of the plugin `name`; `config`, where it is not a row already, is a row of its own.
+    """The contract of the plugin `name`; `config`, where it is neither a row already nor the defaults, is one more.
+
+    Where the plugin ships rows, the further one is the first of them with other parameters: it keeps the target, and
+    what is left out, but no reference.
 
     Raises:
         ConfigError: no such plugin, a group without a contract, a config out of range, or no row fits.
@@ -54,10 +57,16 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
     if config is None:
         return Contract(group, name, shipped or _defaults(group, name, {}, "defaults"))
     chosen = resolve(group, {"name": name, **config})
-    if chosen in [resolve(group, {"name": name, **row.config}) for row in shipped]:
-        return Contract(group, name, shipped)
     plain = {key: value for key, value in chosen.items() if key != "name"}
-    return Contract(group, name, (*_defaults(group, name, plain, "as configured"), *shipped))
+    if not shipped:
+        return Contract(group, name, _defaults(group, name, plain, "as configured"))
+    known = [{}, *(row.config for row in shipped)]
+    if chosen in [resolve(group, {"name": name, **row}) for row in known]:
+        return Contract(group, name, shipped)
+    further = replace(shipped[0], name="as configured", config=plain)
+    if isinstance(further, HeadRow):
+        further = replace(further, cases=None)
+    return Contract(group, name, (further, *shipped))
 
 
 def _shipped(group: str, name: str) -> tuple[Row, ...]:
