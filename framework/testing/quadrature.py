@@ -9,7 +9,7 @@ from torch.distributions import Distribution
 
 from framework.density import Circular
 
-POINTS = {1: 1020, 2: 252, 3: 36}
+POINTS = {1: 1020, 2: 252, 3: 60}
 """Grid points a side by the number of angles; spectrally exact for densities that the grid resolves."""
 REAL_POINTS = {1: 1020, 2: 252, 3: 72}
 CELLS = {1: 12, 2: 12, 3: 6}

@@ -23,6 +23,16 @@ def test_the_loss_is_cross_entropy():
     torch.testing.assert_close(head("bernoulli", TWO).loss(raw, label), wanted)
 
 
+def test_large_logits_keep_digits_that_torchs_own_normalisation_loses():
+    logits = torch.tensor([-1e4, 1e4, 1e4, 1e4, 1e4])
+    wanted = -np.log(4)
+    ours = head("categorical", FIVE)(logits).log_prob(torch.tensor(1)).item()
+    assert ours == pytest.approx(wanted, rel=2e-7)
+    assert (
+        abs(torch.distributions.Categorical(logits=logits).log_prob(torch.tensor(1)).item() - wanted) > 1e-4
+    )
+
+
 def test_a_mixture_averages_probabilities_and_not_logits():
     raw = torch.tensor([[[8.0, 0.0], [0.0, 2.0]]])
     density = Mixture(torch.zeros(1, 2), head("categorical", TWO)(raw))

@@ -51,17 +51,14 @@ def stiff(head: DensityHead) -> Iterator[Case]:
 
 ROWS = {
     "mixture": (
-        HeadRow("five components", ONE, cases=stiff),
-        HeadRow("one component", ONE, {"components": 1}, cases=stiff),
+        HeadRow("five components", ONE, cases=stiff, scale=3.0),
+        HeadRow("one component", ONE, {"components": 1}, cases=stiff, scale=3.0),
         HeadRow("two angles", TWO, {"components": 3}, cases=stiff),
         HeadRow("mixture of mixtures", ONE, NESTED),
         HeadRow(
             "rotations",
             VIEWPOINT,
             {"components": 2, "component": {"name": "matrix_fisher"}},
-            limits={
-                "integral": 1e-3
-            },  # the grid of 36³ viewpoints resolves no more of components this narrow
             leave_out={
                 "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles"
             },

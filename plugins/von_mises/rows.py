@@ -13,6 +13,7 @@ from framework.testing.rows import Case, HeadRow
 from plugins.von_mises.head import LARGEST_CONCENTRATION
 
 ONE = Target("angle", ("azimuth",))
+TWO = Target("angle", ("azimuth", "elevation"))
 THREE = Target("angle", ("azimuth", "elevation", "tilt"))
 CONCENTRATIONS = (0.0, 1e-30, 1e-8, 1e-3, 0.5, 3.75, 10.0, 50.0, 1e3, 1e4, 1e6, 1e8, LARGEST_CONCENTRATION)
 OFFSETS = (0.0, 1e-8, 1e-3, 1.0, 3.0, -math.pi, 2 * math.pi, 1e6)
@@ -51,6 +52,8 @@ def fixed(head: DensityHead) -> Iterator[Case]:
 ROWS = {
     "von_mises": (
         HeadRow("one angle", ONE, cases=predicted),
+        HeadRow("narrow", ONE, scale=3.0),
+        HeadRow("two angles, narrow", TWO, {"floor": 0.5}, scale=3.0),
         HeadRow("three angles", THREE, cases=predicted),
         HeadRow("fixed concentration", ONE, {"concentration": "fixed"}, cases=fixed),
         HeadRow("least concentration 1", THREE, {"floor": 1.0}),
