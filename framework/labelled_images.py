@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework import images
+from framework import cache, images
 from framework.data import Batch
 from framework.errors import DataError
 from framework.fields import Fields
@@ -46,6 +46,25 @@ class Splits:
 
     def sizes(self) -> dict[str, str]:
         return {split: str(len(table)) for split, table in self.tables.items()}
+
+    def fingerprint(
+        self, root: str | None, generator_seed: int, version: str, test_blur: float
+    ) -> dict[str, str]:
+        """What tells one state of a data set from another; `root` None: generated."""
+        return {
+            "root": f"synthetic, seed {generator_seed}" if root is None else root,
+            "version": version,
+            **self.sizes(),
+            "test_blur": str(test_blur),
+            "sha256": self.digest,
+        }
+
+
+def remedy(root: str | None, name: str) -> str:
+    """What to do about unreadable images of the data set `name`, as a sentence; `root` None: generated."""
+    if root is None:
+        return f"Delete {cache.folder(name)}: the data are generated anew."
+    return "Restore them, or set data.skip_unreadable=true to leave them out."
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:

@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework import cache, images, labelled_images
+from framework import images, labelled_images
 from framework.data import Batch, Data
 from framework.generated import read_mark
 from framework.labelled_images import Labelled
@@ -73,16 +73,13 @@ class Caviar(Data):
             for split, found in read_labels(root / LABELS).items()
         }
         samples["validation"], samples["test"] = labelled_images.halves(samples["test"])
-        remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
-        if self.root is None:
-            remedy = f"Delete {cache.folder('caviar')}: the data are generated anew."
         self._splits = labelled_images.read_splits(
             samples,
             [],
             side=self.image_size,
             test_blur=self.test_blur,
             skip_unreadable=self.skip_unreadable,
-            remedy=remedy,
+            remedy=labelled_images.remedy(self.root, "caviar"),
         )
         self.skipped = self._splits.skipped
 
@@ -103,13 +100,8 @@ class Caviar(Data):
         return labelled_images.varied(batch, ("gaze",), (), self.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
-        return {
-            "root": f"synthetic, seed {self.generator_seed}" if self.root is None else self.root,
-            "version": f"generator {VERSION}" if self.synthetic else "CAVIARShoppingCenterFullOccl",
-            **self._splits.sizes(),
-            "test_blur": str(self.test_blur),
-            "sha256": self._splits.digest,
-        }
+        version = f"generator {VERSION}" if self.synthetic else "CAVIARShoppingCenterFullOccl"
+        return self._splits.fingerprint(self.root, self.generator_seed, version, self.test_blur)
 
     def picture(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)

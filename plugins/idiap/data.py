@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework import cache, images, labelled_images
+from framework import images, labelled_images
 from framework.data import Batch, Data
 from framework.generated import read_mark
 from framework.labelled_images import Labelled
@@ -81,16 +81,13 @@ class Idiap(Data):
             for split, found in labels.items()
         }
         samples["validation"], samples["test"] = labelled_images.halves(samples["test"])
-        remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
-        if self.root is None:
-            remedy = f"Delete {cache.folder('idiap')}: the data are generated anew."
         self._splits = labelled_images.read_splits(
             samples,
             [],
             side=self.image_size,
             test_blur=self.test_blur,
             skip_unreadable=self.skip_unreadable,
-            remedy=remedy,
+            remedy=labelled_images.remedy(self.root, "idiap"),
         )
         self.skipped = self._splits.skipped
 
@@ -111,13 +108,8 @@ class Idiap(Data):
         return labelled_images.varied(batch, self.angles, (), self.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
-        return {
-            "root": f"synthetic, seed {self.generator_seed}" if self.root is None else self.root,
-            "version": f"generator {VERSION}" if self.synthetic else "IHDPHeadPose",
-            **self._splits.sizes(),
-            "test_blur": str(self.test_blur),
-            "sha256": self._splits.digest,
-        }
+        version = f"generator {VERSION}" if self.synthetic else "IHDPHeadPose"
+        return self._splits.fingerprint(self.root, self.generator_seed, version, self.test_blur)
 
     def picture(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)

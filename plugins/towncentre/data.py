@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework import cache, images, labelled_images
+from framework import images, labelled_images
 from framework.data import Batch, Data
 from framework.generated import read_mark
 from framework.target import Target
@@ -68,16 +68,13 @@ class TownCentre(Data):
         self.groups = ("towncentre",)
         heads, self.invalid, faults = find_heads(root)
         self.synthetic = read_mark(root) is not None
-        remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
-        if self.root is None:
-            remedy = f"Delete {cache.folder('towncentre')}: the data are generated anew."
         self._splits = labelled_images.read_splits(
             by_person(heads),
             faults,
             side=self.image_size,
             test_blur=self.test_blur,
             skip_unreadable=self.skip_unreadable,
-            remedy=remedy,
+            remedy=labelled_images.remedy(self.root, "towncentre"),
             left_out=f", {self.invalid} marked as not valid",
         )
         self.skipped = self._splits.skipped
@@ -99,13 +96,8 @@ class TownCentre(Data):
         return labelled_images.varied(batch, ("pan",), ("pan",) if self.mirror else (), self.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
-        return {
-            "root": f"synthetic, seed {self.generator_seed}" if self.root is None else self.root,
-            "version": f"generator {VERSION}" if self.synthetic else "TownCentreHeadImages",
-            **self._splits.sizes(),
-            "test_blur": str(self.test_blur),
-            "sha256": self._splits.digest,
-        }
+        version = f"generator {VERSION}" if self.synthetic else "TownCentreHeadImages"
+        return self._splits.fingerprint(self.root, self.generator_seed, version, self.test_blur)
 
     def picture(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)
