@@ -39,7 +39,48 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     for group in ("encoder", "uncertainty", "objective", "metric"):
         chosen = config.get(group) or {}
         resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
+    outliers = config.get("outliers")
+    resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
+    require_outliers(resolved)
     return resolved
+
+
+def require_outliers(resolved: Resolved) -> None:
+    """Refuse metrics of outliers without outliers.
+
+    Raises:
+        ConfigError: a metric reads outliers and none are configured.
+    """
+    wanting = reading_outliers(resolved)
+    if wanting and not resolved.get("outliers"):
+        raise ConfigError(
+            f"metric {wanting[0]} compares the test split with outliers, but none are chosen. Name their data set, "
+            f"e.g. `data@outliers={resolved['data']['name']} outliers.<key>=...`, or leave this metric out."
+        )
+
+
+def reading_outliers(resolved: Resolved) -> list[str]:
+    """Names of the metrics that read predictions on outliers."""
+    return [part["name"] for part in resolved["metric"] if "outliers" in load("metric", part["name"]).splits]
+
+
+def build_outliers(resolved: Resolved, data: Data) -> Data | None:
+    """The data set of the outliers, prepared; None where no metric reads it.
+
+    Raises:
+        ConfigError: its inputs are not of the shape of `data`, which is prepared.
+        DataError: as `Data.prepare`.
+    """
+    if not reading_outliers(resolved):
+        return None
+    outliers: Data = build("data", resolved["outliers"])
+    outliers.prepare()
+    if outliers.input_shape != data.input_shape:
+        raise ConfigError(
+            f"outliers={resolved['outliers']['name']} has inputs of shape {outliers.input_shape}, the data "
+            f"{resolved['data']['name']} of shape {data.input_shape}; wanted one shape. Set the size of either."
+        )
+    return outliers
 
 
 def build_data(resolved: Resolved) -> Data:
@@ -98,6 +139,8 @@ def citations(resolved: Resolved) -> dict[str, str]:
     for group in GROUPS:
         for part in _items(resolved.get(group)):
             visit(group, part)
+    for part in _items(resolved.get("outliers")):
+        visit("data", part)
     return found
 
 

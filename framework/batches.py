@@ -130,6 +130,10 @@ class Batches(pl.LightningDataModule):
     def test_dataloader(self) -> DataLoader[Batch]:
         return self._loader(self.data.test(), seed=None, drop_last=False)
 
+    def of(self, dataset: Dataset[Batch]) -> DataLoader[Batch]:
+        """Batches of a dataset that is none of the four stages', in its own order."""
+        return self._loader(dataset, seed=None, drop_last=False)
+
     def predict_dataloader(self) -> DataLoader[Batch]:
         # Plain, since Lightning rebuilds a loader of predict to keep track of indices, and cannot ours.
         return DataLoader(

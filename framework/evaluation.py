@@ -11,7 +11,7 @@ from framework.cost import Cost, measure
 from framework.data import Batch
 from framework.metric import Metric
 from framework.model import Predictor
-from framework.prediction import Prediction
+from framework.prediction import Prediction, Split
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,8 @@ class Evaluation:
 
     total: dict[str, float]
     groups: dict[str, dict[str, float]]
+    metrics: list[Metric]
+    """Those over everything, as they stood at the end."""
 
 
 def on_device(batches: Iterable[Batch], device: torch.device) -> Iterator[Batch]:
@@ -38,8 +40,13 @@ def evaluate(
     samples: int,
     seed: int,
     device: torch.device,
+    outliers: Iterable[Batch] = (),
 ) -> Evaluation:
-    """Every metric over every batch; noise is a function of (seed, batch), so a second call gives the same bits."""
+    """Every metric over every batch; noise is a function of (seed, batch), so a second call gives the same bits.
+
+    Args:
+        outliers: of another data set; seen by the metrics that read them, in every group.
+    """
     predictor.eval().to(device)
     several = len(groups) > 1
     apart = {name: _fresh(metrics, device) for name in groups} if several else {}
@@ -51,17 +58,25 @@ def evaluate(
             rows = (batch["group"] == index).nonzero().flatten()
             if len(rows):
                 seed_step(seed, number, "test")
-                _update(apart[name], predictor, {key: value[rows] for key, value in batch.items()}, samples)
-    return Evaluation(_numbers(together), {name: _numbers(group) for name, group in apart.items()})
+                some = {key: value[rows] for key, value in batch.items()}
+                _update(apart[name], predictor, some, samples)
+    everyone = [metric for group in (together, *apart.values()) for metric in group]
+    for number, batch in enumerate(on_device(outliers, device)):
+        seed_step(seed, number, "outliers")
+        _update(everyone, predictor, batch, samples, "outliers")
+    return Evaluation(_numbers(together), {name: _numbers(group) for name, group in apart.items()}, together)
 
 
 def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
     return [cast(Metric, metric.clone().to(device)) for metric in metrics]
 
 
-def _update(metrics: Sequence[Metric], predictor: Predictor, batch: Batch, samples: int) -> None:
-    prediction = Prediction(predictor(batch["input"]), batch, samples)
-    for metric in metrics:
+def _update(
+    metrics: Sequence[Metric], predictor: Predictor, batch: Batch, samples: int, split: Split = "test"
+) -> None:
+    reading = [metric for metric in metrics if split in metric.splits]
+    prediction = Prediction(predictor(batch["input"]), batch, samples, split)
+    for metric in reading:
         metric.update(prediction)
 
 

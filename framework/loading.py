@@ -76,7 +76,7 @@ def checked(config: Mapping[str, Any]) -> Resolved:
         elif group in ("encoder", "density_head", "uncertainty"):
             resolved[group] = resolve(group, part)
         else:
-            resolved[group] = dict(part)
+            resolved[group] = None if part is None else dict(part)
     return resolved
 
 

@@ -1,12 +1,15 @@
 """The contract of a metric: predictions in, named numbers out."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torchmetrics
 from torch import Tensor
 
-from framework.prediction import Prediction
+from framework.prediction import Prediction, Split
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Metric(torchmetrics.Metric, ABC):
@@ -25,6 +28,9 @@ class Metric(torchmetrics.Metric, ABC):
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
     full_state_update = False
+    splits: ClassVar[tuple[Split, ...]] = ("test",)
+    """Whose predictions `update` is given. With "outliers" it also gets those on the test split of the config's
+    `outliers`, told apart by `prediction.split`; nothing is predicted on outliers that no metric reads."""
     columns: ClassVar[dict[str, str]]
     """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
     A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own."""
@@ -42,3 +48,15 @@ class Metric(torchmetrics.Metric, ABC):
 
         NaN where nothing was seen.
         """
+
+
+class Pictured(ABC):
+    """What a metric derives from as well when it has a picture to show."""
+
+    picture: ClassVar[str]
+    """Name of the picture's file, without a suffix."""
+
+    @abstractmethod
+    def figure(self, title: str, *, synthetic: bool) -> "Figure":
+        """The picture of what was seen, called after `compute`. The module that draws is imported in here, so that
+        a metric that is only computed loads no Matplotlib."""

@@ -27,6 +27,13 @@ class Predictor(nn.Module, ABC):
         """The training loss per sample, nats."""
 
     @abstractmethod
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        """What an objective may shape by gradient: batch_shape (batch,), or (batch, member) where several are trained.
+
+        A model's own density; of a wrapper, those of what it wraps, before anything is mixed or calibrated.
+        """
+
+    @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Fit what is not trained by gradient, on the validation set; called once after training."""
 
@@ -56,6 +63,9 @@ class Model(Predictor):
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         return self.head.loss(self.raw(inputs), target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self(inputs)
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
         """What the head reads."""

@@ -1,6 +1,7 @@
 """What a model predicted for one batch; whatever is derived from it is computed on first use, once."""
 
 from functools import cached_property
+from typing import Literal
 
 from torch import Tensor
 from torch.distributions import Distribution
@@ -8,6 +9,9 @@ from torch.distributions import Distribution
 from framework.data import Batch
 from framework.density import marginal, median
 from framework.monte_carlo import Estimate, estimate
+
+Split = Literal["test", "outliers"]
+"""Where inputs come from: the test split, or data that belongs to nothing the model was trained on."""
 
 
 class Prediction:
@@ -17,12 +21,16 @@ class Prediction:
         density: with batch_shape (batch,).
         batch: the fields of the batch, on the density's device.
         samples: draws for a point prediction that has no closed form (S of eq. 3.24).
+        split: where the batch comes from; the targets of outliers mean nothing.
     """
 
-    def __init__(self, density: Distribution, batch: Batch, samples: int = 1000) -> None:
+    def __init__(
+        self, density: Distribution, batch: Batch, samples: int = 1000, split: Split = "test"
+    ) -> None:
         self.density = density
         self.batch = batch
         self.samples = samples
+        self.split: Split = split
 
     @property
     def target(self) -> Tensor:
@@ -37,6 +45,11 @@ class Prediction:
     def estimate(self) -> Estimate:
         """The same with its Monte Carlo error and the samples it took; exact of most densities."""
         return estimate(self.density, self.target)
+
+    @cached_property
+    def entropy(self) -> Tensor:
+        """Of each density, (batch,), nats."""
+        return self.density.entropy()
 
     @cached_property
     def point(self) -> Tensor:

@@ -17,7 +17,7 @@ from framework.cost import Cost
 from framework.data import Batch, Data
 from framework.density import circular_entropy, circular_grid
 from framework.evaluation import Evaluation, cost, evaluate, on_device
-from framework.metric import Metric
+from framework.metric import Metric, Pictured
 from framework.model import Predictor
 from framework.prediction import Prediction
 from framework.run import Run
@@ -38,8 +38,13 @@ def report_test(
     metrics: Sequence[Metric],
     device: torch.device,
     console: Console,
+    outliers: Data | None = None,
 ) -> None:
-    """Test, measure the cost, print the table, write results.json and the pictures, tell the tracker."""
+    """Test, measure the cost, print the table, write results.json and the pictures, tell the tracker.
+
+    Args:
+        outliers: prepared, where a metric reads them.
+    """
     loader = batches.test_dataloader()
     settings = run.settings
     found = evaluate(
@@ -50,6 +55,7 @@ def report_test(
         samples=settings.samples,
         seed=settings.seed,
         device=device,
+        outliers=() if outliers is None else batches.of(outliers.test()),
     )
     spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
@@ -73,6 +79,10 @@ def report_test(
     run.tracker.log_artifact(path)
     if data.target.kind == "angle":
         picture(run, gallery(predictor, data, batches, device, settings.samples), "predicted_densities.png")
+    synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
+    for metric in found.metrics:
+        if isinstance(metric, Pictured):
+            picture(run, metric.figure(results["experiment"], synthetic=synthetic), f"{metric.picture}.png")
     rows = [
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),

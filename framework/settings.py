@@ -73,7 +73,7 @@ def settings(config: Mapping[str, Any]) -> Settings:
         ConfigError: `_target_` anywhere, an unknown key, or a value out of range.
     """
     forbid_targets(config)
-    own = {key: value for key, value in config.items() if key not in GROUPS}
+    own = {key: value for key, value in config.items() if key not in (*GROUPS, "outliers")}
     for key in ("optimizer", "logger"):
         model = {"optimizer": OptimizerSettings, "logger": LoggerSettings}[key]
         if isinstance(own.get(key), Mapping):

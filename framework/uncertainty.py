@@ -1,7 +1,7 @@
 """The contract of an uncertainty wrapper: a predictor in, a better calibrated predictor out."""
 
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 from jaxtyping import Float
@@ -24,6 +24,9 @@ class Uncertainty(Predictor):
     group: ClassVar[str] = "uncertainty"
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]]
+    """Attributes that trade error for run time and may be set at any time after training, with the values worth
+    trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
 
     @abstractmethod
     def forward(self, inputs: Tensor) -> Distribution:
@@ -32,6 +35,10 @@ class Uncertainty(Predictor):
     @abstractmethod
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """The training loss per sample, nats."""
+
+    @abstractmethod
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        """What an objective may shape by gradient: of what is wrapped, batch_shape (batch,) or (batch, member)."""
 
     @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from framework.assembly import build_data, build_metrics, citations
+from framework.assembly import build_data, build_metrics, build_outliers, citations, require_outliers
 from framework.batches import Batches
 from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
@@ -27,7 +27,8 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
         batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
         metrics = build_metrics(described["config"], data.target)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        report_test(run, predictor, data, batches, metrics, device, Console())
+        outliers = build_outliers(described["config"], data)
+        report_test(run, predictor, data, batches, metrics, device, Console(), outliers)
 
 
 def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str, Any]]:
@@ -54,6 +55,9 @@ def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str
         described["config"]["metric"] = [
             resolve("metric", part, f"metric.{key}") for key, part in chosen.items()
         ]
+    if run.values.get("outliers"):
+        described["config"]["outliers"] = resolve("data", run.values["outliers"], "outliers")
+    require_outliers(described["config"])
     data = build_data({"data": resolve("data", described["config"]["data"])})
     if not prepare:
         return predictor, data, described

@@ -17,6 +17,7 @@ from framework.assembly import (
     build_data,
     build_metrics,
     build_objectives,
+    build_outliers,
     build_predictor,
     citations,
     resolve_all,
@@ -60,6 +61,7 @@ def _run(run: Run) -> float:
     data = build_data(resolved)
     data.prepare()
     describe_data(run, data)
+    outliers = build_outliers(resolved, data)  # before training: a wrong root is said now
     record_citations(run, citations(resolved))
 
     predictor = build_predictor(resolved, data.target, data.input_shape, settings.seed)
@@ -85,7 +87,8 @@ def _run(run: Run) -> float:
     save_model(run.checkpoints / "model.ckpt", predictor, training.description)
     run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
     report_training(run, best_epoch=keep.best_epoch, synthetic=data.synthetic)
-    report_test(run, predictor, data, batches, build_metrics(resolved, data.target), device, console)
+    metrics = build_metrics(resolved, data.target)
+    report_test(run, predictor, data, batches, metrics, device, console, outliers)
     return keep.best_loss
 
 

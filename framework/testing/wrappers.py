@@ -27,13 +27,17 @@ class Plain(Predictor):
     def __init__(self, target: Target) -> None:
         super().__init__()
         self.target = target
+        self.dropout = nn.Dropout(0.1)  # for wrappers that need one
         self.layer = nn.Linear(LENGTH, len(target.names))
 
     def forward(self, inputs: Tensor) -> Distribution:
-        return density_about(self.target, self.layer(inputs))
+        return density_about(self.target, self.layer(self.dropout(inputs)))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return -self(inputs).log_prob(target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         pass

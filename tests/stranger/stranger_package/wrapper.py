@@ -1,7 +1,7 @@
 """An uncertainty wrapper that the framework does not ship."""
 
-from collections.abc import Callable, Iterable
-from typing import Annotated
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field
@@ -18,6 +18,7 @@ class Committee(Uncertainty):
     """Several copies, each trained on everything; their densities mixed with equal weights."""
 
     bibtex = ""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 3) -> None:
         super().__init__()
@@ -32,6 +33,9 @@ class Committee(Uncertainty):
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return torch.stack([member.loss(inputs, target) for member in self.members]).mean(0)
 
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self(inputs)
+
     def calibrate(self, batches: Iterable[Batch]) -> None:
         pass
 
@@ -40,6 +44,7 @@ class AveragedCommittee(Uncertainty):
     """The same with averaged directions, which is what the contract is against: of one member it is not the member."""
 
     bibtex = ""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 3) -> None:
         super().__init__()
@@ -52,6 +57,9 @@ class AveragedCommittee(Uncertainty):
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return torch.stack([member.loss(inputs, target) for member in self.members]).mean(0)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         pass
