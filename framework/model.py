@@ -76,3 +76,15 @@ class Model(Predictor):
         pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
         raws, targets = zip(*pairs, strict=True)
         self.head.calibrate(torch.cat(raws), torch.cat(targets))
+
+
+def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
+    """A penalty per sample from that of each member, (batch,) or (batch, member): members train as if alone.
+
+    Its value is the mean over members, so that it compares with that of one model; its gradient is that of the sum, so
+    that each member's own gradient is neither divided by their number nor changed by the others.
+    """
+    if values.dim() == 1:
+        return values
+    total = values.sum(-1)
+    return total + (values.mean(-1) - total).detach()
