@@ -24,6 +24,9 @@ class Encoder(nn.Module, ABC):
     group: ClassVar[str] = "encoder"
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
+    vectorises: bool = False
+    """Whether `torch.vmap` over its parameters computes several such encoders in one pass, to rounding, and faster than
+    one after the other: layers of matrix products without buffers. May be set by the constructor."""
     output_shape: tuple[int, ...]
     """Shape of the features of one sample; set by the constructor. The last encoder's is (length,)."""
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from framework.assembly import Resolved
 from framework.batches import Batches
 from framework.circular import angular_distance
 from framework.cost import Cost
@@ -33,6 +34,7 @@ PICTURED = 128
 def report_test(
     run: Run,
     predictor: Predictor,
+    resolved: Resolved,
     data: Data,
     batches: Batches,
     metrics: Sequence[Metric],
@@ -60,7 +62,7 @@ def report_test(
     spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
-    results = _results(run, data, found, spent, columns, better)
+    results = _results(run, resolved, data, found, spent, columns, better)
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
     step = 0
@@ -95,13 +97,18 @@ def report_test(
 
 
 def _results(
-    run: Run, data: Data, found: Evaluation, spent: Cost, columns: dict[str, str], better: Better
+    run: Run,
+    resolved: Resolved,
+    data: Data,
+    found: Evaluation,
+    spent: Cost,
+    columns: dict[str, str],
+    better: Better,
 ) -> dict[str, Any]:
-    values = run.values
-    head = values.get("density_head") or {}
     name = run.settings.experiment_name
-    method = name.rpartition("/")[2] if name else str(head.get("name", run.settings.checkpoint))
-    wrappers = [str(part["name"]) for part in (values.get("uncertainty") or {}).values()]
+    method = name.rpartition("/")[2] if name else str(resolved["density_head"]["name"])
+    # an experiment that is named for its wrapper need not say it twice
+    wrappers = [part["name"] for part in resolved["uncertainty"] if part["name"] not in method]
     return {
         "method": " + ".join([method, *wrappers]),
         "experiment": name or "no experiment",
@@ -124,7 +131,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def report_training(run: Run, *, best_epoch: int, synthetic: bool) -> None:
+def report_training(run: Run, *, kept_epoch: int, synthetic: bool) -> None:
     """The training curve, from the journal."""
     from framework.pictures import training_curve
 
@@ -141,7 +148,7 @@ def report_training(run: Run, *, best_epoch: int, synthetic: bool) -> None:
         [step / steps_per_epoch for step, _ in train],
         [loss for _, loss in train],
         validation,
-        best_epoch=best_epoch + 1,
+        best_epoch=kept_epoch + 1,
         title=run.settings.experiment_name or "training",
         synthetic=synthetic,
     )

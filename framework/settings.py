@@ -62,7 +62,7 @@ def store_experiment(config: Mapping[str, Any]) -> str:
     return str(logger.get("experiment") or (name.partition("/")[0] if name else "default"))
 
 
-TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps"}
+TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
 """Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
 
 
@@ -99,6 +99,10 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
             isinstance(value, bool) or not isinstance(value, kind) or not value >= least
         ):
             raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
+    if trainer.get("keep", "best") not in ("best", "last"):
+        raise ConfigError(
+            f"trainer.keep = {trainer['keep']!r}: wanted `best` (the weights of the lowest validation loss) or `last`."
+        )
 
 
 def check_trainer_keys(trainer: Mapping[str, Any], known: set[str]) -> None:

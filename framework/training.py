@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytorch_lightning as pl
 import torch
@@ -115,24 +115,34 @@ class Training(pl.LightningModule):
 
 
 class KeepCheckpoints(pl.Callback):
-    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and best.ckpt.
+    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, where it is to be kept, best.ckpt.
 
     `last` is saved at every epoch's end and every `every_steps` steps; `best` whenever the validation loss is lower
     than ever. Each write is whole or absent (framework.checkpoint).
+
+    Attributes:
+        kept_loss: validation loss of the weights that will be tested, nats.
+        kept_epoch: theirs, from 0.
     """
 
-    def __init__(self, folder: Path, every_steps: int | None) -> None:
+    def __init__(self, folder: Path, every_steps: int | None, keep: Literal["best", "last"] = "best") -> None:
         self.folder = folder
         self.every_steps = every_steps
-        self.best_loss = math.inf
-        self.best_epoch = -1
+        self.keep: Literal["best", "last"] = keep
+        self.kept_loss = math.inf
+        self.kept_epoch = -1
+
+    @property
+    def kept(self) -> Path:
+        """The checkpoint whose weights will be tested."""
+        return self.folder / f"{self.keep}.ckpt"
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best_loss": self.best_loss, "best_epoch": self.best_epoch}
+        return {"kept_loss": self.kept_loss, "kept_epoch": self.kept_epoch}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.best_loss = state_dict["best_loss"]
-        self.best_epoch = state_dict["best_epoch"]
+        self.kept_loss = state_dict["kept_loss"]
+        self.kept_epoch = state_dict["kept_epoch"]
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -145,9 +155,10 @@ class KeepCheckpoints(pl.Callback):
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         loss = float(trainer.callback_metrics["validation/loss"])
-        if loss < self.best_loss:
-            self.best_loss, self.best_epoch = loss, trainer.current_epoch
-            trainer.save_checkpoint(self.folder / "best.ckpt")
+        if self.keep == "last" or loss < self.kept_loss:
+            self.kept_loss, self.kept_epoch = loss, trainer.current_epoch
+            if self.keep == "best":
+                trainer.save_checkpoint(self.kept)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.save_last(trainer)

@@ -1,7 +1,7 @@
 """The contract of an uncertainty wrapper: a predictor in, a better calibrated predictor out."""
 
-from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 from jaxtyping import Float
@@ -24,7 +24,7 @@ class Uncertainty(Predictor):
     group: ClassVar[str] = "uncertainty"
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]]
+    knobs: Mapping[str, tuple[int, ...]]
     """Attributes that trade error for run time and may be set at any time after training, with the values worth
     trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
 
@@ -43,3 +43,11 @@ class Uncertainty(Predictor):
     @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate what is wrapped, then itself, on the validation set; called once after training."""
+
+
+class Joining(ABC):
+    """What a wrapper derives from as well when models that were trained apart can become its members (mode=combine)."""
+
+    @abstractmethod
+    def join(self, members: Sequence[Predictor]) -> None:
+        """Take over their weights, in order; each is built like what is wrapped."""

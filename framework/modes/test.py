@@ -28,7 +28,8 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
         metrics = build_metrics(described["config"], data.target)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         outliers = build_outliers(described["config"], data)
-        report_test(run, predictor, data, batches, metrics, device, Console(), outliers)
+        config = described["config"]
+        report_test(run, predictor, config, data, batches, metrics, device, Console(), outliers)
 
 
 def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str, Any]]:
@@ -48,6 +49,17 @@ def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str
             f"mode={run.values['mode']['name']} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
         )
     predictor, described = load_with_description(settings.checkpoint, uri=settings.logger.uri)
+    return predictor, data_for(run, described, settings.checkpoint, prepare=prepare), described
+
+
+def data_for(run: Run, described: dict[str, Any], source: str, *, prepare: bool = True) -> Data:
+    """The data to test a stored model on; what the command line says of data, outliers and metrics goes into
+    `described`.
+
+    Raises:
+        ConfigError: a metric wants outliers and there are none.
+        CheckpointError: the data does not fit the model of `source`.
+    """
     if run.values.get("data"):
         described["config"]["data"] = resolve("data", run.values["data"])
     if run.values.get("metric"):
@@ -60,7 +72,7 @@ def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str
     require_outliers(described["config"])
     data = build_data({"data": resolve("data", described["config"]["data"])})
     if not prepare:
-        return predictor, data, described
+        return data
     data.prepare()
     describe_data(run, data)
     wanted = (
@@ -71,7 +83,7 @@ def loaded(run: Run, *, prepare: bool = True) -> tuple[Predictor, Data, dict[str
     found = (data.input_shape, data.target.kind, data.target.names)
     if wanted != found:
         raise CheckpointError(
-            f"{settings.checkpoint} reads inputs of shape {wanted[0]} and predicts {wanted[1]} {wanted[2]}, but the "
+            f"{source} reads inputs of shape {wanted[0]} and predicts {wanted[1]} {wanted[2]}, but the "
             f"data has inputs of shape {found[0]} and targets {found[1]} {found[2]}. Give the data it was trained on."
         )
-    return predictor, data, described
+    return data

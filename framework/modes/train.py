@@ -40,7 +40,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> float:
-    """Returns the best validation loss, nats: what a sweeper minimises."""
+    """Returns the validation loss of the kept weights, nats: what a sweeper minimises."""
     with opened(folder, values, settings, overrides) as run:
         loss = _run(run)
     if (folder / RECORD).is_file():  # this is a job of a sweep
@@ -74,22 +74,25 @@ def _run(run: Run) -> float:
         description(resolved, data),
     )
     batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
-    keep = KeepCheckpoints(run.checkpoints, settings.trainer.get("checkpoint_every_steps"))
+    keep = KeepCheckpoints(
+        run.checkpoints,
+        settings.trainer.get("checkpoint_every_steps"),
+        settings.trainer.get("keep") or "best",
+    )
     trainer = _trainer(run, keep)
     _fit(run, training, batches, trainer, console)
 
     device = trainer.strategy.root_device
-    best = run.checkpoints / "best.ckpt"
-    fill(predictor, weights(read(best)), str(best))
+    fill(predictor, weights(read(keep.kept)), str(keep.kept))
     predictor.eval().to(device)
     seed_step(settings.seed, 0, "calibrate")
     predictor.calibrate(on_device(batches.val_dataloader(), device))
     save_model(run.checkpoints / "model.ckpt", predictor, training.description)
     run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
-    report_training(run, best_epoch=keep.best_epoch, synthetic=data.synthetic)
+    report_training(run, kept_epoch=keep.kept_epoch, synthetic=data.synthetic)
     metrics = build_metrics(resolved, data.target)
-    report_test(run, predictor, data, batches, metrics, device, console, outliers)
-    return keep.best_loss
+    report_test(run, predictor, resolved, data, batches, metrics, device, console, outliers)
+    return keep.kept_loss
 
 
 def _fit(run: Run, training: Training, batches: Batches, trainer: pl.Trainer, console: Console) -> None:

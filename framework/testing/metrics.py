@@ -11,7 +11,7 @@ from torch.distributions import Categorical, Distribution, MultivariateNormal, c
 
 from framework.density import circular, marginal, median, pick, take
 from framework.metric import Metric
-from framework.prediction import Prediction
+from framework.prediction import Prediction, Split
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
@@ -22,12 +22,18 @@ SAMPLES = 24
 
 
 class Cardioid(Distribution):
-    """(1 + cos(φ - μ)) / 2π for each angle (Mardia & Jupp 2000, §3.5.5): the simplest density on the circle."""
+    """(1 + 2ρ cos(φ - μ)) / 2π for each angle (Mardia & Jupp 2000, §3.5.5): the simplest density on the circle.
+
+    Args:
+        location: μ, (*batch, angle), radians.
+        strength: 2ρ in (0, 1], (*batch); 1 everywhere by default, the narrowest.
+    """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
-    def __init__(self, location: Tensor) -> None:
+    def __init__(self, location: Tensor, strength: Tensor | None = None) -> None:
         self.location = location
+        self.strength = torch.ones_like(location[..., 0]) if strength is None else strength.to(location)
         super().__init__(location.shape[:-1], location.shape[-1:], validate_args=False)
 
     @property
@@ -41,24 +47,30 @@ class Cardioid(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         # 1 + cos d = 2 cos²(d/2); kept off its zero, where no metric could compare anything
         near = 2 * torch.cos((value - self.location) / 2).square()
+        weight = self.strength.unsqueeze(-1)
+        near = 1 - weight + weight * near
         return (near.clamp(min=1e-12).log() - math.log(2 * math.pi)).sum(-1)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = self._extended_shape(torch.Size(sample_shape))
-        # with t = tan(θ/2) the density is ∝ 1/(1+t²)²: √3 t is Student's with 3 degrees of freedom
+        # with t = tan(θ/2) the density of strength 1 is ∝ 1/(1+t²)²: √3 t is Student's with 3 degrees of freedom
         normal = torch.randn(4, *shape, dtype=self.location.dtype)
-        return self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
+        found = self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
+        if (self.strength == 1).all():
+            return found
+        # 1 + s cos d = s (1 + cos d) + (1 - s): that density, or else the uniform one
+        anywhere = 2 * math.pi * torch.rand(shape, dtype=self.location.dtype)
+        return torch.where(torch.rand(shape) < self.strength.unsqueeze(-1), found, anywhere)
 
     def entropy(self) -> Tensor:
-        # -∫ p log p = log 4π - 1 each (quadrature: 1.5310)
-        return torch.full(self.batch_shape, self.event_shape[0] * (math.log(4 * math.pi) - 1)).to(
-            self.location
-        )
+        # log 2π - (1/2π) ∫ (1 + s cos d) log(1 + s cos d) = log 4π - 1 + r - log(1 + r) with r = √(1 - s²)
+        root = (1 - self.strength.square()).sqrt()
+        return self.event_shape[0] * (math.log(4 * math.pi) - 1 + root - torch.log1p(root))
 
 
 @marginal.register
 def _(density: Cardioid, index: int) -> Cardioid:
-    return Cardioid(density.location[..., index : index + 1])
+    return Cardioid(density.location[..., index : index + 1], density.strength)
 
 
 @median.register
@@ -71,15 +83,21 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
     return Cardioid(take(density.location, index))
 
 
-def density_about(target: Target, place: Tensor) -> Distribution:
-    """The simplest density of the target's kind about a place (*batch, number); for classes their logits."""
+def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) -> Distribution:
+    """The simplest density of the target's kind about a place (*batch, number); for classes their logits.
+
+    Args:
+        breadth: 1 or more, (*batch): how many times as broad; classes as much less sure.
+    """
     if target.kind == "angle":
-        return Cardioid(place)
+        return Cardioid(place, None if breadth is None else 1 / breadth)
     if target.kind == "real":
         # MultivariateNormal, since Independent refuses empty batches
-        identity = torch.eye(place.shape[-1], dtype=place.dtype)
-        return MultivariateNormal(place, scale_tril=identity, validate_args=False)
-    return Categorical(logits=place, validate_args=False)
+        scale = torch.eye(place.shape[-1], dtype=place.dtype)
+        if breadth is not None:
+            scale = scale * breadth[..., None, None].to(place)
+        return MultivariateNormal(place, scale_tril=scale, validate_args=False)
+    return Categorical(logits=place if breadth is None else place / breadth.unsqueeze(-1), validate_args=False)
 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
@@ -99,11 +117,12 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
             yield examined(name, row.limits.get(name, limit), check)
 
 
-Slices = Callable[[Tensor], Prediction]
+Slices = Callable[[Tensor, Split], Prediction]
 
 
 def _predictions(row: MetricRow, count: int) -> Slices:
-    """Indices → the prediction of those samples of one fixed set."""
+    """Indices and split → the prediction of those samples of one fixed set; as outliers they have other densities, most
+    of them broader."""
     target = values(row.target, (count,))
     fields = {name: make(count) for name, make in row.fields.items()}
     generator = torch.Generator().manual_seed(SEED)
@@ -111,21 +130,35 @@ def _predictions(row: MetricRow, count: int) -> Slices:
         torch.randn(target.shape, generator=generator) if row.target.kind != "class" else torch.zeros(())
     )
     logits = torch.randn(count, len(row.target.names), generator=generator)
+    breadth = 1 + 2 * torch.rand(count, generator=generator)
 
-    def some(index: Tensor) -> Prediction:
-        about = logits[index] if row.target.kind == "class" else location[index]
-        density = density_about(row.target, about)
+    def some(index: Tensor, split: Split) -> Prediction:
+        if split == "outliers":
+            # the densities of others, so that no two of one index are about the same place
+            other = (index + 1) % count
+            about = logits[other] if row.target.kind == "class" else location[other]
+            density = density_about(row.target, about, breadth[index])
+        else:
+            about = logits[index] if row.target.kind == "class" else location[index]
+            density = density_about(row.target, about)
         batch = {"target": target[index], "index": index, "group": torch.zeros_like(index)}
-        return Prediction(density, batch | {name: field[index] for name, field in fields.items()})
+        batch |= {name: field[index] for name, field in fields.items()}
+        return Prediction(density, batch, split=split)
 
     return some
+
+
+def _feed(metric: Metric, some: Slices, part: Tensor) -> None:
+    """These samples of every split that the metric reads."""
+    for split in metric.splits:
+        metric.update(some(part, split))
 
 
 def _after(build: Make, some: Slices, parts: list[Tensor]) -> dict[str, Tensor]:
     metric = build()
     torch.manual_seed(SEED)
     for part in parts:
-        metric.update(some(part))
+        _feed(metric, some, part)
     return metric.compute()
 
 
@@ -182,8 +215,8 @@ def _order(build: Make, some: Slices, worst: Worst) -> None:
 def _merge(build: Make, some: Slices, worst: Worst) -> None:
     """What two processes saw, merged as torchmetrics merges them."""
     first, second = build(), build()
-    first.update(some(torch.arange(10)))
-    second.update(some(torch.arange(10, SAMPLES)))
+    _feed(first, some, torch.arange(10))
+    _feed(second, some, torch.arange(10, SAMPLES))
     first.merge_state(second)
     _compare("two halves merged", first.compute(), _after(build, some, [torch.arange(SAMPLES)]), worst)
 
@@ -191,32 +224,37 @@ def _merge(build: Make, some: Slices, worst: Worst) -> None:
 def _reset(build: Make, some: Slices, worst: Worst) -> None:
     index = torch.arange(SAMPLES)
     metric = build()
-    metric.update(some(index[:5]))
+    _feed(metric, some, index[:5])
     metric.reset()
-    metric.update(some(index))
+    _feed(metric, some, index)
     wanted = _after(build, some, [index])
     _compare("after a reset", metric.compute(), wanted, worst)
     _compare("of a copy", copy.deepcopy(metric).compute(), wanted, worst)
 
 
 def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
-    """A density about the target is judged better, in every column that has a better way, than one about elsewhere."""
+    """A density about the target is judged better, in every column that has a better way, than one about elsewhere.
+
+    A metric that reads outliers sees them broader beside the former, and as narrow as the test samples beside the other.
+    """
     metric = build()
     some = _predictions(row, SAMPLES)
     index = torch.arange(SAMPLES)
+    breadth = torch.full((SAMPLES,), 2.0)
 
-    def about(location: Tensor) -> dict[str, Tensor]:
-        prediction = some(index)
+    def about(location: Tensor, outliers: Tensor | None) -> dict[str, Tensor]:
+        batch = some(index, "test").batch
         if row.target.kind == "class":
             location = 3.0 * torch.nn.functional.one_hot(location, len(row.target.names))
-        density = density_about(row.target, location.float())
         judged = build()
-        judged.update(Prediction(density, prediction.batch))
+        for split in judged.splits:
+            density = density_about(row.target, location.float(), outliers if split == "outliers" else None)
+            judged.update(Prediction(density, batch, split=split))
         return judged.compute()
 
-    target = some(index).target
+    target = some(index, "test").target
     elsewhere = (target + 1) % len(row.target.names) if row.target.kind == "class" else target + 2.0
-    good, bad = about(target), about(elsewhere)
+    good, bad = about(target, breadth), about(elsewhere, None)
     worst.count(False, "no column has a better way")
     for key, way in metric.better.items():
         ahead = good[key] - bad[key] if way == "higher" else bad[key] - good[key]

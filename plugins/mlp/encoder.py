@@ -61,6 +61,7 @@ class MLP(Encoder):
             layers += [nn.ReLU(inplace=True), nn.Dropout(dropout)]
             length = width
         self.layers = nn.Sequential(*layers)
+        self.vectorises = not batch_norm  # whose running moments are buffers
         self.output_shape = (length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:

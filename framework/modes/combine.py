@@ -1,0 +1,140 @@
+"""mode=combine: models that were trained apart become the members of one wrapper, which is calibrated and tested."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ConfigDict
+from rich.console import Console
+
+from framework.assembly import build_metrics, build_outliers, build_predictor, citations
+from framework.batches import Batches, seed_step
+from framework.data import Data
+from framework.errors import CheckpointError, ConfigError
+from framework.evaluation import on_device
+from framework.loading import description, load_with_description
+from framework.model import Predictor
+from framework.modes.test import data_for
+from framework.modes.train import quiet, record_citations, save_model
+from framework.report import report_test
+from framework.run import Run, opened
+from framework.schema import check, resolve
+from framework.settings import Settings
+from framework.uncertainty import Joining
+
+
+class _Options(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    members: str | list[str]
+    wrapper: str
+
+
+def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+    """Write checkpoints/model.ckpt, which every other mode takes; print its table row."""
+    with opened(folder, values, settings, overrides) as run:
+        _run(run, _Options.model_validate(check(_Options, values["mode"], "mode")))
+
+
+def _run(run: Run, options: _Options) -> None:
+    settings, console = run.settings, Console()
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    quiet()
+    sources = found(options.members)
+    members = [load_with_description(source, uri=settings.logger.uri) for source in sources]
+    described = common([described for _, described in members])
+    config = described["config"]
+    data = data_for(run, described, str(sources[0]))
+    config["uncertainty"] = [
+        *config["uncertainty"],
+        resolve("uncertainty", {"name": options.wrapper, "members": len(members)}, "mode.wrapper"),
+        *(
+            resolve("uncertainty", part, f"uncertainty.{key}")
+            for key, part in (run.values.get("uncertainty") or {}).items()
+        ),
+    ]
+    outliers = build_outliers(config, data)
+    record_citations(run, citations(config))
+    predictor = joined(config, data, [member for member, _ in members], options.wrapper)
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    predictor.eval().to(device)
+    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
+    seed_step(settings.seed, 0, "calibrate")
+    predictor.calibrate(on_device(batches.val_dataloader(), device))
+    run.checkpoints.mkdir(parents=True, exist_ok=True)
+    save_model(run.checkpoints / "model.ckpt", predictor, description(config, data))
+    run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
+    console.print(f"{len(members)} members: {', '.join(map(str, sources))}", soft_wrap=True)
+    metrics = build_metrics(config, data.target)
+    report_test(run, predictor, config, data, batches, metrics, device, console, outliers)
+
+
+def found(members: str | Sequence[str]) -> list[str | Path]:
+    """Run folders, files or MLflow run ids; of a folder of runs those that hold a trained model, by name.
+
+    Raises:
+        ConfigError: fewer than two.
+    """
+    if not isinstance(members, str):
+        listed: list[str | Path] = list(members)
+    else:
+        folder = Path(members).expanduser()
+        runs = sorted(folder.glob("*/checkpoints/model.ckpt"), key=_by_number)
+        listed = [path.parent.parent for path in runs]
+    if len(listed) < 2:
+        raise ConfigError(
+            f"mode.members = {members!r} gives {len(listed)} trained models; wanted at least two: the folder of "
+            "a sweep (outputs/sweeps/<time>), or a list of run folders, checkpoint files or MLflow run ids."
+        )
+    return listed
+
+
+def _by_number(path: Path) -> tuple[int, str]:
+    """Job 2 before job 10."""
+    name = path.parent.parent.name
+    return len(name), name
+
+
+def common(members: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What all members say of themselves.
+
+    Raises:
+        CheckpointError: two of them are models of different kinds; says in what.
+    """
+    first = members[0]
+    for other in members[1:]:
+        for key in ("density_head", "encoder", "uncertainty", "data"):
+            if other["config"][key] != first["config"][key]:
+                raise CheckpointError(
+                    f"{other['path']} and {first['path']} differ in {key}: {other['config'][key]} and "
+                    f"{first['config'][key]}. Members must be alike but for their seed; "
+                    "name those that are one by one in mode.members."
+                )
+        for key in ("target", "input_shape"):
+            if other[key] != first[key]:
+                raise CheckpointError(
+                    f"{other['path']} and {first['path']} differ in {key}: {other[key]} and {first[key]}. "
+                    "Members must have been trained on the same data."
+                )
+    return first
+
+
+def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wrapper: str) -> Predictor:
+    """The predictor of `config` around the members.
+
+    Raises:
+        ConfigError: the wrapper cannot take members that were trained apart.
+    """
+    predictor = build_predictor(config, data.target, data.input_shape, seed=0)
+    joining = next((module for module in predictor.modules() if isinstance(module, Joining)), None)
+    if joining is None:
+        raise ConfigError(
+            f"mode.wrapper={wrapper} has no members that could have been trained apart. Give one that has, such as "
+            "`ensemble`."
+        )
+    joining.join(members)
+    return predictor

@@ -1,0 +1,56 @@
+"""Networks of one architecture side by side: their parameters stacked, all computed in one pass."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.func import functional_call, vmap
+
+
+class SideBySide(nn.Module):
+    """T networks as one: each parameter has the members as its first dimension, each layer is one batched product.
+
+    An optimiser that works element by element (SGD, Adam and their like) moves every member as it would alone.
+
+    Args:
+        networks: of one architecture, without buffers; their parameters are copied.
+    """
+
+    _template: ClassVar[nn.Module]
+
+    def __init__(self, networks: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.count = len(networks)
+        self.stacked = copy.deepcopy(networks[0])
+        for name, parameter in self.stacked.named_parameters():
+            parts = [network.get_parameter(name).detach() for network in networks]
+            parameter.data = torch.stack(parts)
+        # not a submodule: it only says what to compute, and its own parameters are never read
+        self.__dict__["_template"] = copy.deepcopy(networks[0])
+
+    def forward(self, inputs: Tensor, used: int | None = None) -> Float[Tensor, "batch member size"]:
+        """What each of the first `used` members (all by default) makes of the inputs; each has dropout of its own."""
+        template = self._template.train(self.training)
+        parameters: dict[str, Tensor] = {**dict(self.stacked.named_parameters())}
+        if used is not None and used < self.count:
+            parameters = {name: parameter[:used] for name, parameter in parameters.items()}
+
+        def one(mine: dict[str, Tensor], given: Tensor) -> Tensor:
+            return functional_call(template, mine, (given,))
+
+        return vmap(one, in_dims=(0, None), out_dims=1, randomness="different")(parameters, inputs)
+
+    @torch.no_grad()
+    def write(self, index: int, parameters: Mapping[str, Tensor]) -> None:
+        """Give member `index` these parameters."""
+        for name, parameter in self.stacked.named_parameters():
+            parameter[index] = parameters[name]
+
+    def read(self, index: int) -> dict[str, Tensor]:
+        """A copy of the parameters of member `index`."""
+        return {
+            name: parameter[index].detach().clone() for name, parameter in self.stacked.named_parameters()
+        }
