@@ -116,6 +116,8 @@ def sentence(error: BaseException) -> str | None:
         options = [str(option) for option in error.options or ()] or _options(group)
         available = f" Available in {group}: {', '.join(options)}." if options else ""
         return f"No configuration {wanted!r}.{did_you_mean(name, options)}{available}"
+    if isinstance(error, ValueError) and "Config group override must be" in str(error):
+        return "A group cannot be set to null. Take it out with `~`, e.g. `~data@outliers` or `~density_head`."
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, OmegaConfBaseException):
         cause = cause.__cause__ or cause.__context__

@@ -81,6 +81,9 @@ def report_test(
     run.tracker.log_artifact(path)
     if data.target.kind == "angle":
         picture(run, gallery(predictor, data, batches, device, settings.samples), "predicted_densities.png")
+    if data.target.kind == "class" and data.input_shape == (2,):
+        figure = landscape(predictor, data, outliers, device, results["method"])
+        picture(run, figure, "landscape.png")
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
     for metric in found.metrics:
         if isinstance(metric, Pictured):
@@ -206,6 +209,32 @@ def gallery(
         title=f"{', '.join(data.groups)}: predicted density of the {data.target.names[0]}",
         synthetic=data.synthetic,
     )
+
+
+def landscape(
+    predictor: Predictor, data: Data, outliers: Data | None, device: torch.device, caption: str
+) -> "Figure":
+    """The probabilities of a classifier of two inputs over their plane, with test samples and outliers."""
+    from framework.landscape_picture import Plane, half_width, landscapes, probabilities
+
+    points, labels = _points_of(data)
+    others = _points_of(outliers)[0] if outliers is not None else points[:0]
+    plane = Plane(points, labels, others, data.target.names, half_width(points, others))
+    return landscapes(
+        {caption: probabilities(predictor.cpu(), plane.half_width)},
+        plane,
+        title=f"{', '.join(data.groups)}: probability landscape",
+        synthetic=data.synthetic,
+    )
+
+
+def _points_of(data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and targets of the first PICTURED test samples."""
+    dataset = data.test()
+    count = min(PICTURED, len(dataset))  # type: ignore[arg-type]
+    items = [dataset[index] for index in range(count)]
+    inputs = torch.stack([item["input"] for item in items]).numpy()
+    return inputs, torch.stack([item["target"] for item in items]).numpy()
 
 
 def _caption(entropy: float, error: float, symmetry: int) -> str:

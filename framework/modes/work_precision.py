@@ -1,4 +1,4 @@
-"""mode=work_precision: error against run time along a declared knob of a trained head."""
+"""mode=work_precision: error against run time along a declared knob of a trained model."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -8,16 +8,20 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
+from framework.assembly import build_metrics
 from framework.batches import Batches
-from framework.errors import ConfigError
+from framework.data import Batch, Data
+from framework.density_head import DensityHead
+from framework.errors import ConfigError, did_you_mean
 from framework.evaluation import on_device
-from framework.model import Model
+from framework.model import Model, Predictor
 from framework.modes.test import loaded
 from framework.report import picture
 from framework.run import Run, opened
 from framework.schema import check
 from framework.settings import Positive, Settings
 from framework.table import results_table
+from framework.uncertainty import Uncertainty
 from framework.work_precision import COLUMNS, rows, work_precision, write
 
 
@@ -30,6 +34,7 @@ class _Options(BaseModel):
     repeats: Annotated[int, Field(ge=2)] = 5
     reference: Positive = 10_000
     limit: Positive = 200
+    metrics: list[str] | None = None
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
@@ -42,20 +47,15 @@ def _run(run: Run, options: _Options) -> None:
     from framework import pictures
 
     predictor, data, described = loaded(run)
-    if not isinstance(predictor, Model):
-        raise ConfigError("mode=work_precision wants a model without an uncertainty wrapper around it.")
+    if options.metrics is not None or not isinstance(predictor, Model):
+        _metrics_against_time(run, options, predictor, data, described)
+        return
     knobs = predictor.head.knobs
     knob = options.knob or next(iter(knobs), "")
     settings = run.settings
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     predictor.to(device)
-    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
-    kept, seen = [], 0
-    for batch in on_device(batches.test_dataloader(), device):
-        kept.append({name: tensor[: options.limit - seen] for name, tensor in batch.items()})
-        seen += len(kept[-1]["index"])
-        if seen >= options.limit:
-            break
+    kept = _kept(run, data, device, options.limit)
     curve = work_precision(
         predictor,
         kept,
@@ -87,4 +87,78 @@ def _run(run: Run, options: _Options) -> None:
             rows({name: curve}, synthetic=data.synthetic), COLUMNS, title=f"{name}: {curve.samples} samples"
         )
     )
+    console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)
+
+
+def _kept(run: Run, data: Data, device: torch.device, limit: int) -> list[Batch]:
+    """The first `limit` test samples, in batches."""
+    settings = run.settings
+    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
+    kept, seen = [], 0
+    for batch in on_device(batches.test_dataloader(), device):
+        kept.append({name: tensor[: limit - seen] for name, tensor in batch.items()})
+        seen += len(kept[-1]["index"])
+        if seen >= limit:
+            break
+    return kept
+
+
+def _metrics_against_time(
+    run: Run, options: _Options, predictor: Predictor, data: Data, described: dict[str, Any]
+) -> None:
+    """The metrics of the test split themselves, where there is no reference to be off from: of wrappers, say."""
+    from framework import tradeoff, tradeoff_picture
+
+    config = described["config"]
+    metrics = [metric for metric in build_metrics(config, data.target) if "outliers" not in metric.splits]
+    headings = {key: heading for metric in metrics for key, heading in metric.columns.items()}
+    lower = {key: way == "lower" for metric in metrics for key, way in metric.better.items()}
+    keys = options.metrics or [key for key in headings if key in lower]
+    for key in keys:
+        if key not in lower:
+            raise ConfigError(
+                f"mode.metrics: no metric gives {key!r} and says which way it is better.{did_you_mean(key, lower)} "
+                f"There are: {', '.join(lower) or 'none; choose some with metric=[...]'}."
+            )
+    parts = [part for part in predictor.modules() if isinstance(part, Uncertainty | DensityHead)]
+    knob = options.knob or next((name for part in parts for name in part.knobs), "")
+    values = options.values or tradeoff.owners(predictor, knob)[0].knobs[knob]
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    predictor.to(device)
+    turns = tradeoff.tradeoff(
+        predictor,
+        _kept(run, data, device, options.limit),
+        metrics,
+        knob=knob,
+        values=values,
+        samples=run.settings.samples,
+        seed=run.settings.seed,
+        repeats=options.repeats,
+    )
+    name = " + ".join([config["density_head"]["name"], *(part["name"] for part in config["uncertainty"])])
+    found = tradeoff.rows({name: turns}, keys, lower, synthetic=data.synthetic)
+    path = run.folder / "work_precision.csv"
+    tradeoff.write(found, path)
+    run.tracker.log_artifact(path)
+    for turn in turns:
+        numbers = {**{key: turn.metrics[key] for key in keys}, "milliseconds": turn.milliseconds}
+        run.tracker.log_metrics(
+            {f"work_precision/{key}": value for key, value in numbers.items()}, turn.value, 0
+        )
+    figure = tradeoff_picture.tradeoff(
+        {name: turns},
+        {key: headings[key] for key in keys},
+        title=f"{name} on {', '.join(data.groups)}: metrics against run time along {knob}",
+        synthetic=data.synthetic,
+        note=tradeoff.device_note(predictor),
+    )
+    where = picture(run, figure, "work_precision.png")
+    console = Console()
+    columns = {
+        "method": "method",
+        "value": knob,
+        **{key: headings[key] for key in keys},
+        "milliseconds_per_sample": "ms / sample",
+    }
+    console.print(results_table(found, columns, title=f"{name}: {options.limit} samples at most"))
     console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)

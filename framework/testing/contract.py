@@ -11,9 +11,9 @@ from framework.registry import load
 from framework.schema import build, resolve
 from framework.target import Target
 from framework.testing.finding import Finding
-from framework.testing.rows import EncoderRow, HeadRow, MetricRow, RendererRow, WrapperRow
+from framework.testing.rows import EncoderRow, HeadRow, MetricRow, ObjectiveRow, RendererRow, WrapperRow
 
-Row = HeadRow | EncoderRow | MetricRow | RendererRow | WrapperRow
+Row = HeadRow | EncoderRow | MetricRow | ObjectiveRow | RendererRow | WrapperRow
 TARGETS = (
     Target("angle", ("azimuth",)),
     Target("angle", ("azimuth", "elevation", "tilt")),
@@ -21,6 +21,12 @@ TARGETS = (
     Target("real", ("x", "y")),
     Target("class", ("first", "second", "third")),
 )
+ROW_OF = {
+    "density_head": HeadRow,
+    "metric": MetricRow,
+    "objective": ObjectiveRow,
+    "uncertainty": WrapperRow,
+}
 SHAPES = ((3, 64, 64), (1, 96, 80), (16,))
 """What a plugin without rows is tried with; it may refuse some, with a ConfigError."""
 
@@ -88,7 +94,7 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
         try:
             if isinstance(option, Target):
                 _tried(group, resolved, option)
-                row = {"density_head": HeadRow, "metric": MetricRow, "uncertainty": WrapperRow}[group]
+                row = ROW_OF[group]
                 found.append(row(f"{label}, {len(option.names)} of kind {option.kind}", option, config))
             else:
                 build(group, resolved, input_shape=option)
@@ -109,6 +115,8 @@ def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
         from framework.testing.wrappers import Plain
 
         build(group, resolved, model=lambda: Plain(target), target=target)
+    elif group == "objective":
+        build(group, resolved)
     else:
         build(group, resolved, target=target)
 
@@ -156,6 +164,16 @@ def _examine_wrapper(name: str, row: WrapperRow) -> Iterator[Finding]:
     yield from examine_wrapper(row, lambda: around(row.config, lambda: Plain(row.target)), identity)
 
 
+def _examine_objective(name: str, row: ObjectiveRow) -> Iterator[Finding]:
+    from framework.testing.objectives import examine_objective
+
+    def weighted(factor: float) -> Any:
+        chosen = resolve("objective", {"name": name, **row.config})
+        return build("objective", resolve("objective", {**chosen, "weight": factor * chosen["weight"]}))
+
+    yield from examine_objective(row, weighted)
+
+
 def _examine_renderer(name: str, row: RendererRow) -> Iterator[Finding]:
     from framework.testing.renderers import examine_renderer
 
@@ -168,6 +186,7 @@ CONTRACTS: dict[str, Callable[[str, Any], Iterator[Finding]]] = {
     "encoder": _examine_encoder,
     "uncertainty": _examine_wrapper,
     "metric": _examine_metric,
+    "objective": _examine_objective,
     "renderer": _examine_renderer,
 }
 """Group → name and row → findings."""

@@ -97,7 +97,9 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
         if breadth is not None:
             scale = scale * breadth[..., None, None].to(place)
         return MultivariateNormal(place, scale_tril=scale, validate_args=False)
-    return Categorical(logits=place if breadth is None else place / breadth.unsqueeze(-1), validate_args=False)
+    return Categorical(
+        logits=place if breadth is None else place / breadth.unsqueeze(-1), validate_args=False
+    )
 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
@@ -235,7 +237,8 @@ def _reset(build: Make, some: Slices, worst: Worst) -> None:
 def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
     """A density about the target is judged better, in every column that has a better way, than one about elsewhere.
 
-    A metric that reads outliers sees them broader beside the former, and as narrow as the test samples beside the other.
+    A metric that reads outliers sees them broader beside the former, and as narrow as the test samples beside the
+    latter.
     """
     metric = build()
     some = _predictions(row, SAMPLES)

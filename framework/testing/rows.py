@@ -113,6 +113,25 @@ class WrapperRow:
 
 
 @dataclass(frozen=True)
+class ObjectiveRow:
+    """One parametrisation of an objective, on inputs that are vectors of `framework.testing.wrappers.LENGTH` numbers.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        target: what is predicted.
+        fields: further fields of a batch that it reads: number of samples → tensor with that first dimension.
+        config, limits, leave_out: as in HeadRow.
+    """
+
+    name: str
+    target: Target
+    config: Mapping[str, Any] = field(default_factory=dict)
+    fields: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class RendererRow:
     """One parametrisation of a renderer.
 

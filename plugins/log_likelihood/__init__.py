@@ -1,1 +1,1 @@
-"""Mean log-likelihood of the targets."""
+"""Mean log-likelihood of the targets, and its negative."""

@@ -1,4 +1,4 @@
-"""Mean log-likelihood and its standard error, from a running mean and a running sum of squared deviations."""
+"""Mean log-likelihood, of either sign, and its standard error: a running mean and sum of squared deviations."""
 
 from typing import ClassVar, Literal
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from framework.metric import Metric
 from framework.monte_carlo import Estimate
+from framework.nan import refuse_nan
 from framework.prediction import Prediction
 
 
@@ -46,24 +47,71 @@ class LogLikelihood(Metric):
         self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
 
     def compute(self) -> dict[str, Tensor]:
-        count, mean, squares = self.moments
-        seen = count > 0
-        found = {
-            "log_likelihood": torch.where(seen, mean, torch.nan),
-            # σ/√n with the sample deviation σ² = Σ(x - x̄)² / (n - 1); one sample has none: 0/0
-            "log_likelihood_sem": torch.where(seen, (squares / (count - 1) / count).sqrt(), torch.nan),
-        }
-        debiased, variance, samples, above, most = self.sampling
-        if samples == 0:
-            return found
-        return found | {
-            "log_likelihood_debiased": debiased / count,
-            # the items' points are independent: the variance of a mean
-            "log_likelihood_mc_error": variance.sqrt() / count,
-            "samples_mean": samples / count,
-            "samples_max": most,
-            "items_above_tolerance": above,
-        }
+        return summary("log_likelihood", self.moments, self.sampling)
+
+
+class NegativeLogLikelihood(Metric):
+    """Mean negative log-likelihood of the targets, nats, with its standard error (thesis eq. 2.25 as a mean).
+
+    The negative of `log_likelihood`, for tables in which lower is better, with the same further numbers of densities
+    whose log_prob is an estimate. A target the density rules out makes the mean infinite and the error NaN.
+
+    Raises:
+        UserError: log-likelihoods that are NaN; says how many.
+    """
+
+    bibtex = """@article{good1952rational,
+  author  = {Good, Irving John},
+  title   = {Rational Decisions},
+  journal = {Journal of the Royal Statistical Society: Series B},
+  volume  = {14},
+  number  = {1},
+  pages   = {107--114},
+  year    = {1952}
+}"""
+    columns: ClassVar[dict[str, str]] = {"nll": "NLL"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"nll": "lower"}
+    moments: Tensor
+    sampling: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
+        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
+
+    def update(self, prediction: Prediction) -> None:
+        log_prob = refuse_nan(prediction.log_prob, "log-likelihoods of the targets")
+        self.moments = merged_moments(torch.stack([self.moments, moments_of(log_prob)]))
+        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
+
+    def compute(self) -> dict[str, Tensor]:
+        found = summary("nll", self.moments, self.sampling)
+        # from 0, so that the NLL of certain and right predictions is no -0
+        return found | {name: 0 - found[name] for name in ("nll", "nll_debiased") if name in found}
+
+
+def summary(
+    name: str, moments: Float[Tensor, "3"], sampling: Float[Tensor, "5"]
+) -> dict[str, Float[Tensor, ""]]:
+    """Mean and standard error called `name`; where something was estimated, also what that did to them."""
+    count, mean, squares = moments
+    seen = count > 0
+    found = {
+        name: torch.where(seen, mean, torch.nan),
+        # σ/√n with the sample deviation σ² = Σ(x - x̄)² / (n - 1); one sample has none: 0/0
+        f"{name}_sem": torch.where(seen, (squares / (count - 1) / count).sqrt(), torch.nan),
+    }
+    debiased, variance, samples, above, most = sampling
+    if samples == 0:
+        return found
+    return found | {
+        f"{name}_debiased": debiased / count,
+        # the items' points are independent: the variance of a mean
+        f"{name}_mc_error": variance.sqrt() / count,
+        "samples_mean": samples / count,
+        "samples_max": most,
+        "items_above_tolerance": above,
+    }
 
 
 def moments_of(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:

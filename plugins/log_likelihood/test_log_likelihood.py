@@ -6,9 +6,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import special
 from scipy.stats import norm, sem
-from torch.distributions import Distribution, Independent, Normal
+from sklearn.metrics import log_loss
+from torch.distributions import Categorical, Distribution, Independent, Normal
 
+from framework.errors import UserError
 from framework.monte_carlo import Estimate, estimate
 from framework.prediction import Prediction
 from framework.schema import build, resolve
@@ -177,3 +180,62 @@ def test_estimates_of_merged_halves_are_those_of_the_whole():
     first.merge_state(second)
     for name, value in first.compute().items():
         torch.testing.assert_close(value, whole.compute()[name], rtol=1e-12, atol=0)
+
+
+def negative(*batches):
+    metric = build("metric", resolve("metric", "nll"))
+    for batch in batches:
+        metric.update(batch)
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("classes", [2, 7])
+def test_nll_of_classes_is_sklearns_log_loss(dtype, tolerance, classes):
+    generator = np.random.default_rng(0)
+    logits = torch.tensor(3 * generator.normal(size=(90, classes)), dtype=dtype)
+    label = generator.integers(classes, size=90)
+    found = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor(label)}))
+    probability = special.softmax(logits.double().numpy(), -1)
+    probability /= probability.sum(-1, keepdims=True)
+    assert found["nll"] == pytest.approx(log_loss(label, probability, labels=range(classes)), rel=tolerance)
+    assert found["nll_sem"] == pytest.approx(sem(-np.log(probability[np.arange(90), label])), rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nll_of_logits_of_ten_thousand(dtype):
+    logits = torch.tensor([[1e4, -1e4], [-1e4, 1e4]], dtype=dtype)
+    found = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor([0, 0])}))
+    assert found == {"nll": 1e4, "nll_sem": 1e4}
+
+
+def test_nll_is_the_negative_of_the_log_likelihood_with_the_same_error():
+    values = [1.0, -2.0, 6.5, -1e3]
+    found, positive = (
+        negative(prediction(values[:3]), prediction([]), prediction(values[3:])),
+        measured(values),
+    )
+    assert found["nll"] == -positive["log_likelihood"]
+    assert found["nll_sem"] == pytest.approx(positive["log_likelihood_sem"], rel=1e-14)
+
+
+def test_nll_of_the_certain_is_zero_without_a_sign_and_of_the_impossible_infinite():
+    assert str(negative(prediction([0.0, 0.0]))["nll"]) == "0.0"
+    assert negative(prediction([-1.0, -np.inf]))["nll"] == np.inf
+    assert all(np.isnan(value) for value in negative(prediction([])).values())
+
+
+def test_nll_names_nan():
+    with pytest.raises(
+        UserError, match=r"2 of 3 log-likelihoods of the targets in this batch are NaN.* row 0"
+    ):
+        negative(prediction([np.nan, 1.0, np.nan]))
+
+
+def test_nll_of_estimates_has_the_bias_the_other_way_round():
+    found = negative(drawn([1.0, 2.0, 6.0]), drawn([]), drawn([3.0]))
+    squares = [0.01, 0.04, 0.09, 0.01]
+    assert found["nll"] == -3.0
+    assert found["nll_debiased"] == pytest.approx(-3 - sum(squares) / 8)
+    assert found["nll_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
+    assert (found["samples_max"], found["items_above_tolerance"]) == (30, 1)

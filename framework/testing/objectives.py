@@ -1,0 +1,290 @@
+"""The contract of an objective: one function a property, each reporting the worst case it saw."""
+
+import copy
+from collections.abc import Callable, Iterable, Iterator
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from framework.data import Batch
+from framework.errors import ConfigError
+from framework.model import Predictor, each_alone
+from framework.objective import Objective
+from framework.rearranged import Stacked
+from framework.target import Target
+from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.heads import values
+from framework.testing.metrics import density_about
+from framework.testing.rows import ObjectiveRow
+from framework.testing.wrappers import LENGTH
+
+Make = Callable[[float], Objective]
+"""Builds the row's objective with its weight times a factor."""
+SAMPLES = 12
+
+
+class Network(nn.Module):
+    """One small network with what keeps state or draws noise: batch norm and dropout."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        self.target = target
+        self.first = nn.Linear(LENGTH, 8)
+        self.norm = nn.BatchNorm1d(8)
+        self.dropout = nn.Dropout(0.2)
+        self.last = nn.Linear(8, len(target.names))
+        self.gain = 1.0
+        """Of the raw numbers, to make them extreme."""
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        numbers = inputs / 255 if inputs.dtype == torch.uint8 else inputs
+        hidden = self.norm(self.first(numbers.to(self.first.weight.dtype)).tanh())
+        return density_about(self.target, self.gain * self.last(self.dropout(hidden)))
+
+
+class Members(Predictor):
+    """What an objective is tried on: `count` networks trained together, as a wrapper trains them; None: one alone."""
+
+    def __init__(self, target: Target, count: int | None = None) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList(Network(target) for _ in range(count or 1))
+        self.several = count is not None
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        return self.training_densities(inputs)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
+        return each_alone(torch.stack([-network(inputs).log_prob(target) for network in self.networks], 1))
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        found = [network(inputs) for network in self.networks]
+        return Stacked(found) if self.several else found[0]
+
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        pass
+
+    def amplify(self, gain: float) -> None:
+        for network in self.networks:
+            assert isinstance(network, Network)
+            network.gain = gain
+
+
+def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
+    """Every property of one objective on small predictors of `row.target`, fresh for each."""
+    checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
+        "a finite scalar": (0.0, lambda worst: _scalar(build, row, worst)),
+        "gradient": (1e-5, lambda worst: _gradient(build, row, worst)),
+        "weight is a factor": (1e-6, lambda worst: _weight(build, row, worst)),
+        "same seed, same bits": (0.0, lambda worst: _repeatable(build, row, worst)),
+        "leaves no trace": (0.0, lambda worst: _traces(build, row, worst)),
+        "order does not matter": (1e-5, lambda worst: _order(build, row, worst)),
+        "members train as if alone": (1e-5, lambda worst: _members(build, row, worst)),
+        "number types": (0.0, lambda worst: _number_types(build, row, worst)),
+        "extreme raw numbers": (0.0, lambda worst: _extreme(build, row, worst)),
+        "empty and single batches": (0.0, lambda worst: _small(build, row, worst)),
+    }
+    for name, (limit, check) in checks.items():
+        if name not in row.leave_out:
+            yield examined(name, row.limits.get(name, limit), check)
+
+
+def predictor_of(row: ObjectiveRow, count: int | None = None) -> Members:
+    """In training mode; the same initial numbers every time."""
+    torch.manual_seed(SEED)
+    predictor = Members(row.target, count)
+    predictor(batch_of(row, 32)["input"])  # gives the running moments something to hold
+    return predictor
+
+
+def batch_of(row: ObjectiveRow, count: int) -> Batch:
+    """Seeded: inputs, targets, and whatever else the row's objective reads."""
+    generator = torch.Generator().manual_seed(SEED + 2)
+    return {
+        "input": torch.randn(count, LENGTH, generator=generator),
+        "target": values(row.target, (count,)),
+        "index": torch.arange(count),
+        "group": torch.zeros(count, dtype=torch.int64),
+        **{name: make(count) for name, make in row.fields.items()},
+    }
+
+
+def in_float64(batch: Batch) -> Batch:
+    return {name: field.double() if field.is_floating_point() else field for name, field in batch.items()}
+
+
+def penalty(objective: Objective, predictor: Predictor, batch: Batch) -> Tensor:
+    """Seeded, as the framework seeds every step."""
+    torch.manual_seed(SEED)
+    return objective(predictor, batch)
+
+
+def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[str, Tensor]:
+    """Of every parameter that has one."""
+    predictor.zero_grad()
+    penalty(objective, predictor, batch).backward()
+    return {
+        name: parameter.grad.clone()
+        for name, parameter in predictor.named_parameters()
+        if parameter.grad is not None
+    }
+
+
+def _scalar(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    for count in (None, 3):
+        predictor = predictor_of(row, count)
+        found = penalty(build(1.0), predictor, batch_of(row, SAMPLES))
+        what = "one model" if count is None else f"{count} members"
+        worst.same(f"shape of the penalty of {what}", tuple(found.shape), ())
+        worst.finite(f"penalty of {what}", found)
+        worst.count(not found.requires_grad, f"the penalty of {what} has no gradient")
+        seen = gradients(build(1.0), predictor, batch_of(row, SAMPLES))
+        for name, gradient in seen.items():
+            worst.finite(f"gradient of {name}", gradient)
+        worst.count(
+            not any(gradient.abs().sum() > 0 for gradient in seen.values()), f"every gradient of {what} is 0"
+        )
+
+
+def _gradient(build: Make, row: ObjectiveRow, worst: Worst, step: float = 1e-6) -> None:
+    """The directional derivative in all parameters against central differences, in evaluation and float64."""
+    objective, predictor = build(1.0), predictor_of(row).eval().double()
+    batch = in_float64(batch_of(row, SAMPLES))
+    found = gradients(objective, predictor, batch)
+    generator = torch.Generator().manual_seed(SEED)
+    parameters = dict(predictor.named_parameters())
+    direction = {
+        name: torch.randn(parameter.shape, dtype=torch.float64, generator=generator)
+        for name, parameter in parameters.items()
+    }
+    analytic = sum((found[name] * direction[name]).sum().item() for name in found)
+
+    def moved(amount: float) -> float:
+        other = copy.deepcopy(predictor)
+        with torch.no_grad():
+            for name, parameter in other.named_parameters():
+                parameter.add_(amount * direction[name])
+        return penalty(objective, other, batch).item()
+
+    numeric = (moved(step) - moved(-step)) / (2 * step)
+    worst.see(
+        abs(analytic - numeric) / max(abs(numeric), 1e-3),
+        f"directional derivative {analytic:.9g}, by differences {numeric:.9g}",
+    )
+
+
+def _weight(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    batch = batch_of(row, SAMPLES)
+    one = penalty(build(1.0), predictor_of(row), batch).item()
+    for factor in (0.25, 3.0, 1e6):
+        found = penalty(build(factor), predictor_of(row), batch).item()
+        worst.see(
+            abs(found - factor * one) / max(abs(factor * one), 1e-12),
+            f"{factor:g} times the weight: {found:.9g}, wanted {factor * one:.9g}",
+        )
+    try:
+        none = build(0.0)
+    except ConfigError:
+        worst.count(False, "weight 0 is refused")
+        return
+    found = penalty(none, predictor_of(row), batch).item()
+    worst.count(found != 0, f"weight 0: penalty {found:g}")
+
+
+def _repeatable(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    batch, objective = batch_of(row, SAMPLES), build(1.0)
+    found = [penalty(one, predictor_of(row), batch) for one in (objective, objective, build(1.0))]
+    worst.same_bits("penalty of two calls", found[1], found[0])
+    worst.same_bits("penalty of two objectives", found[2], found[0])
+
+
+def _traces(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """What a penalty must not touch: modes, buffers, parameters and their gradients, the batch."""
+    for training in (True, False):
+        predictor, batch = predictor_of(row), batch_of(row, SAMPLES)
+        predictor.train(training)
+        first = predictor.networks[0]
+        assert isinstance(first, Network)
+        first.norm.train(not training)  # one that a user keeps otherwise
+        modes = {name: module.training for name, module in predictor.named_modules()}
+        state = copy.deepcopy(predictor.state_dict())
+        before = {name: field.clone() for name, field in batch.items()}
+        penalty(build(1.0), predictor, batch)
+        after = {name: module.training for name, module in predictor.named_modules()}
+        changed = [name for name in modes if after[name] != modes[name]]
+        worst.count(bool(changed), f"modes changed of {', '.join(changed) or 'none'}")
+        for name, value in predictor.state_dict().items():
+            worst.same_bits(f"{name} after a penalty, training {training}", value, state[name])
+        for name, parameter in predictor.named_parameters():
+            worst.count(parameter.grad is not None, f"a gradient is left in {name}")
+            worst.count(not parameter.requires_grad, f"{name} needs no gradient any more")
+        worst.same("fields of the batch", sorted(batch), sorted(before))
+        for name, field in before.items():
+            worst.same_bits(f"{name} of the batch", batch[name], field)
+            worst.count(batch[name].requires_grad, f"{name} of the batch needs a gradient now")
+
+
+def _order(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """Without dropout, whose masks belong to places in the batch."""
+    predictor, batch = predictor_of(row).eval(), batch_of(row, SAMPLES)
+    backwards = {name: field.flip(0) for name, field in batch.items()}
+    wanted = penalty(build(1.0), predictor, batch).item()
+    found = penalty(build(1.0), predictor, backwards).item()
+    worst.see(abs(found - wanted) / max(abs(wanted), 1e-6), f"backwards {found:.9g}, forwards {wanted:.9g}")
+
+
+def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """Members that are alike: the penalty, and each one's gradient, are those of one alone; without dropout."""
+    alone = predictor_of(row).eval()
+    together = predictor_of(row, 3).eval()
+    for network in together.networks:
+        network.load_state_dict(alone.networks[0].state_dict())
+    batch, objective = batch_of(row, SAMPLES), build(1.0)
+    wanted, found = penalty(objective, alone, batch).item(), penalty(objective, together, batch).item()
+    worst.see(
+        abs(found - wanted) / max(abs(wanted), 1e-6), f"penalty of three {found:.9g}, of one {wanted:.9g}"
+    )
+    own, each = gradients(objective, alone, batch), gradients(objective, together, batch)
+    for name, gradient in own.items():
+        for index in range(3):
+            other = each.get(name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient))
+            scale = gradient.abs().max().clamp(min=1e-6)
+            worst.see((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
+
+
+def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """The penalty has the predictor's type; inputs may be images as bytes."""
+    objective = build(1.0)
+    for kind in (torch.float32, torch.float64):
+        predictor = predictor_of(row).to(kind)
+        batch = batch_of(row, SAMPLES)
+        typed = {
+            name: field.to(kind) if field.is_floating_point() else field for name, field in batch.items()
+        }
+        found = penalty(objective, predictor, typed)
+        worst.same(f"penalty of a predictor of {kind}", found.dtype, kind)
+        worst.finite(f"penalty of a predictor of {kind}", found)
+        bytes_ = torch.randint(0, 256, typed["input"].shape, dtype=torch.uint8)
+        worst.finite(f"penalty of bytes, {kind}", penalty(objective, predictor, {**typed, "input": bytes_}))
+
+
+def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """Raw numbers to ±1e4: a network that has become sure of everything."""
+    for kind in (torch.float32, torch.float64):
+        for size in (1e2, 1e4):
+            predictor = predictor_of(row).to(kind)
+            predictor.amplify(size)
+            batch = batch_of(row, SAMPLES)
+            batch = in_float64(batch) if kind == torch.float64 else batch
+            worst.finite(f"penalty at ±{size:g}, {kind}", penalty(build(1.0), predictor, batch))
+            for name, gradient in gradients(build(1.0), predictor, batch).items():
+                worst.finite(f"gradient of {name} at ±{size:g}, {kind}", gradient)
+
+
+def _small(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """In evaluation, since batch norm cannot train on one sample; no samples must not make the loss NaN."""
+    for count in (0, 1):
+        predictor = predictor_of(row).eval()
+        found = penalty(build(1.0), predictor, batch_of(row, count))
+        worst.same(f"shape of the penalty of {count}", tuple(found.shape), ())
+        worst.finite(f"penalty of {count}", found)

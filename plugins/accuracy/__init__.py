@@ -1,0 +1,1 @@
+"""Share of samples whose likeliest class is the true one."""

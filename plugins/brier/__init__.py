@@ -1,0 +1,1 @@
+"""Brier score of class probabilities."""

@@ -1,0 +1,15 @@
+"""Rows of the contract: confidence in the predicted class, and in the positive one."""
+
+from framework.target import Target
+from framework.testing.rows import MetricRow
+
+TWO = Target("class", ("off", "on"))
+
+ROWS = {
+    "calibration_error": (
+        MetricRow("five classes", Target("class", ("a", "b", "c", "d", "e"))),
+        MetricRow("two classes, four bins", TWO, {"bins": 4}),
+        MetricRow("positive class", TWO, {"probability": "positive"}),
+        MetricRow("one bin", TWO, {"bins": 1}),
+    )
+}

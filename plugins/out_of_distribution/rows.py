@@ -1,0 +1,19 @@
+"""Rows of the contract: either score, on classes, reals and angles."""
+
+from framework.target import Target
+from framework.testing.rows import MetricRow
+
+CLASSES = Target("class", ("a", "b", "c"))
+REALS = Target("real", ("x", "y"))
+ANGLE = Target("angle", ("azimuth",))
+
+ROWS = {
+    "out_of_distribution": (
+        MetricRow("entropy of classes", CLASSES),
+        MetricRow("confidence in a class", CLASSES, {"score": "confidence"}),
+        MetricRow("entropy of reals", REALS),
+        MetricRow("confidence in reals", REALS, {"score": "confidence"}),
+        MetricRow("entropy of an angle", ANGLE),
+        MetricRow("confidence in an angle", ANGLE, {"score": "confidence"}),
+    )
+}

@@ -1,0 +1,183 @@
+"""Uncertainty from the command line: ensembles trained in one pass or joined from a sweep, and metrics of outliers."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import framework as package
+from framework.assembly import build_outliers, resolve_all
+from framework.density import Mixture
+from framework.errors import CheckpointError, ConfigError, DataError
+from framework.modes.combine import common, found, joined
+from framework.schema import build, resolve
+from tests.conftest import Done, Framework
+
+SMALL = [
+    "experiment=moons/vanilla_128",
+    "encoder.mlp.widths=[8]",
+    "data.train=60",
+    "data.validation=40",
+    "data.test=100",
+    "outliers.test=30",
+    "batch_size=20",
+    "trainer.max_epochs=3",
+    "trainer.check_val_every_n_epoch=1",
+    "logger=none",
+    "threads=1",
+]
+
+
+def results(done: Done) -> dict[str, object]:
+    assert done.code == 0, done.out
+    return json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+
+
+def inputs() -> torch.Tensor:
+    return torch.randn(50, 2, generator=torch.Generator().manual_seed(0))
+
+
+def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_one_pass(
+    framework: Framework, tmp_path: Path
+) -> None:
+    swept = framework("-m", *SMALL, "seed=0,1,2", f"hydra.sweep.dir={tmp_path}/sweep")
+    assert swept.code == 0, swept.out
+    folder = tmp_path / "sweep"
+    done = framework("mode=combine", f"mode.members={folder}", "logger=none", "threads=1", folder="joined")
+    numbers = results(done)
+    assert numbers["method"] == "bernoulli + ensemble"
+    assert numbers["synthetic"] is True
+    assert "3 members" in done.out
+    members = [package.load(folder / str(number)) for number in range(3)]
+    whole = package.load(done.folder)
+    labels = torch.zeros(50, dtype=torch.int64)
+    with torch.no_grad():
+        mean = torch.stack([member(inputs()).log_prob(labels).exp() for member in members]).mean(0)
+        torch.testing.assert_close(whole(inputs()).log_prob(labels).exp(), mean)
+
+    # around the members comes what is asked for, calibrated on the validation set
+    scaled = framework(
+        "mode=combine",
+        f"mode.members=[{folder}/0,{folder}/2]",
+        "uncertainty=[temperature]",
+        "logger=none",
+        "threads=1",
+        folder="scaled",
+    )
+    assert results(scaled)["method"] == "bernoulli + ensemble + temperature"
+
+    # trained in one pass, with the seed of the first: its first member saw the same batches from the same start
+    once = framework(*SMALL, "uncertainty=[ensemble]", "uncertainty.ensemble.members=3", folder="once")
+    results(once)
+    ensemble = package.load(once.folder)
+    assert isinstance(ensemble(inputs()), Mixture)
+    ensemble.members = 1  # type: ignore[assignment]
+    with torch.no_grad():
+        first = ensemble(inputs()).log_prob(labels)
+        torch.testing.assert_close(first, members[0](inputs()).log_prob(labels), rtol=1e-4, atol=1e-5)
+
+    # the same metrics from the stored model, and its curve of error against run time
+    again = framework("mode=test", f"checkpoint={once.folder}", "logger=none", "threads=1", folder="again")
+    for key in ("nll", "ood_entropy", "auroc"):
+        assert results(again)[key] == pytest.approx(results(once)[key], rel=1e-6)  # other batches
+    curve = framework(
+        "mode=work_precision",
+        f"checkpoint={once.folder}",
+        "mode.metrics=[nll,ece]",
+        "mode.repeats=2",
+        "logger=none",
+        "threads=1",
+        folder="curve",
+    )
+    assert curve.code == 0, curve.out
+    rows = (curve.folder / "work_precision.csv").read_text(encoding="utf-8").splitlines()
+    assert [row.split(",")[1] for row in rows[1:]] == ["1", "2", "3"]
+    assert (curve.folder / "figures" / "work_precision.png").is_file()
+    wrong = framework(
+        "mode=work_precision",
+        f"checkpoint={once.folder}",
+        "mode.metrics=[nil]",
+        "logger=none",
+        folder="wrong",
+    )
+    assert wrong.code == 2
+    assert "no metric gives 'nil'" in wrong.out
+    assert "'nll'" in wrong.out
+
+
+def described(**changes: object) -> dict[str, object]:
+    config = {
+        "density_head": {"name": "a"},
+        "encoder": [],
+        "uncertainty": [],
+        "data": {"name": "d", "seed": 0},
+    }
+    found = {"config": config, "target": {"kind": "class"}, "input_shape": [2], "path": "here"}
+    config |= {key: value for key, value in changes.items() if key in config}
+    return found | {key: value for key, value in changes.items() if key in found}
+
+
+def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
+    assert common([described(), described(path="there")])["path"] == "here"
+    with pytest.raises(CheckpointError, match="differ in encoder"):
+        common([described(), described(encoder=[{"name": "mlp"}])])
+    with pytest.raises(CheckpointError, match="differ in input_shape"):
+        common([described(), described(input_shape=[3])])
+    for name in ("10", "9"):
+        (tmp_path / name / "checkpoints").mkdir(parents=True)
+        (tmp_path / name / "checkpoints" / "model.ckpt").touch()
+    (tmp_path / "11").mkdir()  # a job that failed left no model
+    assert found(str(tmp_path)) == [tmp_path / "9", tmp_path / "10"]
+    with pytest.raises(ConfigError, match="gives 1 trained models"):
+        found(["alone"])
+    data = build("data", resolve("data", "moons"))
+    data.prepare()
+    config = {"encoder": [resolve("encoder", "mlp")], "density_head": resolve("density_head", "bernoulli")}
+    config["uncertainty"] = [resolve("uncertainty", "temperature")]
+    with pytest.raises(ConfigError, match="no members that could have been trained apart"):
+        joined(config, data, [], "temperature")
+
+
+def chosen(outliers: object, *metrics: str) -> dict[str, object]:
+    return {
+        "data": {"name": "moons"},
+        "encoder": {"mlp": {"name": "mlp"}},
+        "density_head": {"name": "bernoulli"},
+        "metric": {name: {"name": name} for name in metrics},
+        "outliers": outliers,
+    }
+
+
+def test_outliers_are_built_only_for_metrics_that_read_them() -> None:
+    data = build("data", resolve("data", "moons"))
+    data.prepare()
+    broken = {"name": "tabular", "path": "no_such_file.csv", "target": "y", "kind": "class"}
+    assert (
+        build_outliers(resolve_all(chosen(broken, "nll")), data) is None
+    )  # the missing file disturbs nobody
+    with pytest.raises(DataError, match=r"no_such_file\.csv"):
+        build_outliers(resolve_all(chosen(broken, "nll", "out_of_distribution")), data)
+    with pytest.raises(ConfigError, match="none are chosen"):
+        resolve_all(chosen(None, "nll", "out_of_distribution"))
+
+
+def test_outliers_have_the_inputs_of_the_data(tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    lines = [f"{row},{row % 7},{row % 5},{'ab'[row % 2]}" for row in range(40)]
+    table.write_text("x,y,z,label\n" + "\n".join(lines) + "\n", encoding="utf-8")
+    data = build("data", resolve("data", "moons"))
+    data.prepare()
+    three = {"name": "tabular", "path": str(table), "target": "label", "kind": "class"}
+    with pytest.raises(ConfigError, match=r"shape \(3,\).*shape \(2,\)"):
+        build_outliers(resolve_all(chosen(three, "out_of_distribution")), data)
+
+
+def test_a_mistake_on_the_command_line_is_said_before_training(framework: Framework) -> None:
+    done = framework(*SMALL, "trainer.keep=first")
+    assert done.code == 2, done.out
+    assert "wanted `best`" in done.out
+    done = framework("experiment=moons/vanilla_128", "data@outliers=null")
+    assert done.code == 2, done.out
+    assert "Take it out with `~`" in done.out
+    assert "Traceback" not in done.out
