@@ -96,7 +96,7 @@ def turn(start: Tensor, end: Tensor) -> Tensor:
 
 
 def _mixed(density: Mixture, parts: Tensor) -> Tensor:
-    weights = density.log_weights.double().exp()
+    weights = density.log_weights.double().softmax(-1)  # float32's sum to 1 but for 1e-7
     return torch.where(weights > 0, weights * parts, 0.0).sum(-1).clamp(0, 1)
 
 

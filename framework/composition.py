@@ -117,7 +117,9 @@ def sentence(error: BaseException) -> str | None:
         available = f" Available in {group}: {', '.join(options)}." if options else ""
         return f"No configuration {wanted!r}.{did_you_mean(name, options)}{available}"
     if isinstance(error, ValueError) and "Config group override must be" in str(error):
-        return "A group cannot be set to null. Take it out with `~`, e.g. `~data@outliers` or `~density_head`."
+        return (
+            "A group cannot be set to null. Take it out with `~`, e.g. `~data@outliers` or `~density_head`."
+        )
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, OmegaConfBaseException):
         cause = cause.__cause__ or cause.__context__

@@ -70,7 +70,7 @@ def of_normals(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor
         # E|X - X'| = 2σ/√π, so that a large mean takes no digits
         return (to_value - density.scale.squeeze(-1) / math.sqrt(math.pi)).clamp(min=0)
     count = density.mean.shape[-1]
-    rows = [number.reshape(-1, count) for number in (weights, density.mean, density.scale)]
+    rows = [number.flatten(0, -2) for number in (weights, density.mean, density.scale)]
     step = max(1, CHUNK // count**2)
     parts = [_between(*part) for part in zip(*(row.split(step) for row in rows), strict=True)]
     return (to_value - torch.cat(parts).reshape(to_value.shape) / 2).clamp(min=0)
@@ -96,9 +96,7 @@ def absolute_mean(mean: Tensor, scale: Tensor) -> Tensor:
     return scale * bell + mean * torch.erf(standard / math.sqrt(2))
 
 
-def fair(
-    drawn: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"], *, circular: bool
-) -> Score:
+def fair(drawn: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"], *, circular: bool) -> Score:
     """The mean of the unbiased estimates from REPLICATES parts of the draws, and its standard error."""
     size = len(drawn) // REPLICATES
     parts = drawn[: size * REPLICATES].unflatten(0, (REPLICATES, size)).transpose(0, 1)

@@ -26,7 +26,7 @@ class Columns(NamedTuple):
 
 
 def read_columns(file: Path) -> Columns:
-    """Read a CSV file: UTF-8 (a byte-order mark is no fault), commas, names in its first line; blank lines are left out.
+    """Read a CSV file: UTF-8 (also with a byte-order mark), commas, names in its first line; blank lines are left out.
 
     Raises:
         DataError: it is missing, unreadable, empty, separated by something else, a name is missing or stands twice,
@@ -80,6 +80,8 @@ def require(columns: Columns, names: Sequence[str], asked: str) -> None:
 
 def mostly_numbers(columns: Columns, name: str) -> bool:
     """Whether more than half of a column's cells that are not empty are numbers; not so where all are empty."""
+    if _all_finite(columns.cells[name]) is not None:
+        return True
     filled = [cell for cell in columns.cells[name] if cell.lower() not in MISSING]
     return 2 * sum(number(cell) is not None for cell in filled) > len(filled)
 
@@ -103,6 +105,9 @@ def numbers(columns: Columns, name: str, *, missing: str | None) -> Float[np.nda
     Raises:
         DataError: a cell is a word, is infinite, or is missing and must not be; names the first.
     """
+    plain = _all_finite(columns.cells[name])
+    if plain is not None:
+        return plain
     found = np.empty(len(columns.lines))
     for row, cell in enumerate(columns.cells[name]):
         value = number(cell)
@@ -118,6 +123,15 @@ def numbers(columns: Columns, name: str, *, missing: str | None) -> Float[np.nda
             )
         found[row] = value
     return found
+
+
+def _all_finite(cells: Sequence[str]) -> Float[np.ndarray, "rows"] | None:
+    """The cells as `number` has them, several times as fast; None unless all are finite numbers."""
+    try:
+        found = np.fromiter(map(float, cells), np.float64, len(cells))
+    except ValueError:
+        return None
+    return found if np.isfinite(found).all() and "_" not in "".join(cells) else None
 
 
 def _check_header(file: Path, header: Sequence[str]) -> None:

@@ -6,7 +6,14 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, Independent, Normal, constraints
+from torch.distributions import (
+    Categorical,
+    Distribution,
+    Independent,
+    MultivariateNormal,
+    Normal,
+    constraints,
+)
 
 from framework.circular import circular_median, grid
 from framework.errors import UserError
@@ -209,6 +216,15 @@ def _(density: Independent, index: int) -> Distribution:
     return Independent(base, 1, validate_args=False)
 
 
+@marginal.register
+def _(density: MultivariateNormal, index: int) -> MultivariateNormal:
+    if density.event_shape == (1,) and index == 0:
+        return density
+    here = slice(index, index + 1)
+    scale = density.variance[..., here].sqrt().unsqueeze(-1)
+    return MultivariateNormal(density.loc[..., here], scale_tril=scale, validate_args=False)
+
+
 @singledispatch
 def median(density: Distribution, samples: int) -> Tensor:
     """The point of least expected absolute deviation, number by number (eq. 3.23), from `samples` draws (3.24).
@@ -221,6 +237,12 @@ def median(density: Distribution, samples: int) -> Tensor:
     if isinstance(density.support, Circular):
         return circular_median(drawn)
     return drawn.median(0).values
+
+
+@median.register
+def _(density: MultivariateNormal, samples: int) -> Tensor:
+    # each number's marginal is symmetric about its mean
+    return density.loc
 
 
 def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Tensor]:

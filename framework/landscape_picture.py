@@ -7,12 +7,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from framework.model import Predictor
-from framework.pictures import BLUE, ORANGE
+from framework.pictures import BLUE, ORANGE, titled_figure
 
 POINTS = 201
 """Along each side of the plane."""
@@ -38,7 +37,7 @@ class Plane:
     half_width: float
 
 
-def half_width(*points: Float[np.ndarray, "count 2"]) -> float:
+def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
     """Such that the square holds every point, and a tenth more."""
     return 1.1 * max((float(np.abs(some).max()) for some in points if len(some)), default=1.0)
 
@@ -67,9 +66,7 @@ def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, sy
     """
     across = min(3, len(panels))
     down = -(-len(panels) // across)
-    figure = Figure(figsize=(3.6 * across + 1.0, 3.7 * down + 0.9), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"{title} (synthetic data)" if synthetic else title, fontsize=12, parse_math=False)
+    figure = titled_figure((3.6 * across + 1.0, 3.7 * down + 0.9), title, synthetic)
     axes = figure.subplots(down, across, squeeze=False)
     edge, two = plane.half_width, len(plane.names) == 2
     extent = (-edge, edge, -edge, edge)

@@ -84,7 +84,7 @@ def minimise(
             # downhill by its derivatives, but no value shows it: as near as rounding lets one come
             converged = left <= ROUNDING**0.5 * size
             break
-        gain = (value - _value(terms, trial)).item()
+        gain = (value - total(terms, trial)).item()
         length = (trial - point).norm().item()
         if not gain > max(1e-4 * promise, 0.0):  # NaN too
             radius = length / 4
@@ -102,18 +102,10 @@ def minimise(
     return Minimum(point, value.item(), active, hessian, count, converged)
 
 
-def lowest(terms: Sequence[Term], candidates: Float[Tensor, "candidate n"]) -> Float[Tensor, "n"]:
-    """The candidate with the least sum, from which to start where there may be several minima; the first of equals.
-
-    A later one is taken only if it is lower by more than rounding. Candidates without a finite value are passed over;
-    the first is returned if all are.
-    """
-    best, least = candidates[0], _value(terms, candidates[0].double())
-    for candidate in candidates[1:]:
-        value = _value(terms, candidate.double())
-        if value.isfinite() and not value >= least - 4 * ROUNDING * (1 + least.abs()):
-            best, least = candidate, value
-    return best.double()
+def total(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Σ terms, float64, without gradient."""
+    with torch.no_grad():
+        return torch.stack([term(point).double() for term in terms]).sum()
 
 
 def derivatives(
@@ -141,11 +133,6 @@ def derivatives(
     return value, slope, (hessian + hessian.mT) / 2
 
 
-def _value(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    with torch.no_grad():
-        return torch.stack([term(point).double() for term in terms]).sum()
-
-
 def _held(point: Tensor, slope: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "n"]:
     """Parameters at a bound beyond which the function still falls, or which have no room at all."""
     return ((point <= lower) & (slope > 0)) | ((point >= upper) & (slope < 0)) | (lower == upper)
@@ -159,6 +146,7 @@ def _step(
     A parameter at a bound that the step would push out of the box is held, one at a time, and the step taken anew
     among the others: whatever the Hessian couples, what is left is downhill. It ends at the first bound on its way.
     """
+    trial = point.clone()
     rows = (~_held(point, slope, lower, upper)).nonzero().flatten()
     while len(rows):
         curvature, basis = torch.linalg.eigh(hessian[rows][:, rows])
@@ -169,17 +157,17 @@ def _step(
         if not move.isfinite().all():
             move = along
         move = -(basis @ (move * min(1.0, radius / max(move.norm().item(), 1e-300))))
-        here, room = point[rows], torch.where(move > 0, upper[rows], lower[rows]) - point[rows]
-        out = (room == 0) & (move != 0)
+        # exactly at the bound where the step ends there
+        here, ends = point[rows], torch.where(move > 0, upper[rows], lower[rows])
+        room = ends - here
+        out = (room.abs() <= 1e-14 * (1 + here.abs())) & (move != 0)
         if out.any():
-            worst = (move.abs() * out).argmax()
+            worst = int((move.abs() * out).argmax())
+            trial[rows[worst]] = ends[worst]
             rows = torch.cat([rows[:worst], rows[worst + 1 :]])
             continue
         share = torch.where(move == 0, torch.inf, room / move)
         cut = min(1.0, share.amin().item())
-        trial = point.clone()
-        # exactly at the bound where it ends there
-        ends = torch.where(move > 0, upper[rows], lower[rows])
         trial[rows] = torch.where(share <= cut, ends, here + cut * move).clamp(lower[rows], upper[rows])
         moved = trial[rows] - here
         promise = -(slope[rows] @ moved) - ((basis.mT @ moved).square() * bent).sum() / 2

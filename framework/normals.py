@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 
-from framework.density import Mixture, marginal
+from framework.density import Mixture
 from framework.rearranged import Reshaped, Stacked
 
 
@@ -54,7 +54,8 @@ def _(density: Mixture) -> Normals | None:
     parts = normals(density.components)  # (*batch, K, k)
     if parts is None:
         return None
-    log_weights = density.log_weights.double().unsqueeze(-1) + parts.log_weights
+    # again: float32's sum to 1 but for 1e-7
+    log_weights = density.log_weights.double().log_softmax(-1).unsqueeze(-1) + parts.log_weights
     return Normals(*(number.flatten(-2) for number in (log_weights, parts.mean, parts.scale)))
 
 
@@ -111,12 +112,3 @@ def _(density: Reshaped, value: Tensor) -> Tensor | None:
     inner = density.density
     found = mahalanobis(inner, value.reshape(*inner.batch_shape, *inner.event_shape))
     return None if found is None else found.reshape(density.batch_shape)
-
-
-@marginal.register
-def _(density: MultivariateNormal, index: int) -> MultivariateNormal:
-    if tuple(density.event_shape) == (1,) and index == 0:
-        return density
-    here = slice(index, index + 1)
-    scale = density.variance[..., here].sqrt().unsqueeze(-1)
-    return MultivariateNormal(density.loc[..., here], scale_tril=scale, validate_args=False)

@@ -110,7 +110,7 @@ def viewing_circles(
     if np.isnan(density).any():
         raise ValueError("wanted a log-density everywhere, got NaN.")
     across, tall = max(3, *rows.values()), [1.0 if count else 0.25 for count in rows.values()]
-    figure = _figure((2.5 * across + 0.4, 2.75 * sum(tall) + 1.3), title, synthetic)
+    figure = titled_figure((2.5 * across + 0.4, 2.75 * sum(tall) + 1.3), title, synthetic)
     panels = figure.subplots(len(rows), across, squeeze=False, height_ratios=tall)
     sample = 0
     for line, (heading, count) in zip(panels, rows.items(), strict=True):
@@ -157,7 +157,7 @@ def training_curve(
         validation: pairs (epoch, value).
         best_epoch: whose weights were kept; None where none were.
     """
-    figure = _figure((7.0, 4.3), title, synthetic)
+    figure = titled_figure((7.0, 4.3), title, synthetic)
     axes = figure.subplots()
     axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training")
     seen = np.array(validation, dtype=np.float64).reshape(-1, 2)
@@ -197,7 +197,7 @@ def work_precision(
         curves: the points of each method, in the order in which they are joined.
         reference_error: standard error of what the errors refer to, nats; shaded up to there.
     """
-    figure = _figure((7.5, 5.0), title, synthetic)
+    figure = titled_figure((7.5, 5.0), title, synthetic)
     axes = figure.subplots()
     points = [point for curve in curves.values() for point in curve]
     drawn = [point for point in points if math.isfinite(point.error) and math.isfinite(point.milliseconds)]
@@ -255,7 +255,7 @@ def comparison(
             groups look different.
         better: which way `error` is better; its axis is logarithmic for "lower" where all are positive.
     """
-    figure = _figure((7.5, 5.2), title, synthetic)
+    figure = titled_figure((7.5, 5.2), title, synthetic)
     axes = figure.subplots()
     shown = [row for row in rows if math.isfinite(_value(row, error)) and 0 < _value(row, time) < math.inf]
     names = [str(row.get(method)) for row in shown]
@@ -286,7 +286,8 @@ def comparison(
     return figure
 
 
-def _figure(size: tuple[float, float], title: str, synthetic: bool) -> Figure:
+def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Figure:
+    """Empty, `size` in inches; the title says where data are synthetic."""
     figure = Figure(figsize=size, dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     if synthetic and "synthetic" not in title.lower():

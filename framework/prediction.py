@@ -6,6 +6,7 @@ from typing import Literal
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.class_probabilities import class_probabilities
 from framework.data import Batch
 from framework.density import marginal, median
 from framework.monte_carlo import Estimate, estimate
@@ -45,6 +46,11 @@ class Prediction:
     def estimate(self) -> Estimate:
         """The same with its Monte Carlo error and the samples it took; exact of most densities."""
         return estimate(self.density, self.target)
+
+    @cached_property
+    def class_probabilities(self) -> Tensor:
+        """Of each class, (batch, class), float64; of a density over anything else a UserError."""
+        return class_probabilities(self.density)
 
     @cached_property
     def entropy(self) -> Tensor:

@@ -199,7 +199,11 @@ def gallery(
         joined["truth"][order],
         joined["point"][order],
         [
-            _caption(joined["entropy"][index], joined["error"][index], int(joined["symmetry"][index]))
+            _caption(
+                float(joined["entropy"][index]),
+                float(joined["error"][index]),
+                int(joined["symmetry"][index]),
+            )
             for index in order
         ],
         modes=[

@@ -87,6 +87,7 @@ def settings(config: Mapping[str, Any]) -> Settings:
 def _check_trainer(trainer: Mapping[str, Any]) -> None:
     numbers = {
         "max_epochs": (int, 1),
+        "check_val_every_n_epoch": (int, 1),
         "patience": (int, 1),
         "checkpoint_every_steps": (int, 1),
         "log_every_steps": (int, 1),
@@ -99,6 +100,12 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
             isinstance(value, bool) or not isinstance(value, kind) or not value >= least
         ):
             raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
+    every, epochs = trainer.get("check_val_every_n_epoch") or 1, trainer.get("max_epochs")
+    if epochs is not None and every > epochs:
+        raise ConfigError(
+            f"trainer.check_val_every_n_epoch = {every} exceeds trainer.max_epochs = {epochs}: nothing would ever be "
+            "validated. Lower it."
+        )
     if trainer.get("keep", "best") not in ("best", "last"):
         raise ConfigError(
             f"trainer.keep = {trainer['keep']!r}: wanted `best` (the weights of the lowest validation loss) or `last`."

@@ -57,9 +57,9 @@ def tempered(density: Distribution, temperature: Tensor) -> Distribution:
     """
     if density.has_enumerate_support and density.event_shape == ():
         return tempered_classes(density, temperature)
-    if tuple(density.event_shape) == (1,) and isinstance(density.support, Circular):
-        if density.support.ranges is None:
-            return CircularPower(density, temperature)
+    support = density.support if tuple(density.event_shape) == (1,) else None
+    if isinstance(support, Circular) and support.ranges is None:
+        return CircularPower(density, temperature)
     raise UserError(
         f"No temperature is known for {type(density).__name__} over {tuple(density.event_shape)} numbers: p^(1/T) has "
         "no normaliser in closed form that the framework knows. Register it with `framework.temper.tempered.register`, "
@@ -192,7 +192,7 @@ class CircularPower(Distribution):
         # mass of the cell between a point and the next, whose ends' heights count half each
         mass = ((height + height.roll(-1, 0)) / 2).reshape(len(height), -1).T
         until = mass.cumsum(-1)
-        flat = draws.reshape(shape.numel(), -1).T.contiguous() * until[:, -1:]
+        flat = draws.reshape(shape.numel(), len(until)).T.contiguous() * until[:, -1:]
         cell = torch.searchsorted(until, flat, right=True).clamp(max=len(height) - 1)
         part = 1 - (until.gather(-1, cell) - flat) / mass.gather(-1, cell).clamp(min=1e-300)
         step = (2 * math.pi / len(height)) * (cell + part.clamp(0, 1))

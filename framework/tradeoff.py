@@ -38,11 +38,13 @@ class Turn:
 
 
 def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
-    """The parts that have a knob of that name: wrappers, or else heads.
+    """The parts that have a knob of that name: wrappers, or else heads. None of the name "", which turns nothing.
 
     Raises:
         ConfigError: none has; says which knobs there are.
     """
+    if not knob:
+        return []
     parts = [part for part in predictor.modules() if isinstance(part, Uncertainty | DensityHead)]
     found = [part for part in parts if knob in part.knobs]
     if not found:

@@ -4,11 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from framework.pictures import COLOURS, GREY, MARKERS
+from framework.pictures import COLOURS, GREY, MARKERS, titled_figure
 from framework.tradeoff import Turn
 
 
@@ -29,9 +28,7 @@ def tradeoff(
         keys: metric → label of its axis.
         note: what it ran on.
     """
-    figure = Figure(figsize=(5.4 * len(keys), 4.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"{title} (synthetic data)" if synthetic else title, fontsize=12, parse_math=False)
+    figure = titled_figure((5.4 * len(keys), 4.6), title, synthetic)
     panels = figure.subplots(1, len(keys), squeeze=False)[0]
     for axes, (key, label) in zip(panels, keys.items(), strict=True):
         for index, (name, turns) in enumerate(curves.items()):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,10 +19,11 @@ from framework.settings import OptimizerSettings
 from framework.signals import Stopper
 from framework.tracking import Tracker
 
+# fused: one pass over the memory of each parameter instead of several, half the time of a small network's step
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
-    "adam": torch.optim.Adam,
-    "adamw": torch.optim.AdamW,
-    "sgd": torch.optim.SGD,
+    "adam": partial(torch.optim.Adam, fused=True),
+    "adamw": partial(torch.optim.AdamW, fused=True),
+    "sgd": partial(torch.optim.SGD, fused=True),
     "nadam": torch.optim.NAdam,
     "radam": torch.optim.RAdam,
 }
@@ -117,8 +119,8 @@ class Training(pl.LightningModule):
 class KeepCheckpoints(pl.Callback):
     """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, where it is to be kept, best.ckpt.
 
-    `last` is saved at every epoch's end and every `every_steps` steps; `best` whenever the validation loss is lower
-    than ever. Each write is whole or absent (framework.checkpoint).
+    `last` is saved at the end of every epoch that was validated, of the last one, and every `every_steps` steps; `best`
+    whenever the validation loss is lower than ever. Each write is whole or absent (framework.checkpoint).
 
     Attributes:
         kept_loss: validation loss of the weights that will be tested, nats.
@@ -161,7 +163,9 @@ class KeepCheckpoints(pl.Callback):
                 trainer.save_checkpoint(self.kept)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        self.save_last(trainer)
+        done, every = trainer.current_epoch + 1, trainer.check_val_every_n_epoch or 1
+        if done % every == 0 or done == trainer.max_epochs or trainer.should_stop:
+            self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
         last = self.folder / "last.ckpt"
@@ -218,7 +222,8 @@ class StopAtBatch(pl.Callback):
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         if self.stopper.received is not None:
-            self.stopper.stop()  # KeepCheckpoints, called before, has saved
+            self.keep.save_last(trainer)
+            self.stopper.stop()
 
     def on_validation_batch_end(
         self,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
-from framework.newton import derivatives, lowest, minimise
+from framework.newton import derivatives, minimise
 
 INFINITE = torch.tensor(math.inf, dtype=torch.float64)
 
@@ -142,13 +142,6 @@ def test_derivatives_agree_with_finite_differences():
         step[row] = 1e-5
         ahead, behind = (derivatives(terms, point + sign * step)[1] for sign in (1, -1))
         np.testing.assert_allclose(hessian[row].numpy(), ((ahead - behind) / 2e-5).numpy(), atol=1e-5)
-
-
-def test_the_start_with_the_least_value_is_chosen_and_the_first_of_equals():
-    well = [lambda x: ((x - 2) ** 2).sum()]
-    candidates = torch.tensor([[0.0], [1.5], [2.5], [math.nan]])
-    assert lowest(well, candidates).tolist() == [1.5]
-    assert lowest([lambda x: 0 * x.sum()], candidates[:3]).tolist() == [0.0]
 
 
 def test_bad_starts_get_a_sentence():

@@ -58,22 +58,36 @@ def predictions(
     """One row a sample: its name, the point prediction, and the entropy of the density in nats."""
     dataset = data.read(files) if files else data.test()
     loader = DataLoader(dataset, batch_size=settings.batch_size, collate_fn=as_batch)
-    names = [str(file) for file in files] if files else [f"test {i}" for i in range(len(loader.dataset))]  # type: ignore[arg-type]
+    names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
     for number, batch in enumerate(loader):
         seed_step(settings.seed, number, "predict")
         density = predictor(batch["input"])
         prediction = Prediction(density, batch, settings.samples)
-        columns = _columns(target, prediction.point) | {"entropy_nats": density.entropy()}
+        columns = _columns(target, prediction) | {"entropy_nats": prediction.entropy}
         for row in range(len(batch["index"])):
             values = {key: _text(column[row]) for key, column in columns.items()}
+            if target.kind == "class":
+                values = {"class": target.names[int(prediction.point[row])], **values}
             rows.append({"sample": names[len(rows)], **values})
     return rows
 
 
-def _columns(target: Target, point: Tensor) -> dict[str, Tensor]:
+def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
+    """Of each sample: its file, with its row where a file holds several; without files its place in the test split."""
+    if not files:
+        return [f"test {number}" for number in range(samples)]
+    if samples == len(files):
+        return [str(file) for file in files]
+    counts = [len(data.read([file])) for file in files]  # type: ignore[arg-type]
+    return [f"{file} row {row}" for file, count in zip(files, counts, strict=True) for row in range(count)]
+
+
+def _columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
     if target.kind == "class":
-        return {"class": point}
+        shares = prediction.class_probabilities
+        return {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
+    point = prediction.point
     if target.kind == "angle":
         degrees = wrap(point) * (180 / math.pi)
         return {f"{name}_deg": degrees[:, i] for i, name in enumerate(target.names)}

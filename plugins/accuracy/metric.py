@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework.class_probabilities import class_probabilities, require_labels
+from framework.class_probabilities import require_labels
 from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
@@ -42,7 +42,7 @@ class Accuracy(Metric):
         self.add_state("right", zero.clone(), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
-        probability = class_probabilities(prediction.density)
+        probability = prediction.class_probabilities
         label = require_labels(prediction.target, probability.shape[-1])
         self.count += len(label)
         self.right += (probability.argmax(-1) == label).sum()

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from framework.class_probabilities import class_probabilities, require_labels
+from framework.class_probabilities import require_labels
 from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
@@ -49,7 +49,7 @@ class Brier(Metric):
         self.add_state("squares", zero.clone(), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
-        probability = class_probabilities(prediction.density)
+        probability = prediction.class_probabilities
         score = brier(probability, require_labels(prediction.target, probability.shape[-1]))
         self.count += len(score)
         self.total += score.sum()

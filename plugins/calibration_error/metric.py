@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
-from framework.class_probabilities import class_probabilities, require_labels
+from framework.class_probabilities import require_labels
 from framework.errors import ConfigError
 from framework.metric import Metric, Pictured
 from framework.prediction import Prediction
@@ -83,7 +83,7 @@ class CalibrationError(Metric, Pictured):
         self.add_state("samples", [], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction) -> None:
-        probability = class_probabilities(prediction.density)
+        probability = prediction.class_probabilities
         label = require_labels(prediction.target, probability.shape[-1])
         if self.positive:
             confidence, right = probability[:, 1], label == 1

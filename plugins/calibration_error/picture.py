@@ -1,13 +1,11 @@
 """The reliability curve below the confidence histogram (thesis Figure 2.4)."""
 
-import textwrap
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from framework.pictures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED
+from framework.pictures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, titled_figure
 
 Numbers = Float[np.ndarray, "bin"]
 QUANTILE = 1.959963984540054
@@ -30,10 +28,7 @@ def reliability(
         count, confidence, right: of each bin of equal width the number of samples, and the sums of their confidences
             and of those right.
     """
-    figure = Figure(figsize=(5.8, 7.6), dpi=150, layout="constrained")
-    if synthetic and "synthetic" not in title.lower():
-        title = f"{title} (synthetic data)"
-    figure.suptitle(textwrap.fill(title, 56), fontsize=12, parse_math=False)
+    figure = titled_figure((5.8, 7.6), title, synthetic)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 5))
     below.set(xlim=(0, 1), ylim=(0, 1))
     below.set_xlabel(confidence_label, parse_math=False)

@@ -1,8 +1,9 @@
 """The density of a conditional variational autoencoder, and its two bounds as functions."""
 
+import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -19,6 +20,7 @@ from framework.monte_carlo import (
     estimate_log_mean,
     rows_of,
 )
+from framework.temper import tempered
 
 CHUNK = 2**22
 """Most hidden activations held at once without gradient (16 MiB in float32)."""
@@ -196,3 +198,23 @@ def _(density: CVAEDensity, index: int) -> Distribution:
 @median.register
 def _(density: CVAEDensity, samples: int) -> Tensor:
     return median(density.mixture, samples)
+
+
+@tempered.register
+def _(density: CVAEDensity, temperature: Tensor) -> CVAEDensity:
+    """Component by component; prior, encoder and the drawn points stay."""
+    changed = copy.copy(density)
+    changed.__dict__.pop("mixture", None)  # that of the untempered components, where it was asked for
+    changed.networks = _tempered(density.networks, temperature)
+    changed._example = tempered(density._example, temperature)
+    if temperature.requires_grad:
+        changed.effort = density._fixed  # what a tolerance draws in rounds would all be held
+    return changed
+
+
+def _tempered(networks: Networks, temperature: Tensor) -> Networks:
+    return replace(
+        networks,
+        component=lambda raw: tempered(networks.component(raw), temperature),
+        rows=lambda index: _tempered(networks.rows(index), temperature),
+    )

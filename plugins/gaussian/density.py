@@ -9,6 +9,8 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.density import marginal, median, pick, take
+from framework.normals import Normals, mahalanobis, normals, one_normal
+from framework.temper import tempered
 
 
 class Gaussian(Distribution):
@@ -106,3 +108,22 @@ def _(density: Gaussian, index: Tensor) -> Gaussian:
 def _(density: Gaussian, samples: int) -> Tensor:
     # each number's marginal is symmetric about its mean
     return density.location
+
+
+@normals.register
+def _(density: Gaussian) -> Normals | None:
+    return one_normal(density.location, density.scale) if tuple(density.event_shape) == (1,) else None
+
+
+@mahalanobis.register
+def _(density: Gaussian, value: Tensor) -> Tensor:
+    residual = value.double() - density.location.double()
+    if density.coefficients is not None:
+        residual = residual - (density.coefficients.double() @ residual.unsqueeze(-1)).squeeze(-1)
+    return (residual / density.scale.double()).square().sum(-1)
+
+
+@tempered.register
+def _(density: Gaussian, temperature: Tensor) -> Gaussian:
+    # every e_i is an independent N(0, σ_i²), and exp(-e²/2σ²)^(1/T) = exp(-e²/2σ²T)
+    return Gaussian(density.location, density.scale * temperature.sqrt(), density.coefficients)

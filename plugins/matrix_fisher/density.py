@@ -11,6 +11,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.circular import grid
 from framework.density import Circular, marginal, pick, take
+from framework.temper import tempered
 from plugins.matrix_fisher import angles, functions, quadrature, quaternions
 
 VOLUME = 8 * math.pi**2
@@ -158,3 +159,10 @@ def _(density: MatrixFisher, index: int) -> Angle:
 def _(density: MatrixFisher, index: Tensor) -> MatrixFisher:
     chosen = take(density.parameter.flatten(-2), index).unflatten(-1, (3, 3))
     return MatrixFisher(chosen, density.dtype)
+
+
+@tempered.register
+def _(density: MatrixFisher, temperature: Tensor) -> MatrixFisher:
+    """The power of the density of rotations, exp(tr(FᵀR))^(1/T): with F/T. Its viewpoint's density keeps the factor
+    cos e of the chart as it is, which is no one's belief."""
+    return MatrixFisher(density.parameter / temperature, density.dtype)

@@ -1,7 +1,8 @@
 """The densities of a simplified CVAE: a mixture of S samples, or of as many as a target error asks for."""
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -18,6 +19,7 @@ from framework.monte_carlo import (
     estimate_log_mean,
     rows_of,
 )
+from framework.temper import tempered
 
 CHUNK = 2**22
 """Most hidden activations held at once without gradient (16 MiB in float32)."""
@@ -167,3 +169,16 @@ def _(density: SCVAEDensity, index: int) -> Distribution:
 @median.register
 def _(density: SCVAEDensity, samples: int) -> Tensor:
     return median(density.mixture, samples)
+
+
+@tempered.register
+def _(density: SCVAEDensity, temperature: Tensor) -> SCVAEDensity:
+    """Component by component, at the same points z."""
+    changed = copy.copy(density)
+    changed.__dict__.pop("mixture", None)  # that of the untempered components, where it was asked for
+    component = density.networks.component
+    changed.networks = replace(density.networks, component=lambda raw: tempered(component(raw), temperature))
+    changed._example = tempered(density._example, temperature)
+    if temperature.requires_grad:
+        changed.effort = density._fixed  # what a tolerance draws in rounds would all be held
+    return changed

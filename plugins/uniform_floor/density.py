@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.density import Circular, circular_entropy, marginal, median, pick
+from framework.temper import tempered, tempered_classes
 
 
 class Floored(Distribution):
@@ -80,3 +81,11 @@ def _(density: Floored, samples: int) -> Tensor:
 @pick.register
 def _(density: Floored, index: Tensor) -> Floored:
     return Floored(pick(density.density, index), density.weight, density.log_uniform)
+
+
+@tempered.register
+def _(density: Floored, temperature: Tensor) -> Distribution:
+    """As of any mixture: of classes the whole; of angles p is tempered and the floor, whose power it is, stays."""
+    if density.has_enumerate_support:
+        return tempered_classes(density, temperature)
+    return Floored(tempered(density.density, temperature), density.weight, density.log_uniform)

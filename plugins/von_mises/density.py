@@ -5,7 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints, register_kl
 
+from framework.cdf import arc, turn
 from framework.density import circular, marginal, median, pick, take
+from framework.temper import tempered
 from plugins.von_mises import functions, integrals
 
 
@@ -68,9 +70,24 @@ def _(density: VonMises, samples: int) -> Tensor:
     return density.location
 
 
+@tempered.register
+def _(density: VonMises, temperature: Tensor) -> VonMises:
+    # exp(κ cos)^(1/T) = exp(κ/T cos)
+    return VonMises(density.location, density.concentration / temperature)
+
+
 @register_kl(VonMises, VonMises)
 def _(first: VonMises, second: VonMises) -> Tensor:
     parts = integrals.kl_divergence(
         first.location, first.concentration, second.location, second.concentration
     )
     return parts.sum(-1)
+
+
+@arc.register
+def _(density: VonMises, start: Tensor, end: Tensor) -> Tensor:
+    mean, concentration = density.location.double(), density.concentration.double()
+    first = start.double()
+    before = integrals.cdf(first, mean, concentration)
+    through = integrals.cdf(first + turn(start, end), mean, concentration)
+    return (through - before).squeeze(-1).clamp(0, 1)

@@ -1,0 +1,152 @@
+"""Table 2.1 on the two moons (synthetic): every row with five seeds, error and run time; Figures 2.3 and 2.4.
+
+    python -m framework -m hydra.launcher.jobs=2 threads=1 seed=0,1,2,3,4 hydra.sweep.dir=outputs/sweeps/moons \\
+        experiment=moons/vanilla_128,moons/vanilla_512,...   (all of conf/experiment/moons but base)
+    python benchmarks/moons.py outputs/sweeps/moons
+
+Writes moons.md, moons_landscapes.png and moons_reliability.png beside this file.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import framework
+from benchmarks.machine import machine
+from framework.landscape_picture import Plane, landscapes, probabilities
+from framework.schema import build, resolve
+from framework.table import aggregate, markdown
+
+HERE = Path(__file__).parent
+METHODS = {
+    "vanilla_128": "vanilla, 128",
+    "vanilla_512": "vanilla, 512",
+    "temperature": "+ temperature",
+    "platt": "+ Platt",
+    "mc_dropout": "MC dropout",
+    "ensemble": "ensemble of 10",
+    "outlier_exposure": "outlier exposure",
+    "adversarial": "adversarial",
+    "ensemble_temperature": "ensemble + temperature",
+    "mc_dropout_temperature_outlier_exposure": "MC dropout + temperature + outlier exposure",
+    "ensemble_temperature_outlier_exposure": "ensemble + temperature + outlier exposure",
+    "everything": "ensemble of MC dropout + temperature + outlier exposure",
+}
+COLUMNS = {
+    "method": "method",
+    "accuracy": "accuracy",
+    "nll": "NLL",
+    "brier": "Brier",
+    "ece": "ECE",
+    "ood_entropy": "OOD entropy",
+    "auroc": "AUROC",
+    "milliseconds_per_sample": "ms / sample",
+    "seconds": "whole run, s",
+    "n": "seeds",
+}
+BETTER = {
+    "accuracy": "higher",
+    "nll": "lower",
+    "brier": "lower",
+    "ece": "lower",
+    "ood_entropy": "higher",
+    "auroc": "higher",
+}
+THESIS = """| method (thesis, its own data) | accuracy | NLL | Brier | ECE | OOD entropy |
+|---|---|---|---|---|---|
+| vanilla, 128 | 85.8 % | 0.345 | 0.102 | 0.045 | 0.024 |
+| vanilla, 512 | 86.5 % | 0.437 | 0.107 | 0.081 | 0.009 |
+| + temperature | 86.5 % | 0.320 | 0.098 | 0.045 | 0.031 |
+| MC dropout | 86.8 % | 0.311 | 0.093 | 0.039 | 0.101 |
+| ensemble of 10 | 86.8 % | 0.372 | 0.102 | 0.072 | 0.070 |
+| outlier exposure | 87.5 % | 0.342 | 0.101 | 0.030 | 0.689 |"""
+
+
+def results(sweep: Path) -> list[dict[str, Any]]:
+    rows = []
+    for path in sorted(sweep.glob("*/results.json")):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        job = json.loads((path.parent / "job.json").read_text(encoding="utf-8"))
+        key = found["experiment"].rpartition("/")[2]
+        kept = {name: found[name] for name in COLUMNS if name in found}
+        rows.append(
+            {**kept, "key": key, "method": METHODS[key], "seed": found["seed"], "folder": str(path.parent)}
+            | {"seconds": job["ended"] - job["started"], "synthetic": found["synthetic"]}
+            | {"started": job["started"], "ended": job["ended"]}
+        )
+    order = list(METHODS)
+    return sorted(rows, key=lambda row: (order.index(row["key"]), row["seed"]))
+
+
+def best_possible() -> str:
+    """What the exact posterior of the generator gives on the same test points."""
+    data = build("data", resolve("data", "moons"))
+    data.prepare()
+    fields = data.test().fields
+    p, label = fields["posterior"][:, 1].double().numpy(), fields["target"].numpy()
+    own = np.where(label == 1, p, 1 - p)
+    return (
+        f"The exact posterior of the generator on the same test points: accuracy {((p > 0.5) == label).mean():.3f}, "
+        f"NLL {-np.log(own).mean():.4f}, Brier {((label - p) ** 2).mean():.4f}."
+    )
+
+
+def pictures(rows: list[dict[str, Any]]) -> None:
+    """Of the runs with seed 0."""
+    folders = {row["key"]: Path(row["folder"]) for row in rows if row["seed"] == 0}
+    data, others = build("data", resolve("data", "moons")), build("data", resolve("data", "moons_outliers"))
+    data.prepare()
+    others.prepare()
+    seen, far = data.train().fields, others.test().fields["input"].numpy()
+    plane = Plane(seen["input"].numpy(), seen["target"].numpy(), far, data.target.names, 4.0)
+    six = ["vanilla_128", "vanilla_512", "temperature", "mc_dropout", "ensemble", "outlier_exposure"]
+    panels = {
+        f"({letter}) {METHODS[key]}": probabilities(framework.load(folders[key]), plane.half_width)
+        for letter, key in zip("abcdef", six, strict=True)
+    }
+    figure = landscapes(panels, plane, title="Probability landscapes of Table 2.1, seed 0", synthetic=True)
+    figure.savefig(HERE / "moons_landscapes.png", dpi=100)
+    figure = Figure(figsize=(11, 6.6), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    for place, key in zip(figure.subplots(1, 2), ("vanilla_512", "temperature"), strict=True):
+        place.imshow(imread(folders[key] / "figures" / "reliability.png"))
+        place.set_axis_off()
+    figure.savefig(HERE / "moons_reliability.png")
+
+
+def main() -> None:
+    torch.set_num_threads(2)
+    rows = results(Path(sys.argv[1]))
+    pictures(rows)
+    took = max(row["ended"] for row in rows) - min(row["started"] for row in rows)
+    kept = [
+        {key: value for key, value in row.items() if key in COLUMNS or key in ("seed", "synthetic")}
+        for row in rows
+    ]
+    compared = aggregate(kept, by=["method"])
+    text = (
+        "# Table 2.1: uncertainty on the two moons (synthetic data)\n\n"
+        f"{len(rows)} runs in {took:.0f} s, two at a time on two cores (`benchmarks/moons.py` has the command). The "
+        "same data for all, 5000 test points; ± is the standard deviation over seeds. The settings of `conf/experiment/"
+        "moons` were chosen on the validation split alone.\n\n"
+        f"{markdown(compared, COLUMNS, better=BETTER)}\n\n{best_possible()}\n\n{THESIS}\n\n"
+        "![landscapes](moons_landscapes.png)\n\n![reliability](moons_reliability.png)\n\n"
+        f"{machine('torch', 'pytorch-lightning')}\n"
+    )
+    note = HERE / "moons_note.md"
+    if note.is_file():
+        text = text.replace("![landscapes]", note.read_text(encoding="utf-8") + "\n![landscapes]")
+    (HERE / "moons.md").write_text(text, encoding="utf-8")
+    sys.stdout.write(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""NLL and ECE against run time on the two moons (synthetic): 1 to 20 networks, 1 to 100 dropout passes, temperature.
+
+    python -m framework experiment=moons/ensemble uncertainty.ensemble.members=20 hydra.run.dir=outputs/time/ensemble
+    python -m framework experiment=moons/ensemble_temperature uncertainty.ensemble.members=20 \\
+        hydra.run.dir=outputs/time/ensemble_temperature
+    python -m framework experiment=moons/<mc_dropout, vanilla_512, temperature> hydra.run.dir=outputs/time/<the same>
+    python benchmarks/moons_time.py outputs/time
+
+Writes moons_time.csv and moons_time.png beside this file.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import framework
+from benchmarks.machine import machine
+from framework.batches import as_batch
+from framework.schema import build, resolve
+from framework.tradeoff import rows, tradeoff, write
+from framework.tradeoff_picture import tradeoff as drawn
+
+HERE = Path(__file__).parent
+KNOBS = {
+    "vanilla_512": ("one network", "", (1,)),
+    "temperature": ("one network + temperature", "", (1,)),
+    "ensemble": ("ensemble", "members", (1, 2, 3, 5, 10, 20)),
+    "ensemble_temperature": ("ensemble + temperature", "members", (1, 2, 3, 5, 10, 20)),
+    "mc_dropout": ("MC dropout", "samples", (1, 3, 10, 30, 100)),
+}
+KEYS = {"nll": "NLL (nats)", "ece": "ECE"}
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    data = build("data", resolve("data", "moons"))
+    data.prepare()
+    test = data.test()
+    batches = [as_batch(test.__getitems__(range(start, start + 500))) for start in range(0, len(test), 500)]
+    metrics = [
+        build("metric", resolve("metric", name), target=data.target) for name in ("nll", "calibration_error")
+    ]
+    curves = {}
+    for key, (name, knob, values) in KNOBS.items():
+        predictor = framework.load(Path(sys.argv[1]) / key)
+        curves[name] = tradeoff(
+            predictor,
+            batches,
+            metrics,
+            knob=knob,
+            values=values,
+            samples=1,
+            seed=0,
+            repeats=5 if knob == "samples" else 1,
+        )
+    found = rows(curves, list(KEYS), dict.fromkeys(KEYS, True), synthetic=True)
+    write(found, HERE / "moons_time.csv")
+    where = f"batches of 500, one thread; {machine('torch')}"
+    title = "Two moons: NLL and ECE against run time, 512-512 networks"
+    drawn(curves, KEYS, title=title, synthetic=True, note=where).savefig(HERE / "moons_time.png", dpi=110)
+    for row in found:
+        sys.stdout.write(f"{row['method']}, {row['value']}: NLL {row['nll']:.4f}, ECE {row['ece']:.4f}, ")
+        sys.stdout.write(f"{row['milliseconds_per_sample'] * 1e3:.2f} µs\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,13 @@
+"""Rows of the contract: one and several reals and angles."""
+
+from framework.target import Target
+from framework.testing.rows import MetricRow
+
+ROWS = {
+    "crps": (
+        MetricRow("one real", Target("real", ("height",))),
+        MetricRow("three reals", Target("real", ("x", "y", "z"))),
+        MetricRow("one angle", Target("angle", ("azimuth",))),
+        MetricRow("three angles", Target("angle", ("azimuth", "elevation", "tilt"))),
+    )
+}

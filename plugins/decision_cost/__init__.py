@@ -1,0 +1,1 @@
+"""What it costs to act on the predicted densities."""

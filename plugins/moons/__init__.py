@@ -1,0 +1,1 @@
+"""Two interleaved half circles with overlapping noise, and points far from both, as data sets."""

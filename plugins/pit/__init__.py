@@ -1,0 +1,1 @@
+"""Probability integral transform."""

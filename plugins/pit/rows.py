@@ -1,0 +1,13 @@
+"""Rows of the contract: one and several reals and angles."""
+
+from framework.target import Target
+from framework.testing.rows import MetricRow
+
+ROWS = {
+    "pit": (
+        MetricRow("one real", Target("real", ("height",))),
+        MetricRow("two reals", Target("real", ("x", "y"))),
+        MetricRow("one angle", Target("angle", ("azimuth",)), {"bins": 5}),
+        MetricRow("three angles", Target("angle", ("azimuth", "elevation", "tilt"))),
+    )
+}

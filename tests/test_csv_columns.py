@@ -1,0 +1,138 @@
+"""A CSV file by columns: what is read, and what is refused by line and column."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.csv_columns import mostly_numbers, number, numbers, read_columns, require
+from framework.errors import DataError
+
+
+def written(folder: Path, content: str | bytes) -> Path:
+    file = folder / "table.csv"
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return file
+
+
+def test_what_a_spreadsheet_writes_is_read(tmp_path: Path) -> None:
+    """A byte-order mark, carriage returns, quotes, blanks, empty lines and lines of nothing but commas."""
+    text = 'a, b ,word\r\n1, 2.5 ,"x, y"\r\n\r\n,,\r\n"-1e3",nan, z\r\n'
+    columns = read_columns(written(tmp_path, b"\xef\xbb\xbf" + text.encode()))
+    assert columns.cells == {"a": ["1", "-1e3"], "b": ["2.5", "nan"], "word": ["x, y", "z"]}
+    assert columns.lines == [2, 5]
+    np.testing.assert_array_equal(numbers(columns, "a", missing=""), [1.0, -1000.0])
+    np.testing.assert_array_equal(numbers(columns, "b", missing=None), [2.5, math.nan])
+
+
+def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None:
+    columns = read_columns(written(tmp_path, 'a\n1\n""\n\n3\n'))
+    assert columns.lines == [2, 3, 5]
+    np.testing.assert_array_equal(numbers(columns, "a", missing=None), [1.0, math.nan, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "is empty or begins with a blank line"),
+        ("\na,b\n1,2", "is empty or begins with a blank line"),
+        ("a,b", "has no row below its first line"),
+        ("a,b\n,\n\n", "has no row below its first line"),
+        ("a;b\n1;2", r"is separated by semicolons: its first line reads 'a;b'; wanted commas"),
+        ("a\tb\n1\t2", "is separated by tabs"),
+        ("a,b,a\n1,2,3", "names the column 'a' twice"),
+        (",a\n0,1", r"column 1 has no name \(a row number"),
+        ("a,b\n1,2\n1,2,3", "line 3: 3 cells; wanted 2"),
+        ("a,b\n1,2\n1\n", "line 3: 1 cells; wanted 2"),
+        ('a,b\n1,"2', "cannot be read"),
+        (b"a,b\n\xe4,2", "cannot be read .* wanted UTF-8 text"),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        read_columns(written(tmp_path, content))
+
+
+def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"none\.csv: no such file; wanted a CSV table"):
+        read_columns(tmp_path / "none.csv")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_columns(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        ("abc", r"line 4, column 'a': 'abc'; wanted a finite number"),
+        ("", r"line 4, column 'a': ''; .* Or set it to skip\."),
+        ("NA", r"'NA'; .* Or set it to skip\."),
+        ("nan", r"'nan'; .* Or set it to skip\."),
+        ("-inf", r"'-inf'; wanted a finite number\. Mend the cell, or take the line out\.$"),
+        ("1e999", "'1e999'; wanted a finite number"),
+        ("1_0", "'1_0'; wanted a finite number"),
+        ('"1,5"', r"'1,5'; .* Decimals are written with a point"),
+    ],
+)
+def test_cells_that_are_no_finite_number_are_named(tmp_path: Path, cell: str, message: str) -> None:
+    columns = read_columns(written(tmp_path, f"a,b\n1,1\n2,2\n{cell},3\nxyz,4\n"))
+    with pytest.raises(DataError, match=message):
+        numbers(columns, "a", missing="set it to skip")
+    np.testing.assert_array_equal(numbers(columns, "b", missing=""), [1.0, 2.0, 3.0, 4.0])
+
+
+def test_only_missing_numbers_may_be_missing(tmp_path: Path) -> None:
+    columns = read_columns(written(tmp_path, "a\n1\nNone\n?\ninf\n"))
+    with pytest.raises(DataError, match="line 5, column 'a': 'inf'"):
+        numbers(columns, "a", missing=None)
+
+
+def test_columns_of_numbers_are_told_from_columns_of_words(tmp_path: Path) -> None:
+    text = "numbers,typo,words,empty,half\n1,1,a,,1\n2,x,b,NA,b\n3,3,3,,\n"
+    columns = read_columns(written(tmp_path, text))
+    found = [name for name in columns.cells if mostly_numbers(columns, name)]
+    assert found == ["numbers", "typo"]
+
+
+def test_a_name_that_is_no_column_is_refused_with_the_nearest(tmp_path: Path) -> None:
+    columns = read_columns(written(tmp_path, "height,width\n1,2\n"))
+    require(columns, ("width", "height"), "data.columns")
+    with pytest.raises(DataError, match=r"data\.columns names 'heigth', .* Did you mean 'height'\?"):
+        require(columns, ("heigth",), "data.columns")
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=20))
+@settings(deadline=None, max_examples=50)
+def test_every_float_comes_back_to_the_last_bit(
+    tmp_path_factory: pytest.TempPathFactory, values: list[float]
+) -> None:
+    text = "a,b\n" + "\n".join(f"{value!r},{'' if index else 1}" for index, value in enumerate(values))
+    columns = read_columns(written(tmp_path_factory.mktemp("any"), text))
+    assert numbers(columns, "a", missing="").tolist() == values
+    found = numbers(columns, "b", missing=None)  # through the cells one by one
+    assert found[0] == 1
+    assert np.isnan(found[1:]).all()
+
+
+@given(st.text(max_size=80))
+@settings(deadline=None, max_examples=150)
+def test_any_text_is_read_or_refused_with_a_sentence(
+    tmp_path_factory: pytest.TempPathFactory, text: str
+) -> None:
+    file = tmp_path_factory.mktemp("any") / "table.csv"
+    file.write_text(text, encoding="utf-8", errors="replace", newline="")
+    try:
+        columns = read_columns(file)
+    except DataError as error:
+        assert str(file) in str(error)
+        return
+    assert all(len(column) == len(columns.lines) >= 1 for column in columns.cells.values())
+    for name in columns.cells:
+        alone = [number(cell) for cell in columns.cells[name]]
+        finite = all(value is not None and math.isfinite(value) for value in alone)
+        try:
+            assert finite == (numbers(columns, name, missing="").tolist() == alone)
+        except DataError:
+            assert not finite

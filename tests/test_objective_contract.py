@@ -1,0 +1,175 @@
+"""The contract of objectives: what each of its checks catches."""
+
+import pytest
+import torch
+from torch import nn
+
+from framework.errors import ConfigError
+from framework.objective import Objective
+from framework.target import Target
+from framework.testing.finding import require
+from framework.testing.objectives import examine_objective
+from framework.testing.rows import ObjectiveRow
+
+ROW = ObjectiveRow("reals", Target("real", ("x", "y")))
+
+
+class Spread(Objective):
+    """Sound: the mean entropy-like size of the places, of each member."""
+
+    def __init__(self, weight):
+        super().__init__()
+        if weight <= 0:
+            raise ConfigError("weight: wanted more than 0.")
+        self.weight = weight
+
+    def places(self, predictor, batch):
+        numbers = batch["input"].to(next(predictor.parameters()).dtype)
+        norms = [layer for layer in predictor.modules() if isinstance(layer, nn.BatchNorm1d)]
+        modes = [layer.training for layer in norms]
+        for layer in norms:
+            layer.training = False
+        found = predictor.training_densities(numbers)
+        for layer, mode in zip(norms, modes, strict=True):
+            layer.training = mode
+        members = getattr(found, "densities", [found])
+        return torch.stack([one.loc.square().mean(-1) for one in members], 1)
+
+    def penalty(self, predictor, batch):
+        each = self.places(predictor, batch)
+        return each.sum() + (each.mean(1).sum() - each.sum()).detach()
+
+    def forward(self, predictor, batch):
+        return self.weight * self.penalty(predictor, batch) / max(1, len(batch["input"]))
+
+
+class Averaging(Spread):
+    """Divides each member's gradient by their number."""
+
+    def penalty(self, predictor, batch):
+        return self.places(predictor, batch).mean(1).sum()
+
+
+class Learning(Spread):
+    """Moves the running moments."""
+
+    def penalty(self, predictor, batch):
+        predictor.training_densities(batch["input"].to(next(predictor.parameters()).dtype))
+        return super().penalty(predictor, batch)
+
+
+class Switching(Spread):
+    """Leaves the predictor in evaluation."""
+
+    def penalty(self, predictor, batch):
+        predictor.eval()
+        return super().penalty(predictor, batch)
+
+
+class Backward(Spread):
+    """Leaves gradients in the parameters."""
+
+    def penalty(self, predictor, batch):
+        found = super().penalty(predictor, batch)
+        found.backward(retain_graph=True)
+        return found
+
+
+class Squared(Spread):
+    """Not linear in its weight."""
+
+    def forward(self, predictor, batch):
+        return self.weight * super().forward(predictor, batch)
+
+
+class Detached(Spread):
+    """No gradient."""
+
+    def forward(self, predictor, batch):
+        return super().forward(predictor, batch).detach()
+
+
+class Halved(Spread):
+    """Half the gradient of its value."""
+
+    def penalty(self, predictor, batch):
+        found = super().penalty(predictor, batch)
+        return found / 2 + found.detach() / 2
+
+
+class Empty(Spread):
+    """The mean of no samples."""
+
+    def forward(self, predictor, batch):
+        return self.weight * self.places(predictor, batch).sum(1).mean()
+
+
+class Unseeded(Spread):
+    """Noise that no seed fixes."""
+
+    generator = torch.Generator().manual_seed(0)
+
+    def penalty(self, predictor, batch):
+        return super().penalty(predictor, batch) * torch.rand((), generator=self.generator)
+
+
+class Ordered(Spread):
+    """Reads the batch from its front."""
+
+    def penalty(self, predictor, batch):
+        return super().penalty(predictor, {**batch, "input": batch["input"][: len(batch["input"]) // 2]})
+
+
+class Narrow(Spread):
+    """float32 whatever comes."""
+
+    def forward(self, predictor, batch):
+        return super().forward(predictor, batch).float()
+
+
+class Overflowing(Spread):
+    """e to the power of what it penalises."""
+
+    def penalty(self, predictor, batch):
+        return super().penalty(predictor, batch).exp()
+
+
+class Marking(Spread):
+    """Leaves inputs that need a gradient."""
+
+    def penalty(self, predictor, batch):
+        batch["input"].requires_grad_()
+        return super().penalty(predictor, batch)
+
+
+def test_a_sound_objective_passes():
+    require(*examine_objective(ROW, Spread))
+
+
+@pytest.mark.parametrize(
+    "kind, caught",
+    [
+        (Averaging, "members train as if alone"),
+        (Learning, "leaves no trace"),
+        (Switching, "leaves no trace"),
+        (Backward, "leaves no trace"),
+        (Marking, "leaves no trace"),
+        (Squared, "weight is a factor"),
+        (Detached, "a finite scalar"),
+        (Halved, "gradient"),
+        (Empty, "empty and single batches"),
+        (Unseeded, "same seed, same bits"),
+        (Ordered, "order does not matter"),
+        (Narrow, "number types"),
+        (Overflowing, "extreme raw numbers"),
+    ],
+)
+def test_an_unsound_objective_is_caught(kind, caught):
+    failed = [finding.name for finding in examine_objective(ROW, kind) if not finding.holds]
+    assert caught in failed
+
+
+def test_what_a_row_leaves_out_is_not_examined():
+    row = ObjectiveRow("reals", ROW.target, leave_out={"gradient": "it has none"})
+    names = [finding.name for finding in examine_objective(row, Spread)]
+    assert "gradient" not in names and "leaves no trace" in names
