@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from framework.model import Predictor
 from framework.pictures import BLUE, ORANGE, titled_figure
 
-POINTS = 201
+POINTS = 61
 """Along each side of the plane."""
 SHOWN = 300
 """Points of each kind drawn over a landscape, at most."""

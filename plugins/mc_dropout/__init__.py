@@ -1,0 +1,1 @@
+"""Monte Carlo dropout (thesis §2.3.2)."""

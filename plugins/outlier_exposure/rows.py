@@ -1,0 +1,21 @@
+"""Rows of the contract: outlier exposure, for each kind of target and divergence."""
+
+from framework.target import Target
+from framework.testing.rows import ObjectiveRow
+
+CLASSES = Target("class", ("a", "b", "c"))
+ANGLE = Target("angle", ("azimuth",))
+ANGLES = Target("angle", ("azimuth", "elevation"))
+REALS = Target("real", ("x", "y"))
+BOX = {"low": -4.0, "high": 4.0}  # that of the thesis's toy data
+
+ROWS = {
+    "outlier_exposure": (
+        ObjectiveRow("classes", CLASSES, BOX),
+        ObjectiveRow("classes, cross-entropy", CLASSES, {**BOX, "divergence": "cross_entropy"}),
+        ObjectiveRow("seven outliers", CLASSES, {**BOX, "count": 7, "weight": 0.3}),
+        ObjectiveRow("one angle", ANGLE, BOX),
+        ObjectiveRow("two angles", ANGLES, BOX),
+        ObjectiveRow("reals", REALS, {**BOX, "prior_scale": 5.0}),
+    )
+}
