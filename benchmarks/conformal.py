@@ -160,7 +160,7 @@ def main() -> None:
         "# Conformal prediction sets: coverage and size\n\n"
         f"`python benchmarks/conformal.py`: means over {SPLITS} random splits of {POOL} samples (half validation, of "
         "which the wrapper's own half gives the threshold); fixed models, badly calibrated on purpose; size over the "
-        "first 10 splits. `spread` is the standard deviation over splits, about 1.3 % where 500 scores and 1000 "
+        "first 10 splits. `spread` is the standard deviation over splits, about 1.6 % where 500 scores and 1000 "
         "targets are drawn at 90 %. `model's own` is the coverage of the model's region of that mass without any "
         "calibration. Synthetic data.\n\n"
         "| data, unit of size | model | wrappers | score | promised | covered | spread | model's own | mean size |\n"

@@ -1,0 +1,1 @@
+"""Sets that cover as promised."""

@@ -1,0 +1,1 @@
+"""Slope and biases for the log-probabilities of classes."""

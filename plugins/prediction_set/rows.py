@@ -1,0 +1,25 @@
+"""Rows of the contract. Its densities have no sets: what needs them is shown in test_prediction_set_metric.py, by the
+same checks on sets."""
+
+from framework.target import Target
+from framework.testing.rows import MetricRow
+
+NO_SET = "it judges sets, which the contract's densities have none of; its own test runs this check on sets"
+CHECKS = (
+    "named numbers",
+    "batches do not matter",
+    "order does not matter",
+    "states merge",
+    "reset and copy",
+    "perfect beats random",
+)
+ROWS = {
+    "prediction_set": tuple(
+        MetricRow(name, target, leave_out=dict.fromkeys(CHECKS, NO_SET))
+        for name, target in {
+            "classes": Target("class", ("a", "b", "c")),
+            "one angle": Target("angle", ("azimuth",)),
+            "one real": Target("real", ("height",)),
+        }.items()
+    )
+}

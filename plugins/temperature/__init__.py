@@ -1,0 +1,1 @@
+"""One temperature for all densities."""
