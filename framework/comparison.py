@@ -271,7 +271,7 @@ def _close_parent(folder: Path, files: Sequence[Path], rows: Sequence[Mapping[st
     tracker.open()
     for row in rows:
         numbers = {key: float(value) for key, value in row.items() if isinstance(value, int | float)}
-        name = f"{row['method']}/{row['data']}"
+        name = f"{str(row['method']).replace(' + ', ' ')}/{row['data']}"  # MLflow's names hold no plus
         tracker.log_metrics({f"{name}/{key}": value for key, value in numbers.items()}, 0, 0)
     for file in files:
         tracker.log_artifact(file)

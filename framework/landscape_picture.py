@@ -96,6 +96,6 @@ def _points(place: Axes, plane: Plane) -> None:
     for label, name in enumerate(plane.names):
         some = plane.points[plane.labels == label][:SHOWN]
         colour = (BLUE, ORANGE)[label] if len(plane.names) == 2 else None
-        place.scatter(*some.T, s=7, color=colour, edgecolor="white", linewidth=0.3, label=name)
+        place.scatter(*some.T, s=9, color=colour, edgecolor="black", linewidth=0.35, label=name)
     if len(plane.outliers):
         place.scatter(*plane.outliers[:SHOWN].T, s=12, marker="^", color="black", label="outliers")

@@ -21,7 +21,7 @@ from framework.evaluation import Evaluation, cost, evaluate, on_device
 from framework.metric import Metric, Pictured
 from framework.model import Predictor
 from framework.prediction import Prediction
-from framework.run import Run
+from framework.run import Run, stored_overrides
 from framework.table import COST_BETTER, COST_COLUMNS, Better, results_table
 
 if TYPE_CHECKING:
@@ -62,7 +62,8 @@ def report_test(
     spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
-    results = _results(run, resolved, data, found, spent, columns, better)
+    synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
+    results = _results(run, resolved, data, found, spent, columns, better) | {"synthetic": synthetic}
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
     step = 0
@@ -84,7 +85,6 @@ def report_test(
     if data.target.kind == "class" and data.input_shape == (2,):
         figure = landscape(predictor, data, outliers, device, results["method"])
         picture(run, figure, "landscape.png")
-    synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
     for metric in found.metrics:
         if isinstance(metric, Pictured):
             picture(run, metric.figure(results["experiment"], synthetic=synthetic), f"{metric.picture}.png")
@@ -109,15 +109,18 @@ def _results(
     better: Better,
 ) -> dict[str, Any]:
     name = run.settings.experiment_name
-    method = name.rpartition("/")[2] if name else str(resolved["density_head"]["name"])
-    # an experiment that is named for its wrapper need not say it twice
-    wrappers = [part["name"] for part in resolved["uncertainty"] if part["name"] not in method]
+    wrappers = [part["name"] for part in resolved["uncertainty"]]
+    if name:  # an experiment's name stands for its own wrappers
+        method = name.rpartition("/")[2]
+        changed = any(item.lstrip("+~").startswith("uncertainty") for item in stored_overrides(run.folder))
+        wrappers = wrappers if changed else []
+    else:
+        method = str(resolved["density_head"]["name"])
     return {
         "method": " + ".join([method, *wrappers]),
         "experiment": name or "no experiment",
         "data": ", ".join(data.groups),
         "seed": run.settings.seed,
-        "synthetic": data.synthetic,
         **{key: _plain(value) for key, value in found.total.items()},
         "groups": {
             name: {k: _plain(v) for k, v in numbers.items()} for name, numbers in found.groups.items()

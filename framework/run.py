@@ -16,7 +16,7 @@ from framework.journal import write_atomically
 from framework.provenance import flatten, git_commit, package_versions
 from framework.settings import Settings, store_experiment
 from framework.signals import Stopped, Stopper
-from framework.sweep import PARENT
+from framework.sweep import PARENT, SYNCED_WITHIN
 from framework.tracking import MlflowTracker, NoTracker, Tracker, read_run_info
 
 
@@ -108,6 +108,7 @@ def _tracker(
         experiment=store_experiment(values),
         run_name=run_name(settings, values["mode"]["name"], overrides),
         parent=os.environ.get(PARENT),
+        wait=SYNCED_WITHIN if PARENT in os.environ else 0.0,
         run_id=run_id,
         resumed=resumed,
     )

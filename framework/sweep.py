@@ -12,6 +12,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -25,6 +26,8 @@ PARENT = "FRAMEWORK_SWEEP_PARENT"
 """Environment variable that tells a job the tracking run its sweep is recorded under."""
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """What runs one job; its overrides follow. No config can set it, since it would then run code."""
+SYNCED_WITHIN = 60.0
+"""Seconds: what a shorter job has to tell the tracking store, the sweep sends when it has ended."""
 RECORD = "job.json"
 CONSOLE = "console.log"
 VALUE = "value.json"
@@ -157,7 +160,7 @@ def run(
     )
     running: list[_Running] = []
     passed_on = 0
-    with _signals() as received:
+    with _signals() as received, ThreadPoolExecutor(1, "sync") as sending:
         while running or (queue and not received):
             for number in received[passed_on:]:
                 _pass_on(number, passed_on, running)
@@ -179,11 +182,21 @@ def run(
             for one in [one for one in running if one.process.poll() is not None]:
                 running.remove(one)
                 _end(one)
+                if parent is not None:
+                    sending.submit(_sync, one.job.folder)
                 if one.job.record["status"] == "died" and one.job.attempts <= retries and not received:
                     queue.append(one.job)
             time.sleep(0.05)
     if received:
         raise Stopped(received[0])
+
+
+def _sync(folder: Path) -> None:
+    """Send what a job left unsent; one that died is closed and sent by `summarise`."""
+    try:
+        import_module("framework.tracking").sync(folder)
+    except UserError as error:
+        log.warning(f"{folder}: {error}")
 
 
 def failure(jobs: Sequence[Job]) -> UserError | None:

@@ -154,6 +154,9 @@ class MlflowTracker(Tracker):
     has is not sent again: a resumed run repeats the steps after its checkpoint, and of these the store keeps
     what it got first.
 
+    A short run that somebody else will `sync` when it has ended (a sweep, which has MLflow at hand already) need not
+    pay for MLflow's import, several seconds: with `wait` nothing is sent before that time is over.
+
     Args:
         folder: of the run.
         uri: an MLflow tracking URI; None: `default_uri(folder)`.
@@ -164,6 +167,7 @@ class MlflowTracker(Tracker):
         resumed: whether to go on with the run in the folder, or to set that aside; None: as `run_id` tells.
         patience: seconds `close` waits for the store.
         opening_patience: seconds `open` waits for the store.
+        wait: seconds after opening before the first line is sent; a run that ends sooner sends nothing.
 
     Raises:
         ConfigError: `uri` names a store that MLflow cannot keep runs in.
@@ -181,6 +185,7 @@ class MlflowTracker(Tracker):
         resumed: bool | None = None,
         patience: float = 60.0,
         opening_patience: float = 30.0,
+        wait: float = 0.0,
     ) -> None:
         self.folder = folder.absolute()
         self.journal = Journal(self.folder / JOURNAL)
@@ -199,14 +204,20 @@ class MlflowTracker(Tracker):
         self._resumed = resumed
         self._patience = patience
         self._opening_patience = opening_patience
+        self._sends_from = time.monotonic() + wait if wait else 0.0
         self._sidecar: Sidecar | None = None
         self._sender: Sender | None = None
+        self._closed = False
 
     def open(self) -> None:
+        self._closed = False
         self._sidecar = _begin(self.folder, self.journal, self._wanted, self._resumed)
         self.journal.append(status="RUNNING")
+        self._notice()
+
+    def _start_sending(self, sidecar: Sidecar) -> None:
         # Imported here and not in the sender's thread: imports of two threads can get into each other's way.
-        sender = Sender(self.folder, self.journal, self._sidecar, _mlflow_store())
+        sender = Sender(self.folder, self.journal, sidecar, _mlflow_store())
         sender.start()
         if not sender.tried.wait(self._opening_patience):
             sender.warn("no answer yet")
@@ -225,8 +236,7 @@ class MlflowTracker(Tracker):
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
-        if self._sender is not None:
-            self._sender.notice()
+        self._notice()
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
         path = path.absolute()
@@ -238,15 +248,16 @@ class MlflowTracker(Tracker):
         self.journal.drop_after(step)
 
     def close(self, status: Status) -> None:
-        if self._sidecar is not None and self._sender is not None:
+        if self._sidecar is not None and not self._closed:
             self.journal.append(status=status)
             self._sidecar.update(status=status)
         self.leave_open()
 
     def leave_open(self) -> None:
-        if self._sidecar is None or self._sender is None:
+        if self._sidecar is None or self._closed:
             return
-        if not self._sender.finish(self._patience):
+        self._closed = True
+        if self._sender is not None and not self._sender.finish(self._patience):
             _log.warning(
                 "Part of this run has not reached the tracking store %s; it is kept in %s, and "
                 "`python -m framework mode=sync mode.run=%s` will send it.",
@@ -269,7 +280,14 @@ class MlflowTracker(Tracker):
 
     def _log(self, **record: Any) -> None:
         self.journal.append(**record)
-        if self._sender is not None:
+        self._notice()
+
+    def _notice(self) -> None:
+        """One more line waits; start sending when it is time."""
+        if self._sender is None and self._sidecar is not None and not self._closed:
+            if time.monotonic() >= self._sends_from:
+                self._start_sending(self._sidecar)
+        elif self._sender is not None:
             self._sender.notice()
 
     @property

@@ -210,6 +210,36 @@ def test_other_ends(folder: Path, end: str) -> None:
     assert history(folder) == losses([1])
 
 
+def test_a_short_run_leaves_sending_to_whoever_syncs(folder: Path) -> None:
+    tracker = build(folder, wait=1e6)
+    tracker.open()
+    log(tracker, range(5))
+    tracker.close("FINISHED")
+    info = read_run_info(folder)
+    assert info is not None
+    assert (info.run_id, info.sent, info.status) == (None, 0, "FINISHED")
+    assert sync(folder) > 0
+    assert history(folder) == losses(range(5))
+    assert status(folder) == "FINISHED"
+    assert sync(folder) == 0
+
+
+def test_a_run_that_lasts_sends_from_then_on(folder: Path) -> None:
+    tracker = build(folder, wait=0.2)
+    tracker.open()
+    assert tracker.run_id is None
+    log(tracker, [0])
+
+    def sent_by_the_next_line() -> bool:
+        tracker.set_tags({"still": "here"})
+        return tracker.run_id is not None
+
+    until(sent_by_the_next_line)
+    tracker.close("FINISHED")
+    assert history(folder) == losses([0])
+    assert status(folder) == "FINISHED"
+
+
 def test_long_parameters_are_shortened_visibly_and_kept_whole(folder: Path) -> None:
     tracker = build(folder)
     tracker.open()

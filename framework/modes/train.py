@@ -62,6 +62,8 @@ def _run(run: Run) -> float:
     data.prepare()
     describe_data(run, data)
     outliers = build_outliers(resolved, data)  # before training: a wrong root is said now
+    if outliers is not None:
+        describe_data(run, outliers, "outliers")
     record_citations(run, citations(resolved))
 
     predictor = build_predictor(resolved, data.target, data.input_shape, settings.seed)
@@ -157,11 +159,11 @@ def quiet() -> None:
     )
 
 
-def describe_data(run: Run, data: Data) -> None:
+def describe_data(run: Run, data: Data, role: str = "data") -> None:
     """Tag the run with what it was fed."""
     run.tracker.set_tags(
-        {f"data.{key}": value for key, value in data.fingerprint().items()}
-        | {"data.synthetic": str(data.synthetic).lower(), "data.skipped": str(data.skipped)}
+        {f"{role}.{key}": value for key, value in data.fingerprint().items()}
+        | {f"{role}.synthetic": str(data.synthetic).lower(), f"{role}.skipped": str(data.skipped)}
     )
 
 

@@ -33,7 +33,10 @@ class SideBySide(nn.Module):
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Float[Tensor, "batch member size"]:
         """What each of the first `used` members (all by default) makes of the inputs; each has dropout of its own."""
-        template = self._template.train(self.training)
+        template = self._template
+        # module by module: dropout may be active where all else evaluates
+        for mine, shown in zip(template.modules(), self.stacked.modules(), strict=True):
+            mine.training = shown.training
         parameters: dict[str, Tensor] = {**dict(self.stacked.named_parameters())}
         if used is not None and used < self.count:
             parameters = {name: parameter[:used] for name, parameter in parameters.items()}

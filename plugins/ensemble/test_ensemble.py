@@ -173,6 +173,20 @@ def test_each_member_drops_other_outputs():
     assert torch.equal(same[:, :1].expand_as(same), same)
 
 
+def test_dropout_of_the_members_can_be_active_where_all_else_evaluates():
+    """As MC dropout around an ensemble has it."""
+    torch.manual_seed(0)
+    whole = SideBySide(
+        [network(factory(encoder={"name": "mlp", "widths": [64], "dropout": 0.5})())] * 2
+    ).eval()
+    still = whole(torch.ones(2, 4))
+    assert torch.equal(still[:, 0], still[:, 1])
+    for module in whole.modules():
+        if isinstance(module, torch.nn.Dropout):
+            module.train()
+    assert not torch.equal(whole(torch.ones(2, 4))[:, 0], whole(torch.ones(2, 4))[:, 1])
+
+
 def test_networks_that_do_not_vectorise_are_computed_one_after_the_other():
     encoder = {"name": "mlp", "widths": [8], "batch_norm": True}
     whole = ensemble(2, encoder=encoder).eval()

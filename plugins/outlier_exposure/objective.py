@@ -3,7 +3,7 @@
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
@@ -37,6 +37,8 @@ class OutlierExposure(Objective):
         outliers: data to draw from; prepared at once.
         low, high: the range of uniform numbers, in the units of the inputs; of images, 0 and 1.
         count: outliers of a step; as many as the batch has samples where not given.
+        clearance: outliers nearer than this to an input of the batch (Euclidean, in its units) are left out: uniform
+            numbers also fall among the training data, where knowing nothing costs likelihood. 0 keeps all.
         divergence: how far from knowing nothing.
         prior_scale: standard deviation of u for a real number, in the target's units.
 
@@ -67,6 +69,7 @@ class OutlierExposure(Objective):
         low: Annotated[float, Field(allow_inf_nan=False)] | None = None,
         high: Annotated[float, Field(allow_inf_nan=False)] | None = None,
         count: Annotated[int, Field(gt=0)] | None = None,
+        clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0,
         divergence: Literal["auto", "entropy", "cross_entropy"] = "auto",
         prior_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3.0,
     ) -> None:
@@ -75,6 +78,7 @@ class OutlierExposure(Objective):
         self.weight = weight
         self.outliers = outliers
         self.count = count
+        self.clearance = clearance
         self.divergence = divergence
         self.prior_scale = prior_scale
         if outliers is not None:
@@ -85,9 +89,11 @@ class OutlierExposure(Objective):
         inputs = batch["input"]
         count = len(inputs) if self.count is None else self.count
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
+        if self.clearance > 0:
+            drawn = drawn[clear_of(drawn, inputs, self.clearance)]
         with flagged(predictor, _BatchNorm, "training", False):
             found = each_alone(self._divergences(predictor.training_densities(drawn)))
-        return self.weight * found.sum() / max(1, count)  # no outliers, no penalty
+        return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
 
     def _divergences(self, density: Distribution) -> Float[Tensor, "batch *member"]:
         """Of each outlier and member, nats."""
@@ -122,6 +128,19 @@ class OutlierExposure(Objective):
         )
         batch = {name: field.to(inputs.device) for name, field in next(iter(loader)).items()}
         return self.outliers.augment(batch)["input"]
+
+
+def clear_of(
+    outliers: Float[Tensor, "outlier *input"], inputs: Tensor, clearance: float
+) -> Bool[Tensor, "outlier"]:
+    """Which outliers are at least `clearance` away from every input; bytes are read as 0 to 1."""
+    if len(inputs) == 0 or len(outliers) == 0:
+        return torch.ones(len(outliers), dtype=torch.bool, device=outliers.device)
+    some, others = (
+        given.flatten(1).float() / 255 if given.dtype == torch.uint8 else given.flatten(1)
+        for given in (outliers, inputs)
+    )
+    return torch.cdist(some, others.to(some)).amin(1) >= clearance
 
 
 def uniform_range(low: float | None, high: float | None, *, other: bool) -> tuple[float, float]:

@@ -114,6 +114,31 @@ def test_knowing_nothing_costs_nothing():
     assert objective(**BOX)(angle, given_batch()).item() == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["uniform", "data", "bytes"])
+def test_outliers_among_the_data_are_left_out(kind):
+    inputs = torch.tensor([[0.0, 0.0], [2.0, 0.0]])
+    if kind == "bytes":
+        inputs = torch.tensor([[0, 0], [255, 0]], dtype=torch.uint8)
+    if kind == "data":
+        loss = objective(outliers={"name": "moons"}, clearance=0.7, count=200)
+    else:
+        edge = {"low": 0.0, "high": 1.0} if kind == "bytes" else BOX
+        loss = objective(**edge, clearance=0.7, count=200)
+    predictor = Given(head("categorical", CLASSES), torch.randn(3))
+    found = loss(predictor, {"input": inputs})
+    (seen,) = predictor.seen
+    scale = 255 if kind == "bytes" else 1
+    gaps = np.linalg.norm(seen.numpy()[:, None] - inputs.numpy()[None] / scale, axis=-1).min(1)
+    assert 0 < len(seen) < 200
+    assert gaps.min() >= 0.7
+    one = objective(**BOX, count=1)(
+        predictor, {"input": inputs}
+    )  # the same density everywhere: the same mean
+    torch.testing.assert_close(found, one)
+    all_near = objective(**BOX, clearance=100.0)
+    assert all_near(predictor, {"input": inputs}).item() == 0
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_sure_class_still_learns_from_cross_entropy_and_not_from_entropy(dtype):
     slopes = {}
