@@ -63,7 +63,8 @@ def report_test(
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
-    results = _results(run, resolved, data, found, spent, columns, better) | {"synthetic": synthetic}
+    results = _results(run, resolved, data, found, spent, columns, better)
+    results["synthetic"] = synthetic
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
     step = 0

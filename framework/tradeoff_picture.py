@@ -21,8 +21,7 @@ def tradeoff(
 ) -> Figure:
     """Every metric of `keys` against run time, which is logarithmic.
 
-    Bars are standard deviations over repeats. The first and last value of a knob stand beside their points; a method
-    of one point has no number.
+    Bars are standard deviations over repeats. The knob's values stand beside the points; a method of one point has none.
 
     Args:
         keys: metric → label of its axis.
@@ -42,9 +41,8 @@ def tradeoff(
                     axes.annotate(
                         f"{turn.value}",
                         (turn.milliseconds, turn.metrics[key]),
-                        (0, 7),
+                        (5, 4),
                         textcoords="offset points",
-                        ha="center",
                         fontsize=7.5,
                         color=style["color"],
                     )
