@@ -21,7 +21,7 @@ def tradeoff(
 ) -> Figure:
     """Every metric of `keys` against run time, which is logarithmic.
 
-    Bars are standard deviations over repeats. The knob's values stand beside the points; a method of one point has none.
+    Bars are standard deviations over repeats. The knob's values stand beside the points of a method that has several.
 
     Args:
         keys: metric → label of its axis.
