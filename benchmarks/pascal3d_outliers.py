@@ -1,8 +1,8 @@
 """Uncertainty wrappers on viewpoints, and how well they tell another object class from the one trained on (synthetic).
 
-    python -m framework -m trainer.max_epochs=20 threads=1 hydra.sweep.dir=outputs/sweeps/pascal3d_outliers \\
-        experiment=pascal3d_outliers/plain,pascal3d_outliers/temperature,...   (all of conf/experiment/pascal3d_outliers)
-    python benchmarks/pascal3d_outliers.py outputs/sweeps/pascal3d_outliers
+    python -m framework -m trainer.max_epochs=20 threads=1 hydra.sweep.dir=outputs/sweeps/outliers \\
+        experiment=pascal3d_outliers/plain,...   (all of conf/experiment/pascal3d_outliers but base)
+    python benchmarks/pascal3d_outliers.py outputs/sweeps/outliers
 
 Writes pascal3d_outliers.md beside this file.
 """
@@ -36,7 +36,7 @@ def main() -> None:
         rows.append({**kept, "synthetic": found["synthetic"]})
     text = (
         "# Viewpoints of cars, and bottles that are none (synthetic data)\n\n"
-        "Mixtures of von Mises densities, `biternion_vgg`, 20 epochs, one seed, so that small differences mean nothing. "
+        "Mixtures of von Mises densities, `biternion_vgg`, 20 epochs, one seed: small differences mean nothing. "
         "Trained on cars; outliers of the test are bottles, those of `outlier_exposure`'s training sofas. AUROC by the "
         "entropy of the joint density of three angles. ± is the standard error over test images. Commands in "
         "`pascal3d_outliers.py`.\n\n"
