@@ -2,6 +2,7 @@
 
     python -m framework -m trainer.max_epochs=20 threads=1 hydra.sweep.dir=outputs/sweeps/outliers \\
         experiment=pascal3d_outliers/plain,...   (all of conf/experiment/pascal3d_outliers but base)
+    (and once more experiment=pascal3d_outliers/outlier_exposure objective.outlier_exposure.weight=0.05,1)
     python benchmarks/pascal3d_outliers.py outputs/sweeps/outliers
 
 Writes pascal3d_outliers.md beside this file.
@@ -10,6 +11,8 @@ Writes pascal3d_outliers.md beside this file.
 import json
 import sys
 from pathlib import Path
+
+import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
@@ -33,6 +36,10 @@ def main() -> None:
     for path in sorted(Path(sys.argv[1]).glob("*/results.json")):
         found = json.loads(path.read_text(encoding="utf-8"))
         kept = {key: value for key, value in found.items() if key.removesuffix("_sem") in COLUMNS}
+        config = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))
+        weight = (config.get("objective") or {}).get("outlier_exposure", {}).get("weight")
+        if weight is not None:
+            kept["method"] = f"outlier_exposure, λ = {weight:g}"
         rows.append({**kept, "synthetic": found["synthetic"]})
     text = (
         "# Viewpoints of cars, and bottles that are none (synthetic data)\n\n"
