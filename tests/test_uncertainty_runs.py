@@ -21,6 +21,7 @@ SMALL = [
     "data.validation=40",
     "data.test=100",
     "outliers.test=30",
+    "data.data_seed=0",  # one data set for all seeds
     "batch_size=20",
     "trainer.max_epochs=3",
     "trainer.check_val_every_n_epoch=1",

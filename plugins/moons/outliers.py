@@ -20,8 +20,10 @@ from plugins.moons.points import LABELS, picture, read_points, shown
 
 
 class MoonsOutliers(Data):
-    """Two discs in the upper left and the lower right corner of [-4, 4]², where a network trained on `moons` has seen
-    nothing and is sure all the same (the triangles of thesis Figure 2.2; §2.3.1).
+    """Two discs in the upper left and the lower right corner of [-4, 4]², far from every moon.
+
+    A network trained on `moons` has seen nothing there and is sure all the same (the triangles of thesis Figure 2.2;
+    §2.3.1).
 
     Points are uniform on the discs, in the standard units of `moons`. Their targets name the moon on whose side they
     lie and mean nothing. The splits are independent draws.

@@ -1,5 +1,6 @@
 """A user's table: what is read, what is refused, and a whole run on it."""
 
+import csv
 import json
 import math
 import os
@@ -360,12 +361,22 @@ def test_tables_of_every_kind_are_trained_on_tested_and_predicted_for(tmp_path: 
         timeout=300,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    for kind, column in (("class", "class"), ("real", "real"), ("degrees", "angle_deg")):
+    for kind in ("class", "real", "degrees"):
         results = json.loads((tmp_path / kind / "results.json").read_text())
         assert math.isfinite(results["log_likelihood"])
         assert results["data"] == "mine"
         assert not results["synthetic"]
-        predicted = (tmp_path / kind / "predicted" / "predictions.csv").read_text().splitlines()
-        assert predicted[0] == f"sample,{column},entropy_nats"
-        assert len(predicted) == 2
-        assert all(math.isfinite(float(cell)) for cell in predicted[1].split(",")[1:])
+        with (tmp_path / kind / "predicted" / "predictions.csv").open(encoding="utf-8") as stream:
+            (row,) = csv.DictReader(stream)
+        wanted = {"class": "class", "real": "real", "degrees": "angle_deg"}[kind]
+        names, found = list(row), list(row.values())
+        assert names[:2] == ["sample", wanted]
+        if kind == "class":  # by name, then every class's probability
+            shares = {name: float(value) for name, value in row.items() if name.startswith("p_")}
+            assert sum(shares.values()) == pytest.approx(1, abs=1e-5)
+            assert max(shares, key=shares.__getitem__) == f"p_{row['class']}"
+            found = [value for name, value in row.items() if name not in ("sample", "class")]
+        else:
+            found = found[1:]
+        assert names[-1] == "entropy_nats"
+        assert all(math.isfinite(float(cell)) for cell in found)
