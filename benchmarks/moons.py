@@ -1,7 +1,9 @@
 """Table 2.1 on the two moons (synthetic): every row with five seeds, error and run time; Figures 2.3 and 2.4.
 
-    python -m framework -m hydra.launcher.jobs=2 threads=1 seed=0,1,2,3,4 hydra.sweep.dir=outputs/sweeps/moons \\
-        experiment=moons/vanilla_128,moons/vanilla_512,...   (all of conf/experiment/moons but base)
+    python -m framework -m pictures=false hydra.launcher.jobs=2 threads=1 seed=0,1,2,3,4 \\
+        hydra.sweep.dir=outputs/sweeps/moons \\
+        experiment=moons/vanilla_128,moons/vanilla_512,moons/temperature,moons/mc_dropout,moons/ensemble,\\
+    moons/outlier_exposure,moons/everything
     python benchmarks/moons.py outputs/sweeps/moons
 
 Writes moons.md, moons_landscapes.png and moons_reliability.png beside this file.
@@ -9,8 +11,9 @@ Writes moons.md, moons_landscapes.png and moons_reliability.png beside this file
 
 import json
 import sys
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,7 +24,10 @@ from matplotlib.image import imread
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.machine import machine
+from framework.batches import Batches
+from framework.evaluation import evaluate
 from framework.landscape_picture import Plane, landscapes, probabilities
+from framework.metric import Pictured
 from framework.schema import build, resolve
 from framework.table import aggregate, markdown
 
@@ -148,7 +154,21 @@ def pictures(rows: list[dict[str, Any]]) -> None:
     figure = Figure(figsize=(11, 6.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     for place, key in zip(figure.subplots(1, 2), ("vanilla_512", "temperature"), strict=True):
-        place.imshow(imread(folders[key] / "figures" / "reliability.png"))
+        predictor = framework.load(folders[key])
+        found = evaluate(
+            predictor,
+            Batches(data, batch_size=1000, workers=0, seed=0).test_dataloader(),
+            [build("metric", resolve("metric", "calibration_error"), target=data.target)],
+            groups=data.groups,
+            samples=1,
+            seed=0,
+            device=torch.device("cpu"),
+        )
+        drawn = cast(Pictured, found.metrics[0]).figure(METHODS[key], synthetic=True)
+        stored = BytesIO()
+        drawn.savefig(stored, dpi=110)
+        stored.seek(0)
+        place.imshow(imread(stored))
         place.set_axis_off()
     figure.savefig(HERE / "moons_reliability.png")
 

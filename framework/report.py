@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,14 +81,13 @@ def report_test(
         0,
     )
     run.tracker.log_artifact(path)
-    if data.target.kind == "angle":
-        picture(run, gallery(predictor, data, batches, device, settings.samples), "predicted_densities.png")
-    if data.target.kind == "class" and data.input_shape == (2,):
-        figure = landscape(predictor, data, outliers, device, results["method"])
-        picture(run, figure, "landscape.png")
-    for metric in found.metrics:
-        if isinstance(metric, Pictured):
-            picture(run, metric.figure(results["experiment"], synthetic=synthetic), f"{metric.picture}.png")
+    if settings.pictures:
+        for name, figure in _pictures(run, predictor, data, batches, outliers, device, results):
+            picture(run, figure, name)
+        for metric in found.metrics:
+            if isinstance(metric, Pictured):
+                figure = metric.figure(results["experiment"], synthetic=synthetic)
+                picture(run, figure, f"{metric.picture}.png")
     rows = [
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
@@ -98,6 +97,22 @@ def report_test(
         results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
     )
     _next_steps(run, spent, console)
+
+
+def _pictures(
+    run: Run,
+    predictor: Predictor,
+    data: Data,
+    batches: Batches,
+    outliers: Data | None,
+    device: torch.device,
+    results: dict[str, Any],
+) -> Iterator[tuple[str, "Figure"]]:
+    """Those that the kind of data calls for, with their file names."""
+    if data.target.kind == "angle":
+        yield "predicted_densities.png", gallery(predictor, data, batches, device, run.settings.samples)
+    if data.target.kind == "class" and data.input_shape == (2,):
+        yield "landscape.png", landscape(predictor, data, outliers, device, results["method"])
 
 
 def _results(
@@ -139,7 +154,9 @@ def _plain(value: Any) -> Any:
 
 
 def report_training(run: Run, *, kept_epoch: int, synthetic: bool) -> None:
-    """The training curve, from the journal."""
+    """The training curve, from the journal; nothing where pictures are not wanted."""
+    if not run.settings.pictures:
+        return
     from framework.pictures import training_curve
 
     train: list[tuple[float, float]] = []

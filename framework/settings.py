@@ -43,6 +43,7 @@ class Settings(_Strict):
     batch_size: Positive = 64
     workers: NotNegative = 0
     samples: Positive = 1000
+    pictures: bool = True
     checkpoint: str | None = None
     resume: str | None = "auto"
     experiment_name: str | None = None

@@ -12,7 +12,7 @@ from framework.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.modes.combine import common, found, joined
 from framework.schema import build, resolve
-from tests.conftest import Done, Framework
+from tests.conftest import Done, Framework, listed
 
 SMALL = [
     "experiment=moons/vanilla_128",
@@ -33,6 +33,19 @@ SMALL = [
 def results(done: Done) -> dict[str, object]:
     assert done.code == 0, done.out
     return json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+
+
+def test_pictures_not_asked_for_are_not_drawn(tmp_path: Path) -> None:
+    for name, wanted in (("drawn", "true"), ("spared", "false")):
+        run = tmp_path / name
+        done = listed(*SMALL, f"pictures={wanted}", f"hydra.run.dir={run}", folder=tmp_path)
+        assert done.code == 0, done.out
+        pictures = {path.name for path in run.glob("figures/*")}
+        assert (
+            pictures == {"training_curve.png", "landscape.png", "reliability.png"}
+            if name == "drawn"
+            else not pictures
+        )
 
 
 def inputs() -> torch.Tensor:

@@ -107,11 +107,12 @@ def test_of_one_angle_it_is_the_arc_about_the_mean(concentration, dtype):
 
     wanted = [mass(abs(number)) for number in value[:, 0].tolist()]
     middle = ((found.low + found.high) / 2).numpy()
-    # straight lines cut off the top of a peak; and on the mode, flat there, what is dense to 1e-6 has mass 1e-3
-    np.testing.assert_allclose(middle[:2], wanted[:2], atol=5e-3)
-    np.testing.assert_allclose(middle[2:], wanted[2:], atol=5e-4)
+    # float32 knows log p to 1e-6, and on the mode, flat there, what is dense to 1e-6 has mass 1e-3
+    single = dtype == torch.float32
+    np.testing.assert_allclose(middle[0], wanted[0], atol=5e-3 if single else 1e-6)
+    np.testing.assert_allclose(middle[1:], wanted[1:], atol=1e-4 if single else 1e-6)
     width = optimize.brentq(lambda x: mass(x) - 0.9, 1e-9, math.pi)
-    np.testing.assert_allclose(found.size.numpy(), 2 * width, rtol=2e-3)
+    np.testing.assert_allclose(found.size.numpy(), 2 * width, rtol=1e-5 if single else 1e-6)
 
 
 def test_of_the_uniform_angle_every_target_is_as_dense_as_any():
