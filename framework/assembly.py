@@ -10,7 +10,7 @@ from framework.density_head import DensityHead
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.metric import Metric
-from framework.model import Model, Predictor
+from framework.model import Model, Preceded, Predictor
 from framework.objective import Objective
 from framework.registry import GROUPS, installed, load
 from framework.schema import build, parts, resolve
@@ -88,23 +88,45 @@ def build_data(resolved: Resolved) -> Data:
     return build("data", resolved["data"])
 
 
-def build_predictor(resolved: Resolved, target: Target, input_shape: tuple[int, ...], seed: int) -> Predictor:
-    """The untrained predictor; its initial weights are a function of `seed` and the config."""
+def build_predictor(
+    resolved: Resolved,
+    target: Target,
+    input_shape: tuple[int, ...],
+    seed: int,
+    columns: tuple[str, ...] = (),
+) -> Predictor:
+    """The untrained predictor; its initial weights are a function of `seed` and the config.
+
+    Encoders with fixed features, as many as stand first, are outside what the wrappers of `uncertainty` wrap.
+    """
     torch.manual_seed(seed)
+    parts = list(resolved["encoder"])
+    fixed: list[Encoder] = []
+    ready: list[Encoder] = []  # built already, for the first model
+    shape, names = input_shape, columns
+    while parts:
+        encoder: Encoder = build("encoder", parts[0], input_shape=shape, input_columns=names)
+        if not encoder.fixed:
+            ready.append(encoder)
+            break
+        fixed.append(encoder)
+        shape, names = encoder.output_shape, ()
+        del parts[0]
 
     def model() -> Predictor:
         encoders: list[Encoder] = []
-        shape = input_shape
-        for part in resolved["encoder"]:
-            encoders.append(build("encoder", part, input_shape=shape))
-            shape = encoders[-1].output_shape
+        inner, called = shape, names
+        for part in parts:
+            built = ready.pop() if ready else build("encoder", part, input_shape=inner, input_columns=called)
+            encoders.append(built)
+            inner, called = encoders[-1].output_shape, ()
         head: DensityHead = build("density_head", resolved["density_head"], target=target)
-        return Model(encoders, head)
+        return Model(encoders, head, inner)
 
     factory: Callable[[], Predictor] = model
     for part in resolved["uncertainty"]:
         factory = _wrapped(part, factory, target)
-    return factory()
+    return Preceded(fixed, factory()) if fixed else factory()
 
 
 def _wrapped(

@@ -34,7 +34,11 @@ class Data(ABC):
     target: Target
     """What is to be predicted."""
     input_shape: tuple[int, ...]
-    """Shape of one input, without the batch dimension."""
+    """Shape of one input, without the batch dimension; of point clouds (points, columns), of the largest of them."""
+    columns: tuple[str, ...] = ()
+    """What the numbers of an input's last dimension are called, where they have names: ("x", "y", "z", "red", ...)."""
+    varies: bool = True
+    """Whether `augment` may change a batch."""
     groups: tuple[str, ...]
     """Names by which results are also reported apart (object classes, say); one name where there is one."""
     synthetic: bool

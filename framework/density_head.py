@@ -63,3 +63,22 @@ class DensityHead(nn.Module, ABC):
         Called once after training, in evaluation mode and without gradient, with the whole validation set. What it
         fits is a buffer, so that it is stored in the checkpoint. A head with nothing to fit does nothing.
         """
+
+
+class Fitted(ABC):
+    """A density head that is fitted to the whole training split at once and not by gradient: trees, say.
+
+    No linear layer is put before it: it reads the features as they are, and its `size` is their number, 0 before it
+    was fitted. Encoders before it may not learn either. Its state is of any shape: `load_state_dict` takes what is
+    stored, in a head that was just built.
+    """
+
+    @abstractmethod
+    def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        """Fit to all training samples, in place.
+
+        Args:
+            features: of the training split.
+            target: theirs, (sample, *event).
+            seed: of what is drawn; members of an ensemble get different ones.
+        """

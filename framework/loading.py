@@ -11,6 +11,7 @@ from framework import __version__
 from framework.assembly import Resolved, build_predictor
 from framework.checkpoint import describe_mismatch, latest_good, read
 from framework.data import Data
+from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor
 from framework.schema import resolve
@@ -28,6 +29,7 @@ def description(resolved: Resolved, data: Data) -> dict[str, Any]:
         "config": resolved,
         "target": {**asdict(data.target), "names": list(data.target.names)},
         "input_shape": list(data.input_shape),
+        "columns": list(data.columns),
         "synthetic": data.synthetic,
     }
 
@@ -62,7 +64,8 @@ def load_with_description(
         # The checkpoint holds the weights now; the file they were started from may be gone.
         part.update({"weights": None} if "weights" in part else {})
     target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-    predictor = build_predictor(resolved, target, tuple(described["input_shape"]), seed=0)
+    columns = tuple(described.get("columns", ()))
+    predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)
     fill(predictor, weights(content), str(path))
     return predictor.eval(), {**described, "config": resolved, "path": str(path)}
 
@@ -92,7 +95,15 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
     Raises:
         CheckpointError: they belong to another model; says what does not fit.
     """
-    mismatch = describe_mismatch(predictor.state_dict(), state)
+    # what a head fitted at once holds depends on the data it was fitted to
+    own = tuple(
+        f"{name}." if name else "" for name, part in predictor.named_modules() if isinstance(part, Fitted)
+    )
+    wanted, found = (
+        {name: value for name, value in weights.items() if not name.startswith(own)}
+        for weights in (predictor.state_dict(), state)
+    )
+    mismatch = describe_mismatch(wanted, found)
     if mismatch:
         raise CheckpointError(
             f"{name} belongs to another model: {mismatch} Use the config it was trained with, or another checkpoint."

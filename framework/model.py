@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.data import Batch
-from framework.density_head import DensityHead
+from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 
@@ -42,20 +42,35 @@ class Predictor(nn.Module, ABC):
 class Model(Predictor):
     """Encoders in a chain, a linear layer to the numbers the head reads, the head.
 
+    A head that is fitted at once (`Fitted`) reads the features themselves, flattened, without the linear layer.
+
+    Args:
+        input_shape: of one sample; needed where there are no encoders.
+
     Raises:
-        ConfigError: the last encoder does not end in a vector.
+        ConfigError: the last encoder does not end in a vector, or learns in front of a head that is fitted at once.
     """
 
-    def __init__(self, encoders: Sequence[Encoder], head: DensityHead) -> None:
+    def __init__(
+        self, encoders: Sequence[Encoder], head: DensityHead, input_shape: tuple[int, ...] = ()
+    ) -> None:
         super().__init__()
-        shape = encoders[-1].output_shape
-        if len(shape) != 1:
+        self.encoders = nn.Sequential(*encoders)
+        shape = encoders[-1].output_shape if encoders else input_shape
+        if isinstance(head, Fitted):
+            if any(True for _ in self.encoders.parameters()):
+                raise ConfigError(
+                    f"{type(head).__name__} is fitted to all features at once and gives encoders no gradient, but "
+                    f"{' and '.join(type(encoder).__name__ for encoder in encoders)} learn. Leave those out."
+                )
+            self.projection: nn.Module = nn.Flatten()
+        elif len(shape) == 1:
+            self.projection = nn.Linear(shape[0], head.size)
+        else:
             raise ConfigError(
                 f"The last encoder ends in features of shape {shape}; wanted a vector. "
                 "Append an encoder that flattens, such as `mlp`."
             )
-        self.encoders = nn.Sequential(*encoders)
-        self.projection = nn.Linear(shape[0], head.size)
         self.head = head
 
     def forward(self, inputs: Tensor) -> Distribution:
@@ -76,6 +91,36 @@ class Model(Predictor):
         pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
         raws, targets = zip(*pairs, strict=True)
         self.head.calibrate(torch.cat(raws), torch.cat(targets))
+
+
+@final
+class Preceded(Predictor):
+    """A predictor of features that need be computed but once (`Encoder.fixed`), with the encoders that give them.
+
+    So whatever wraps the predictor (several members, many passes) does not compute them again.
+    """
+
+    def __init__(self, encoders: Sequence[Encoder], predictor: Predictor) -> None:
+        super().__init__()
+        self.encoders = nn.Sequential(*encoders)
+        self.predictor = predictor
+
+    def features(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
+        """What the predictor reads."""
+        return self.encoders(inputs)
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        return self.predictor(self.features(inputs))
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        return self.predictor.loss(self.features(inputs), target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self.predictor.training_densities(self.features(inputs))
+
+    @torch.no_grad()
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        self.predictor.calibrate({**batch, "input": self.features(batch["input"])} for batch in batches)
 
 
 def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from framework.batches import Batches, seed_step
 from framework.data import Batch, Data
 from framework.errors import NonFiniteLoss
-from framework.model import Predictor
+from framework.model import Preceded, Predictor
 from framework.objective import Objective
 from framework.settings import OptimizerSettings
 from framework.signals import Stopper
@@ -34,6 +34,10 @@ class Training(pl.LightningModule):
 
     Noise (dropout, latent draws, augmentation) is a function of (seed, step); a loss that is not finite stops the
     run before the optimiser sees it.
+
+    Args:
+        encoded: whether batches hold features that were computed before training (framework.encoded) and not inputs;
+            the predictor is a `Preceded` then.
     """
 
     def __init__(
@@ -44,6 +48,8 @@ class Training(pl.LightningModule):
         optimizer: OptimizerSettings,
         seed: int,
         description: dict[str, Any],
+        *,
+        encoded: bool = False,
     ) -> None:
         super().__init__()
         self.predictor = predictor
@@ -52,15 +58,24 @@ class Training(pl.LightningModule):
         self.optimizer_settings = optimizer
         self.seed = seed
         self.description = description
+        self.encoded = encoded
+
+    @property
+    def learner(self) -> Predictor:
+        """What reads the batches."""
+        if self.encoded:
+            assert isinstance(self.predictor, Preceded)
+            return self.predictor.predictor
+        return self.predictor
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
         # by batches, not by optimiser steps: those stand still while gradients are accumulated
         seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train", self.global_rank)
         batch = self.augment(batch)
-        losses = self.predictor.loss(batch["input"], batch["target"])
+        losses = self.learner.loss(batch["input"], batch["target"])
         loss = losses.mean()
         for objective in self.objectives:
-            loss = loss + objective(self.predictor, batch)
+            loss = loss + objective(self.learner, batch)
         if not math.isfinite(value := loss.item()):
             raise NonFiniteLoss(self._blame(losses, batch, value))
         self.last_loss = value
@@ -70,7 +85,7 @@ class Training(pl.LightningModule):
         seed_step(self.seed, batch_index, "validation")
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
-        loss = self.predictor.loss(batch["input"], batch["target"]).mean()
+        loss = self.learner.loss(batch["input"], batch["target"]).mean()
         self.log("validation/loss", loss, on_epoch=True, batch_size=len(batch["target"]), sync_dist=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
@@ -237,9 +252,3 @@ class StopAtBatch(pl.Callback):
         # The last checkpoint stands: one saved inside validation would skip the rest of it on resuming.
         if self.stopper.received is not None:
             self.stopper.stop()
-
-
-def fit(training: Training, batches: Batches, trainer: pl.Trainer, resume: Path | None) -> None:
-    """Train; from the state in `resume` where given."""
-    batches.attach(trainer)
-    trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)

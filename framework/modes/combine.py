@@ -14,7 +14,7 @@ from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.evaluation import on_device
 from framework.loading import description, load_with_description
-from framework.model import Predictor
+from framework.model import Preceded, Predictor
 from framework.modes.test import data_for
 from framework.modes.train import quiet, record_citations, save_model
 from framework.report import report_test
@@ -129,7 +129,9 @@ def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wra
     Raises:
         ConfigError: the wrapper cannot take members that were trained apart.
     """
-    predictor = build_predictor(config, data.target, data.input_shape, seed=0)
+    predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
+    if isinstance(predictor, Preceded):
+        members = [_inner(predictor, member, index) for index, member in enumerate(members)]
     joining = next((module for module in predictor.modules() if isinstance(module, Joining)), None)
     if joining is None:
         raise ConfigError(
@@ -138,3 +140,18 @@ def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wra
         )
     joining.join(members)
     return predictor
+
+
+def _inner(whole: Preceded, member: Predictor, index: int) -> Predictor:
+    """What reads the features of a member's encoders, which must be the same in all; they are put into `whole`."""
+    assert isinstance(member, Preceded)
+    state = member.encoders.state_dict()
+    if index == 0:
+        whole.encoders.load_state_dict(state)
+    for name, tensor in whole.encoders.state_dict().items():
+        if not torch.equal(tensor, state[name]):
+            raise CheckpointError(
+                f"member {index} was trained on other features than member 0: their encoders differ in {name}. "
+                "Join runs whose encoders were built alike."
+            )
+    return member.predictor

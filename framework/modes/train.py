@@ -4,6 +4,7 @@ import ctypes
 import inspect
 import logging
 import platform
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from pytorch_lightning.callbacks import EarlyStopping, RichProgressBar
 from rich.console import Console
 
 from framework.assembly import (
+    Resolved,
     build_data,
     build_metrics,
     build_objectives,
@@ -25,9 +27,12 @@ from framework.assembly import (
 from framework.batches import Batches, seed_step
 from framework.checkpoint import WholeCheckpoints, latest_good, read
 from framework.data import Data
+from framework.encoded import Encoded, fits
+from framework.errors import ConfigError
 from framework.evaluation import on_device
+from framework.fitting import fit_at_once, fitted_models, mean_loss
 from framework.loading import PREFIX, description, fill, weights
-from framework.model import Predictor
+from framework.model import Preceded, Predictor
 from framework.report import report_test, report_training
 from framework.run import Run, opened
 from framework.settings import TRAINER_OURS, Settings, check_trainer_keys
@@ -66,35 +71,86 @@ def _run(run: Run) -> float:
         describe_data(run, outliers, "outliers")
     record_citations(run, citations(resolved))
 
-    predictor = build_predictor(resolved, data.target, data.input_shape, settings.seed)
+    predictor = build_predictor(resolved, data.target, data.input_shape, settings.seed, columns=data.columns)
+    described = description(resolved, data)
+    batches = _batches(run, data)
+    if fitted_models(predictor):
+        device = torch.device("cpu")
+        loss = _fit_at_once(run, predictor, resolved, data, console)
+    else:
+        device, loss = _train(run, predictor, resolved, data, described, console)
+    predictor.eval().to(device)
+    seed_step(settings.seed, 0, "calibrate")
+    predictor.calibrate(on_device(batches.val_dataloader(), device))
+    save_model(run.checkpoints / "model.ckpt", predictor, described)
+    run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
+    metrics = build_metrics(resolved, data.target)
+    report_test(run, predictor, resolved, data, batches, metrics, device, console, outliers)
+    return loss
+
+
+def _batches(run: Run, data: Data) -> Batches:
+    settings = run.settings
+    return Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
+
+
+def _train(
+    run: Run,
+    predictor: Predictor,
+    resolved: Resolved,
+    data: Data,
+    described: dict[str, Any],
+    console: Console,
+) -> tuple[torch.device, float]:
+    """By gradient; leaves the kept weights in the predictor. Gives the device, and their validation loss."""
+    settings = run.settings
+    objectives = build_objectives(resolved)
+    fed = data if objectives else _encoded(run, predictor, data, console)  # those may change or add inputs
     training = Training(
-        predictor,
-        build_objectives(resolved),
-        data,
-        settings.optimizer,
-        settings.seed,
-        description(resolved, data),
+        predictor, objectives, fed, settings.optimizer, settings.seed, described, encoded=fed is not data
     )
-    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
     keep = KeepCheckpoints(
         run.checkpoints,
         settings.trainer.get("checkpoint_every_steps"),
         settings.trainer.get("keep") or "best",
     )
     trainer = _trainer(run, keep)
-    _fit(run, training, batches, trainer, console)
-
-    device = trainer.strategy.root_device
+    _fit(run, training, _batches(run, fed), trainer, console)
     fill(predictor, weights(read(keep.kept)), str(keep.kept))
-    predictor.eval().to(device)
-    seed_step(settings.seed, 0, "calibrate")
-    predictor.calibrate(on_device(batches.val_dataloader(), device))
-    save_model(run.checkpoints / "model.ckpt", predictor, training.description)
-    run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
     report_training(run, kept_epoch=keep.kept_epoch, synthetic=data.synthetic)
-    metrics = build_metrics(resolved, data.target)
-    report_test(run, predictor, resolved, data, batches, metrics, device, console, outliers)
-    return keep.kept_loss
+    return trainer.strategy.root_device, keep.kept_loss
+
+
+def _fit_at_once(run: Run, predictor: Predictor, resolved: Resolved, data: Data, console: Console) -> float:
+    """Of heads that learn from the whole training split; the validation loss, nats."""
+    if build_objectives(resolved):
+        raise ConfigError(
+            f"density_head={resolved['density_head']['name']} is fitted at once and has no gradient, which objectives "
+            "work by. Leave objective out."
+        )
+    fed = _encoded(run, predictor, data, console)
+    inner = predictor.predictor if fed is not data and isinstance(predictor, Preceded) else predictor
+    batches = _batches(run, fed)
+    start = time.perf_counter()
+    fit_at_once(inner, batches, run.settings.seed)
+    loss = mean_loss(inner.eval(), batches.val_dataloader())
+    console.print(f"fitted in {time.perf_counter() - start:.1f} s; validation loss {loss:.4f} nats")
+    run.tracker.log_metrics({"validation/loss": loss}, 0, 0)
+    return loss
+
+
+def _encoded(run: Run, predictor: Predictor, data: Data, console: Console) -> Data:
+    """The data with features computed before training, where that gives what computing them in each step would."""
+    if not isinstance(predictor, Preceded) or data.varies or not fits(data, predictor.features):
+        return data
+    encoded = Encoded(data, predictor.features, batch_size=64, workers=run.settings.workers)
+    start = time.perf_counter()
+    count = sum(len(split) for split in (encoded.train(), encoded.validation()))  # type: ignore[arg-type]
+    seconds = time.perf_counter() - start
+    console.print(
+        f"features of {count} samples computed once in {seconds:.1f} s ({1e3 * seconds / max(1, count):.2g} ms each)"
+    )
+    return encoded
 
 
 def _fit(run: Run, training: Training, batches: Batches, trainer: pl.Trainer, console: Console) -> None:

@@ -141,7 +141,10 @@ def _examine_encoder(name: str, row: EncoderRow) -> Iterator[Finding]:
     from framework.testing.encoders import examine_encoder
 
     config = resolve("encoder", {"name": name, **row.config})
-    yield from examine_encoder(row, lambda: build("encoder", config, input_shape=row.input_shape))
+    shape, columns = row.input_shape, row.columns
+    yield from examine_encoder(
+        row, lambda: build("encoder", config, input_shape=shape, input_columns=columns)
+    )
 
 
 def _examine_metric(name: str, row: MetricRow) -> Iterator[Finding]:

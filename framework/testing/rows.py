@@ -58,16 +58,18 @@ class HeadRow:
 
 @dataclass(frozen=True)
 class EncoderRow:
-    """One parametrisation of an encoder: images of 3 or fewer channels, or a vector.
+    """One parametrisation of an encoder: images of 3 or fewer channels, a point cloud, a vector.
 
     Attributes:
         name: what distinguishes it from the plugin's other rows.
         input_shape: of one sample.
+        columns: names of its last dimension, as `Data.columns`.
         config, limits, leave_out: as in HeadRow.
     """
 
     name: str
     input_shape: tuple[int, ...]
+    columns: tuple[str, ...] = ()
     config: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     leave_out: Mapping[str, str] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.density import Mixture
-from framework.density_head import DensityHead
+from framework.density_head import DensityHead, Fitted
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor, each_alone
 from framework.rearranged import Stacked
@@ -157,7 +157,9 @@ REMEDY = (
 
 def vectorises(member: Predictor) -> bool:
     """Whether members like this one can be computed side by side."""
-    return isinstance(member, Model) and all(encoder.vectorises for encoder in member.encoders)
+    if not isinstance(member, Model) or isinstance(member.head, Fitted):
+        return False
+    return all(encoder.vectorises for encoder in member.encoders)
 
 
 def network(member: Model) -> nn.Sequential:
@@ -171,4 +173,5 @@ def has_state(head: nn.Module) -> bool:
 
 
 def _dtype(module: nn.Module) -> torch.dtype:
-    return next(module.parameters()).dtype
+    floats = (tensor.dtype for tensor in module.parameters())
+    return next(floats, torch.get_default_dtype())  # trees have none
