@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from framework.frozen import freeze as freeze
     from framework.loading import load as load
 
-__all__ = ["load"]
+__all__ = ["freeze", "load"]
 __version__ = "0.1.0"
 
 
@@ -17,4 +18,8 @@ def __getattr__(name: str) -> object:
         from framework.loading import load
 
         return load
+    if name == "freeze":
+        from framework.frozen import freeze
+
+        return freeze
     raise AttributeError(f"module 'framework' has no attribute {name!r}")

@@ -10,7 +10,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
-from framework.batches import Batches, seed_step
+from framework.batches import seed_step
 from framework.data import Batch, Data
 from framework.errors import NonFiniteLoss
 from framework.model import Preceded, Predictor

@@ -129,10 +129,11 @@ def _examiner(group: str) -> Callable[[str, Any], Iterator[Finding]]:
 
 def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
     from framework.testing.densities import examine_densities
-    from framework.testing.heads import HeadSubject, examine_head
+    from framework.testing.heads import HeadSubject, examine_head, ready
 
     config = resolve("density_head", {"name": name, **row.config})
-    subject = HeadSubject(row, lambda: build("density_head", config, target=row.target))
+
+    subject = HeadSubject(row, lambda: ready(build("density_head", config, target=row.target), row.target))
     yield from examine_head(subject)
     yield from examine_densities(subject)
 

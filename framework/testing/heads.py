@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density import Circular, Mixture, median
-from framework.density_head import DensityHead
+from framework.density_head import DensityHead, Fitted
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import HeadRow
@@ -43,6 +43,14 @@ class HeadSubject:
     def values(self, *batch: int) -> Tensor:
         """Seeded targets: angles over several turns, reals of size 1, labels."""
         return values(self.row.target, batch)
+
+
+def ready(head: DensityHead, target: Target) -> DensityHead:
+    """The head itself; one that is fitted at once has seen a few drawn features and targets."""
+    if isinstance(head, Fitted):
+        features = torch.randn(200, 4, generator=torch.Generator().manual_seed(SEED))
+        head.fit(features, values(target, (200,)), SEED)
+    return head
 
 
 def values(target: Target, batch: tuple[int, ...]) -> Tensor:

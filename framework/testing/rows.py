@@ -63,16 +63,16 @@ class EncoderRow:
     Attributes:
         name: what distinguishes it from the plugin's other rows.
         input_shape: of one sample.
-        columns: names of its last dimension, as `Data.columns`.
         config, limits, leave_out: as in HeadRow.
+        columns: names of its last dimension, as `Data.columns`.
     """
 
     name: str
     input_shape: tuple[int, ...]
-    columns: tuple[str, ...] = ()
     config: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     leave_out: Mapping[str, str] = field(default_factory=dict)
+    columns: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,355 @@
+"""Sixteen numbers that move together: short vectors for functions compiled by numba.
+
+A value of type `Lanes` holds 16 numbers (4 where a name ends in 4) of an array's dtype, or as many truth values. `-`,
+`+`, `*`, `&`, `|` and the comparisons work lane by lane on two of the same type. Vectors are LLVM's own, so the
+compiler makes of them what the processor has: one register, two or four. No function checks bounds.
+
+`no_type_check` keeps the type checks that tests switch on away from what numba calls while it compiles.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any, no_type_check
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.extending import intrinsic, models, register_model
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+
+LANES = 16
+INT32 = ir.IntType(32)
+Make = Callable[..., Any]
+"""(builder, element type, values…) → value."""
+
+
+class Lanes(types.Type):
+    """`count` numbers of the scalar type `element`."""
+
+    @no_type_check
+    def __init__(self, element, count=LANES):
+        self.element, self.count = element, count
+        super().__init__(name=f"Lanes({element}, {count})")
+
+
+@register_model(Lanes)
+class LanesModel(models.PrimitiveModel):
+    """In memory and in registers an LLVM vector; truth values have one bit."""
+
+    @no_type_check
+    def __init__(self, manager, kind):
+        truth = kind.element == types.boolean
+        element = ir.IntType(1) if truth else manager.lookup(kind.element).get_value_type()
+        super().__init__(manager, kind, ir.VectorType(element, kind.count))
+
+
+@no_type_check
+def real(element):
+    return isinstance(element, types.Float)
+
+
+@no_type_check
+def truths(like):
+    return Lanes(types.boolean, like.count)
+
+
+@no_type_check
+def arithmetic(of_reals: str, of_integers: str) -> Make:
+    def make(builder, element, x, y):
+        return getattr(builder, of_reals if real(element) else of_integers)(x, y)
+
+    return make
+
+
+@no_type_check
+def comparison(sign: str) -> Make:
+    def make(builder, element, x, y):
+        compare = builder.fcmp_ordered if real(element) else builder.icmp_signed  # NaN enters none
+        return compare(sign, x, y)
+
+    return make
+
+
+@no_type_check
+def register(operation: Make, make: Make, compares: bool = False) -> None:
+    """Gives an operator of two vectors its type and its code."""
+
+    @infer_global(operation)  # type: ignore[reportOptionalCall]
+    class Template(AbstractTemplate):
+        @no_type_check
+        def generic(self, arguments, _):
+            if len(arguments) == 2 and isinstance(arguments[0], Lanes) and arguments[0] == arguments[1]:
+                return signature(truths(arguments[0]) if compares else arguments[0], *arguments)
+            return None
+
+    @lower_builtin(operation, Lanes, Lanes)
+    @no_type_check
+    def lower(context, builder, sig, values):
+        return make(builder, sig.args[0].element, *values)
+
+
+register(operator.add, arithmetic("fadd", "add"))
+register(operator.sub, arithmetic("fsub", "sub"))
+register(operator.mul, arithmetic("fmul", "mul"))
+register(operator.and_, arithmetic("and_", "and_"))
+register(operator.or_, arithmetic("or_", "or_"))
+register(operator.lt, comparison("<"), compares=True)
+register(operator.le, comparison("<="), compares=True)
+register(operator.eq, comparison("=="), compares=True)
+register(operator.ne, comparison("!="), compares=True)
+
+
+@no_type_check
+def least_of(builder, element, x, y):
+    return builder.select(comparison("<")(builder, element, x, y), x, y)
+
+
+@no_type_check
+def most_of(builder, element, x, y):
+    return builder.select(comparison(">")(builder, element, x, y), x, y)
+
+
+@no_type_check
+def coded(result, arguments, make):
+    """What an intrinsic returns: its signature, and code that needs nothing but the values."""
+
+    def generate(context, builder, sig, values):
+        return make(builder, *values)
+
+    return result(*arguments), generate
+
+
+@intrinsic
+@no_type_check
+def least(typing, a, b):
+    """The smaller in each lane; b where a is NaN."""
+    return coded(a, (a, b), lambda builder, x, y: least_of(builder, a.element, x, y))
+
+
+@intrinsic
+@no_type_check
+def most(typing, a, b):
+    """The larger in each lane; b where a is NaN."""
+    return coded(a, (a, b), lambda builder, x, y: most_of(builder, a.element, x, y))
+
+
+@intrinsic
+@no_type_check
+def where(typing, truth, a, b):
+    return coded(a, (truth, a, b), lambda builder, t, x, y: builder.select(t, x, y))
+
+
+@intrinsic
+@no_type_check
+def fma(typing, a, b, c):
+    """a·b + c, rounded once where the processor can; the same everywhere on one machine."""
+    kind = {types.float32: "f32", types.float64: "f64"}[a.element]
+
+    def make(builder, *values):
+        vector = values[0].type
+        declared = ir.FunctionType(vector, [vector] * 3)
+        name = f"llvm.fmuladd.v{a.count}{kind}"
+        return builder.call(cgutils.get_or_insert_function(builder.module, declared, name), values)
+
+    return coded(a, (a, a, a), make)
+
+
+@intrinsic
+@no_type_check
+def splat(typing, number):
+    """The number in every lane."""
+
+    def generate(context, builder, sig, values):
+        vector = context.get_value_type(sig.return_type)
+        empty = ir.Constant(vector, ir.Undefined)
+        one = builder.insert_element(empty, values[0], ir.Constant(INT32, 0))
+        return builder.shuffle_vector(one, empty, places([0] * LANES))
+
+    return Lanes(number)(number), generate
+
+
+@no_type_check
+def places(indices):
+    return ir.Constant(ir.VectorType(INT32, len(indices)), indices)
+
+
+@no_type_check
+def folded(vector, combine):
+    """The one number that `combine` leaves of all lanes."""
+
+    def make(builder, value):
+        count = vector.count
+        while count > 1:
+            count //= 2
+            empty = ir.Constant(value.type, ir.Undefined)
+            low, high = (
+                builder.shuffle_vector(value, empty, places(list(range(start, start + count))))
+                for start in (0, count)
+            )
+            value = combine(builder, vector.element, low, high)
+        return builder.extract_element(value, ir.Constant(INT32, 0))
+
+    return coded(vector.element, (vector,), make)
+
+
+@intrinsic
+@no_type_check
+def lowest(typing, vector):
+    return folded(vector, least_of)
+
+
+@intrinsic
+@no_type_check
+def highest(typing, vector):
+    return folded(vector, most_of)
+
+
+@intrinsic
+@no_type_check
+def total(typing, vector):
+    return folded(vector, arithmetic("fadd", "add"))
+
+
+@intrinsic
+@no_type_check
+def bits(typing, truth):
+    """Lane i as bit i of an int64."""
+
+    def make(builder, value):
+        return builder.zext(builder.bitcast(value, ir.IntType(truth.count)), ir.IntType(64))
+
+    return coded(types.int64, (truth,), make)
+
+
+@intrinsic
+@no_type_check
+def mask(typing, number):
+    """The 16 lowest bits of an int64 as truth values."""
+
+    def make(builder, value):
+        return builder.bitcast(builder.trunc(value, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
+
+    return coded(Lanes(types.boolean), (number,), make)
+
+
+@intrinsic
+@no_type_check
+def first(typing, number):
+    """The lowest set bit of an int64 that is not 0."""
+    return coded(types.int64, (number,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
+
+
+@intrinsic
+@no_type_check
+def how_many(typing, number):
+    """The number of set bits."""
+    return coded(types.int64, (number,), lambda builder, x: builder.ctpop(x))
+
+
+@intrinsic
+@no_type_check
+def whole(typing, vector):
+    """Towards zero, as int32; numbers must fit."""
+    result = Lanes(types.int32, vector.count)
+    return coded(result, (vector,), lambda builder, x: builder.fptosi(x, ir.VectorType(INT32, vector.count)))
+
+
+@intrinsic
+@no_type_check
+def lane(typing, vector, index):
+    return coded(vector.element, (vector, types.intp), lambda builder, x, i: builder.extract_element(x, i))
+
+
+@intrinsic
+@no_type_check
+def with_id(typing, vector, number):
+    """Four lanes whose last holds the bits of a whole number (int32 beside float32, int64 beside float64)."""
+    width = vector.element.bitwidth
+
+    def make(builder, value, whole_number):
+        if width == 32:
+            whole_number = builder.trunc(whole_number, INT32)
+        return builder.insert_element(
+            value, builder.bitcast(whole_number, value.type.element), ir.Constant(INT32, 3)
+        )
+
+    return coded(vector, (vector, types.int64), make)
+
+
+@no_type_check
+def pointer(context, builder, sig, values):
+    """Where element values[1] of the 1-D contiguous array values[0] lies."""
+    array = context.make_array(sig.args[0])(context, builder, values[0])
+    return builder.gep(array.data, [values[1]])
+
+
+@intrinsic
+@no_type_check
+def take(typing, array, index):
+    """One element; index ≥ 0."""
+
+    def generate(context, builder, sig, values):
+        return builder.load(pointer(context, builder, sig, values))
+
+    return array.dtype(array, types.intp), generate
+
+
+@no_type_check
+def loaded(array, stride, parts, count=LANES):
+    """`parts` vectors; part c holds elements c, c + stride, c + 2 stride, … from a start."""
+    vector = Lanes(array.dtype, count)
+
+    def generate(context, builder, sig, values):
+        line = ir.VectorType(context.get_value_type(array.dtype), count * stride)
+        address = builder.bitcast(pointer(context, builder, sig, values), line.as_pointer())
+        value = builder.load(address, align=array.dtype.bitwidth // 8)
+        if stride == 1:
+            return value
+        empty = ir.Constant(line, ir.Undefined)
+        taken = [
+            builder.shuffle_vector(value, empty, places([stride * i + part for i in range(count)]))
+            for part in range(parts)
+        ]
+        return context.make_tuple(builder, sig.return_type, taken)
+
+    result = vector if stride == 1 else types.UniTuple(vector, parts)
+    return result(array, types.intp), generate
+
+
+@intrinsic
+@no_type_check
+def load(typing, array, start):
+    return loaded(array, 1, 1)
+
+
+@intrinsic
+@no_type_check
+def load4(typing, array, start):
+    return loaded(array, 1, 1, 4)
+
+
+@intrinsic
+@no_type_check
+def load_triples(typing, array, start):
+    """x, y, z of 16 points that lie as x y z x y z …"""
+    return loaded(array, 3, 3)
+
+
+@intrinsic
+@no_type_check
+def load_quadruples(typing, array, start):
+    """The four parts of 16 records that lie as x y z w x y z w …"""
+    return loaded(array, 4, 4)
+
+
+@intrinsic
+@no_type_check
+def store(typing, array, start, vector):
+    def generate(context, builder, sig, values):
+        address = pointer(context, builder, sig, values)
+        address = builder.bitcast(address, context.get_value_type(vector).as_pointer())
+        builder.store(values[2], address, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector), generate

@@ -1,0 +1,47 @@
+"""A frame of a cloud's own, which turns with it: principal axes, their directions by third moments."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+WITHIN = 1 + 1e-6
+"""Norm up to which a point of a normalised cloud counts: not those that a robust normalisation left outside."""
+APART = 1e-9
+"""Eigenvalues that differ by less, in units of the largest, are equal: their axes have no derivative."""
+
+
+def frame(coordinates: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch 3 3"]:
+    """Rotations whose columns are each cloud's axes, float64; `coordinates @ frame` does not turn with the cloud.
+
+    Axes are the eigenvectors of the second moments about the origin, the longest first. An axis points to where the
+    third moment along it is positive; the axis of least skewness, which a mirror plane makes 0, is the one that
+    completes a right-handed frame, so that a cloud with mirror planes has its frame up to its own symmetries. Not
+    determined where two moments are (nearly) equal, as of a cylinder or a cube. Differentiable in the clouds,
+    equal eigenvalues apart.
+
+    Args:
+        coordinates: about the origin; rows of NaN are padding.
+    """
+    points = coordinates.double()
+    inside = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True) <= WITHIN  # not where NaN
+    points = points.where(inside, 0)
+    # sums, since a factor changes no eigenvector, and the skewness below is divided by them
+    second = points.mT @ points
+    values, axes = torch.linalg.eigh(second.detach())
+    values, axes = values.flip(-1), axes.flip(-1)
+    along = points.detach() @ axes
+    third = along.pow(3).mean(1)
+    skewness = third / along.square().mean(1).clamp(min=torch.finfo(torch.float64).tiny).pow(1.5)
+    direction = torch.ones_like(third).where(third >= 0, -1)
+    axes = axes * direction[:, None]
+    weakest = skewness.abs().argmin(-1, keepdim=True)
+    handedness = torch.linalg.det(axes).sign()[:, None]
+    axes = axes * torch.ones_like(direction).scatter(-1, weakest, handedness)[:, None]
+    if not second.requires_grad:
+        return axes
+    # first order of perturbation: d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)
+    change = axes.mT @ second @ axes
+    gap = values[:, None] - values[..., None]
+    known = gap.abs() > APART * values[:, :1, None]
+    turn = (change - change.detach()).where(known, 0) / gap.where(known, 1)
+    return axes @ (torch.eye(3, dtype=torch.float64, device=axes.device) + turn)

@@ -1,0 +1,1 @@
+"""Objects from airborne laser scans (DALES) as point clouds."""

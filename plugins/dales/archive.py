@@ -1,0 +1,83 @@
+"""Clouds of many sizes in one NumPy archive: `points`, `offset`, `label`, `object_id`, `classes`."""
+
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from framework.errors import DataError
+
+SOURCE = "github.com/ATRM-Raphael/geo5017_A2"
+WANTED = (
+    "Wanted: a .npz archive with points (points, 3) in metres, offset (objects + 1), label (objects), classes, and "
+    "perhaps object_id (objects); object i is points[offset[i]:offset[i+1]]."
+)
+
+
+class Archive(NamedTuple):
+    """Objects one after another, as the archive has them."""
+
+    points: Float[np.ndarray, "points 3"]
+    offset: Int[np.ndarray, "objects_and_one"]
+    label: Int[np.ndarray, "objects"]
+    identity: Int[np.ndarray, "objects"]
+    classes: tuple[str, ...]
+
+
+def read_archive(root: str | None) -> Archive:
+    """The whole archive, checked.
+
+    Raises:
+        DataError: no root, no such file, no archive, an array missing or of another shape, offsets that do not rise, a
+            label without a class, a coordinate that is not finite; names the object.
+    """
+    if root is None:
+        raise DataError(
+            f"data.root is not set: the objects were cut from the DALES scans and are not shipped or generated; an "
+            f"extract of 499 of them is at {SOURCE}. {WANTED}"
+        )
+    file = Path(root).expanduser()
+    if not file.is_file():
+        raise DataError(f"data.root = {file}: no such file. {WANTED}")
+    try:
+        with file.open("rb") as stream:
+            loaded = np.load(stream)
+            held = {} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"{file} cannot be read as a NumPy archive ({error}). {WANTED}") from error
+    missing = [name for name in ("points", "offset", "label", "classes") if name not in held]
+    if missing:
+        raise DataError(f"{file} holds {', '.join(held) or 'nothing'}, but no {missing[0]}. {WANTED}")
+    return _checked(file, held)
+
+
+def _checked(file: Path, held: dict[str, np.ndarray]) -> Archive:
+    points, offset, label = held["points"], held["offset"], held["label"]
+    identity = held.get("object_id", np.arange(len(label)))
+    whole = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (offset, label, identity))
+    if points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3 or not whole:
+        shown = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in held.items())
+        raise DataError(f"{file}: its arrays came as {shown}. {WANTED}")
+    offset, label = offset.astype(np.int64), label.astype(np.int64)
+    ends = len(offset) == len(label) + 1 == len(identity) + 1 and offset[0] == 0 and offset[-1] == len(points)
+    if not ends or (np.diff(offset) < 1).any():
+        raise DataError(
+            f"{file}: {len(label)} labels, {len(identity)} identities and {len(offset)} offsets that do not cut "
+            f"{len(points)} points into objects of at least one. {WANTED}"
+        )
+    classes = tuple(map(str, held["classes"].tolist()))
+    wrong = np.flatnonzero((label < 0) | (label >= len(classes)))
+    if len(wrong):
+        raise DataError(
+            f"{file}: object {wrong[0]} has label {label[wrong[0]]}, but there are {len(classes)} classes."
+        )
+    bad = np.flatnonzero(~np.isfinite(points).all(1))
+    if len(bad):
+        place = int(np.searchsorted(offset, bad[0], side="right")) - 1
+        raise DataError(
+            f"{file}: object {place} has a coordinate that is not finite, first its point {bad[0] - offset[place]}. "
+            "Leave such points out of the archive."
+        )
+    return Archive(points, offset, label, identity.astype(np.int64), classes)

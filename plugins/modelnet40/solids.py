@@ -1,0 +1,159 @@
+"""Closed solids as vertices and triangles, z up: what the generated objects are made of."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Number = float | int
+Point = Sequence[Number]
+
+
+class Solid(NamedTuple):
+    """A surface, or several, as triangles."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+
+    def moved(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Solid":
+        return Solid(self.vertices + np.array([x, y, z]), self.faces)
+
+    def scaled(self, x: Number, y: Number, z: Number) -> "Solid":
+        return Solid(self.vertices * [x, y, z], self.faces)
+
+    def turned(self, axis: str, angle_deg: Number) -> "Solid":
+        """Rotated about a coordinate axis, counter-clockwise seen from its positive end."""
+        c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+        i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+        vertices = self.vertices.copy()
+        vertices[:, i] = c * self.vertices[:, i] - s * self.vertices[:, j]
+        vertices[:, j] = s * self.vertices[:, i] + c * self.vertices[:, j]
+        return Solid(vertices, self.faces)
+
+
+def joined(solids: Sequence[Solid]) -> Solid:
+    """All of them as one."""
+    first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
+    return Solid(
+        np.concatenate([solid.vertices for solid in solids]),
+        np.concatenate([solid.faces + start for solid, start in zip(solids, first, strict=False)]),
+    )
+
+
+def mirrored(solid: Solid, axis: int) -> Solid:
+    """The solid and its mirror image; `axis` 0: left and right of the plane x = 0."""
+    sign = np.ones(3)
+    sign[axis] = -1
+    return joined([solid, Solid(solid.vertices * sign, solid.faces[:, ::-1])])
+
+
+def box(width: Number, depth: Number, height: Number, at: Point = (0, 0, 0)) -> Solid:
+    """Width along x, depth along y; `at` is the middle of its bottom."""
+    return tapered(width, depth, width, depth, height, at)
+
+
+def tapered(
+    width: Number, depth: Number, top_width: Number, top_depth: Number, height: Number, at: Point = (0, 0, 0)
+) -> Solid:
+    """A box whose top has another size than its bottom."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
+    bottom = np.column_stack([corners * [width, depth], np.zeros(4)])
+    top = np.column_stack([corners * [top_width, top_depth], np.full(4, height)])
+    vertices, faces = _rings([bottom, top], 4)
+    return Solid(vertices + np.asarray(at, float), faces)
+
+
+def slab(outline: Sequence[Point], thickness: Number) -> Solid:
+    """A flat plate in the plane z = 0 with a convex outline (x, y), counter-clockwise, centred in its thickness."""
+    flat = np.array([(x, y, 0.0) for x, y in outline])
+    half = np.array([0, 0, thickness / 2])
+    return Solid(*_rings([flat - half, flat + half], len(flat)))
+
+
+def revolved(profile: Sequence[Point], sides: int = 24) -> Solid:
+    """A profile (radius, height), from its lower end to its upper, turned about the z axis; the ends are closed."""
+    angle = 2 * math.pi * np.arange(sides) / sides
+    rings = [
+        np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(sides, float(z))]) for r, z in profile
+    ]
+    return Solid(*_rings(rings, sides))
+
+
+def cylinder(
+    radius: Number, height: Number, at: Point = (0, 0, 0), top: Number | None = None, sides: int = 16
+) -> Solid:
+    """Upright, `at` the middle of its bottom; a cone's frustum where `top`, its upper radius, is another."""
+    return revolved([(radius, 0), (radius if top is None else top, height)], sides).moved(*at)
+
+
+def rod(start: Point, end: Point, radius: Number, sides: int = 8) -> Solid:
+    """A round bar between two points."""
+    return swept([start, end], [radius, radius], sides)
+
+
+def ball(radius: Number, at: Point = (0, 0, 0), sides: int = 16) -> Solid:
+    bend = np.linspace(-math.pi / 2, math.pi / 2, sides // 2 + 1)
+    return revolved([(radius * math.cos(b), radius * math.sin(b)) for b in bend], sides).moved(*at)
+
+
+def ring(radius: Number, thickness: Number, at: Point = (0, 0, 0), sides: int = 24) -> Solid:
+    """A horizontal torus; `thickness` is the radius of its tube."""
+    angle = 2 * math.pi * np.arange(sides + 1) / sides
+    path = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(sides + 1)])
+    return swept(path, [thickness] * (sides + 1), 8).moved(*at)
+
+
+def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: int = 8) -> Solid:
+    """A round tube along a path in a plane or a straight line, with a radius at each of its points."""
+    points = np.asarray(path, float)
+    step = np.gradient(points, axis=0)
+    closed = len(points) > 2 and np.allclose(points[0], points[-1])
+    if closed:
+        step[0] = step[-1] = points[1] - points[-2]
+    tangent = step / np.linalg.norm(step, axis=1, keepdims=True)
+    bend = np.cross(tangent[0], tangent[len(points) // 2])
+    if np.linalg.norm(bend) < 1e-6:  # straight: any direction across it
+        bend = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
+    across = bend / np.linalg.norm(bend)
+    angle = 2 * math.pi * np.arange(sides) / sides
+    rings = [
+        point + radius * (np.cos(angle)[:, None] * np.cross(across, t) + np.sin(angle)[:, None] * across)
+        for point, radius, t in zip(points, radii, tangent, strict=True)
+    ]
+    return Solid(*_rings(rings, sides, caps=not closed))
+
+
+def extruded(
+    outline: Float[np.ndarray, "corners 2"],
+    height: Number,
+    hole: Float[np.ndarray, "corners 2"] | None = None,
+) -> Solid:
+    """An outline that its centre sees whole, from z = 0 to `height`, with a hole of as many corners, if any."""
+    inner = np.zeros_like(outline) if hole is None else hole
+    levels = [(inner, 0), (outline, 0), (outline, height), (inner, height)]
+    if hole is not None:
+        levels.append((inner, 0))  # its wall
+    rings = [np.column_stack([flat, np.full(len(flat), float(z))]) for flat, z in levels]
+    return Solid(*_rings(rings, len(outline), caps=False))
+
+
+def _rings(rings: Sequence[np.ndarray], sides: int, caps: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Rings of equally many points joined by strips; the first and last closed by fans, right for convex ones."""
+    vertices = np.concatenate(rings)
+    here = np.arange(sides)
+    after = (here + 1) % sides
+    strips = []
+    for start in range(0, (len(rings) - 1) * sides, sides):
+        a, b, c, d = start + here, start + after, start + sides + after, start + sides + here
+        strips += [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
+    if caps:
+        inner = np.arange(1, sides - 1)
+        zero = np.zeros_like(inner)
+        last = (len(rings) - 1) * sides
+        strips += [
+            np.column_stack([zero, inner + 1, inner]),
+            last + np.column_stack([zero, inner, inner + 1]),
+        ]
+    return vertices, np.concatenate(strips)

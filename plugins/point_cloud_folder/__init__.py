@@ -1,0 +1,1 @@
+"""A user's own meshes and point clouds in folders named by class."""

@@ -1,0 +1,1 @@
+"""PointNet: one network for every point, and the largest number over the cloud."""

@@ -1,0 +1,52 @@
+"""Farthest-point sampling (Eldar et al. 1997), compiled at its first call; the compiled code is kept on disk."""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def farthest(clouds, counts, count):
+    """Indices (cloud, count): each point as far as can be from all before it, the first from the mean.
+
+    Args:
+        clouds: (cloud, point, 3) float64, C-contiguous.
+        counts: how many points each has, int64; what stands behind them is not read.
+        count: how many are wanted.
+    """
+    found = np.empty((len(clouds), count), dtype=np.int64)
+    for number in range(len(clouds)):
+        cloud, size = clouds[number], counts[number]
+        at = np.zeros(3)
+        for axis in range(3):
+            at[axis] = cloud[:size, axis].mean()
+        distance = np.empty(size)
+        best, place = -1.0, 0
+        for point in range(size):
+            square = _square(cloud, point, at)
+            if square > best:
+                best, place = square, point
+        distance[:] = np.inf
+        for step in range(count):
+            if step >= size:
+                found[number, step] = found[number, step - size]  # all were chosen: over again
+                continue
+            found[number, step] = place
+            at[:] = cloud[place]
+            distance[place] = -1.0  # chosen; what lies at the same place is not
+            best, place = -1.0, 0
+            for point in range(size):
+                if distance[point] >= 0:
+                    square = min(distance[point], _square(cloud, point, at))
+                    distance[point] = square
+                    if square > best:
+                        best, place = square, point
+    return found
+
+
+@njit(inline="always")
+@no_type_check
+def _square(cloud, point, at):
+    return (cloud[point, 0] - at[0]) ** 2 + (cloud[point, 1] - at[1]) ** 2 + (cloud[point, 2] - at[2]) ** 2

@@ -1,0 +1,1 @@
+"""Convolutions over grids of numbers in space."""

@@ -1,0 +1,57 @@
+"""Points of clouds one after the other, and the largest numbers over each, against loops over clouds."""
+
+import pytest
+import torch
+
+from framework.clouds import pad
+from framework.errors import ConfigError
+from framework.point_sets import columns_read, even, in_parts, largest, points_of, to_points
+
+
+@pytest.mark.parametrize("numbers", [(5, 5, 5), (5, 2, 1), (1,)])
+@pytest.mark.parametrize("most", [None, 1, 3, 100])
+def test_points_are_those_of_each_cloud_in_order(numbers, most):
+    clouds = [torch.randn(number, 5) for number in numbers]
+    values, counts = points_of(pad(clouds), "none", columns=4, most=most, dtype=torch.float64)
+    wanted = [cloud[:most, :4] for cloud in clouds]
+    assert counts.tolist() == [len(cloud) for cloud in wanted]
+    assert torch.equal(values, torch.cat(wanted).double())
+
+
+@pytest.mark.parametrize("numbers", [(4, 4, 4), (4, 2, 1), (1,), ()])
+def test_the_largest_of_each_channel(numbers):
+    parts = [torch.randn(number, 3) - 5 for number in numbers]
+    values = torch.cat([torch.zeros(0, 3), *parts]).requires_grad_()
+    counts = torch.tensor(numbers, dtype=torch.int64)
+    found = largest(values, counts)
+    assert found.shape == (len(numbers), 3)
+    for row, part in zip(found, parts, strict=True):
+        assert torch.equal(row, part.max(0).values)
+    spread = to_points(found, counts)
+    assert spread.shape == values.shape
+    assert (spread >= values).all()
+    if not numbers:
+        return
+    found.sum().backward()
+    assert values.grad.sum() == 3 * len(numbers)
+
+
+def test_parts_hold_few_points_and_give_what_the_whole_gives():
+    counts = torch.tensor([3000, 2000, 2100, 10, 5000, 1])
+    values, seen = torch.randn(int(counts.sum()), 2), []
+
+    def network(part, numbers):
+        seen.append(numbers.tolist())
+        return largest(part, numbers)
+
+    assert torch.equal(in_parts(network, values, counts), largest(values, counts))
+    assert seen == [[3000], [2000], [2100, 10], [5000], [1]]
+    assert in_parts(network, values[:0], counts[:0]).shape == (0, 2)
+
+
+def test_even_and_what_is_no_cloud():
+    assert even(torch.tensor([3, 3]), 3) and not even(torch.tensor([3, 2]), 3)
+    assert columns_read((10, 6), "an encoder", False) == 3
+    assert columns_read((10, 6), "an encoder", True) == 6
+    with pytest.raises(ConfigError, match=r"an encoder got inputs of shape \(10, 2\)"):
+        columns_read((10, 2), "an encoder", False)
