@@ -1,7 +1,7 @@
 """Gradient-boosted trees (Chen & Guestrin 2016) as a density head."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 import xgboost
@@ -46,6 +46,8 @@ class XGBoostHead(DensityHead, Fitted):
         samples: share of the training samples drawn in each round.
         features: share of the features drawn for each tree.
         weight: least sum of second derivatives of the loss in a leaf.
+        splits: "hist" tries the borders of at most 256 bins of each feature, "exact" every sample's; for few samples of
+            very many features the latter is faster and takes less memory, which for bins grows with the features.
 
     Raises:
         ConfigError: the target is an angle, or a single class.
@@ -75,6 +77,7 @@ class XGBoostHead(DensityHead, Fitted):
         samples: Share = 1.0,
         features: Share = 1.0,
         weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0,
+        splits: Literal["hist", "exact"] = "hist",
     ) -> None:
         super().__init__()
         require_no_angle(target, by="density_head xgboost")
@@ -92,6 +95,7 @@ class XGBoostHead(DensityHead, Fitted):
             "subsample": samples,
             "colsample_bytree": features,
             "min_child_weight": weight,
+            "tree_method": splits,
         }
         self.register_buffer("model", torch.zeros(0, dtype=torch.uint8))
         self.register_buffer("width", torch.ones(0 if self.classes else self.numbers, dtype=torch.float64))
@@ -102,7 +106,6 @@ class XGBoostHead(DensityHead, Fitted):
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         options: dict[str, Any] = {
             **self.options,
-            "tree_method": "hist",
             "seed": seed % 2**31,
             "nthread": torch.get_num_threads(),
             "objective": "multi:softprob" if self.classes else "reg:squarederror",

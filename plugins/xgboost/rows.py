@@ -9,6 +9,7 @@ from framework.testing.rows import HeadRow
 ROWS = {
     "xgboost": (
         HeadRow("five classes", Target("class", ("a", "b", "c", "d", "e")), {"rounds": 5}),
+        HeadRow("exact splits", Target("class", ("a", "b")), {"rounds": 5, "splits": "exact"}),
         HeadRow("one real", Target("real", ("height",)), {"rounds": 5, "depth": 2}),
         HeadRow("two reals", Target("real", ("x", "y")), {"rounds": 5, "depth": 2}),
     )

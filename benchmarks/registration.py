@@ -1,0 +1,152 @@
+"""What registration costs on one core, and the rank it needs: `python benchmarks/registration.py [run] [scan]`.
+
+Writes registration.md beside this file; of a trained run (`experiment=registration/quick`) also its error, and of a
+scan the picture registration.png. Run it alone: it times one thread.
+"""
+
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import torch
+from machine import machine
+
+from framework.default_body import default_body
+from framework.schema import build, resolve
+
+HERE = Path(__file__).parent
+RANKS = (16, 32, 48, 64, 96, 128)
+BODIES, HELD = 3_000, 500
+WANTED_MS = 5.0
+
+
+def timed(call: Callable[[], object], repeats: int = 100) -> float:
+    """Median milliseconds of a call, after a warm-up."""
+    for _ in range(10):
+        call()
+    found = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        found.append(time.perf_counter() - start)
+    return 1e3 * median(found)
+
+
+def residuals(data) -> dict[int, float]:
+    """Mean vertex error, cm, of held-out bodies projected onto as many principal components of training bodies."""
+    # every k-th sample's target is the mesh in its scan's own frame, as a model has to predict it
+    parts = {}
+    for name, split, count in (("fitted", data.train(), BODIES), ("held", data.test(), HELD)):
+        batches = [split.__getitems__(range(first, first + 100)) for first in range(0, count, 100)]
+        parts[name] = {
+            key: torch.cat([batch[key].float() for batch in batches]) for key in ("target", "scale")
+        }
+    fitted, held = parts["fitted"]["target"], parts["held"]["target"]
+    mean = fitted.mean(0)
+    fitted = fitted - mean
+    values, vectors = torch.linalg.eigh((fitted @ fitted.T).double())
+    found = {}
+    for rank in RANKS:
+        basis = (fitted.T @ vectors[:, -rank:].float()) / values[-rank:].float().sqrt()
+        left = (held - mean) - (held - mean) @ basis @ basis.T
+        norm = torch.linalg.vector_norm(left.unflatten(1, (-1, 3)), dim=-1) * parts["held"]["scale"][:, None]
+        found[rank] = 100 * norm.mean().item()
+    return found
+
+
+def speeds(data) -> list[tuple[str, float]]:
+    """Milliseconds of every step for one scan, one thread."""
+    split = data.test()
+    batch = split.__getitems__([0])
+    cloud = batch["input"][:, : int((~batch["input"].isnan()).all(-1).sum())]
+    shape, pose = split.shape[:64], split.pose[:64]
+    encoder = build(
+        "encoder",
+        resolve("encoder", {"name": "bps", "points": 1024, "normalise": "none"}),
+        input_shape=tuple(cloud.shape[1:]),
+        input_columns=("x", "y", "z"),
+    )
+    rows = [
+        ("pose one body of 64 (linear blend skinning)", timed(lambda: split.model(shape, pose), 20) / 64),
+        ("pose and scan one body of 32", timed(lambda: split.__getitems__(range(32)), 10) / 32),
+        (f"encode {cloud.shape[1]} points, 1024 basis points", timed(lambda: encoder(cloud))),
+    ]
+    features = encoder(cloud)
+    numbers = len(data.target.names)
+    for rank in (32, 64, 128):
+        part = {"name": "dense_blocks", "bottleneck": rank, "standardise": True}
+        blocks = build("encoder", resolve("encoder", part), input_shape=(1024,)).eval()
+        last = torch.nn.Linear(rank, numbers)
+        rows.append((f"forward, rank {rank}", timed(lambda b=blocks, n=last: n(b(features)))))
+        rows.append(
+            (f"encode and forward, rank {rank}", timed(lambda b=blocks, n=last: n(b(encoder(cloud)))))
+        )
+    return rows
+
+
+def main(arguments: list[str]) -> None:
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    data = build("data", resolve("data", {"name": "registration"}))
+    data.prepare()
+    _, traits = default_body()
+    with torch.inference_mode():
+        rows, ranks = speeds(data), residuals(data)
+    lines = [
+        "# Registration",
+        "",
+        machine("torch", "numba"),
+        "",
+        f"The default body's vertices are at most {1e6 * traits.apart:.2g} µm from where its package puts them (8 "
+        "bodies of random shape and pose, float32 against float64).",
+        "",
+        "| one core | ms |",
+        "|---|---:|",
+        *(f"| {name} | {value:.2f} |" for name, value in rows),
+        "",
+        f"Wanted: encode and forward within {WANTED_MS:g} ms.",
+        "",
+        f"Mean vertex error of {HELD} held-out bodies (synthetic) projected onto principal components of {BODIES} "
+        "others: what a last layer of that rank cannot be better than.",
+        "",
+        "| rank | cm |",
+        "|---:|---:|",
+        *(f"| {rank} | {value:.2f} |" for rank, value in ranks.items()),
+    ]
+    if arguments:
+        lines += ["", *trained(Path(arguments[0]))]
+    if len(arguments) > 1:
+        picture(arguments[0], Path(arguments[1]))
+        lines += ["", "![A real scan and the mesh registered to it](registration.png)"]
+    (HERE / "registration.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def trained(run: Path) -> list[str]:
+    """The errors that a run's own test stage wrote."""
+    found = json.loads((run / "results.json").read_text(encoding="utf-8"))
+    rows = {"all": found, **found.get("groups", {})}
+    keys = ("vertex_error_cm", "vertex_error_median_cm", "vertex_error_95_cm")
+    return [
+        f"`experiment={found['experiment']}`, held-out bodies (synthetic), centimetres:",
+        "",
+        "| scans | mean | median | 95 % |",
+        "|---|---:|---:|---:|",
+        *(f"| {name} | {' | '.join(f'{row[key]:.2f}' for key in keys)} |" for name, row in rows.items()),
+    ]
+
+
+def picture(run: str, scan: Path) -> None:
+    from plugins.registration.__main__ import register
+
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        written = register(run, [scan], Path(folder))
+        shutil.copy(next(file for file in written if file.suffix == ".png"), HERE / "registration.png")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,333 @@
+"""Bodies that bend at joints: linear blend skinning with shape and pose blend shapes (thesis eq. 7.1-7.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from framework.errors import ConfigError, DataError, did_you_mean
+
+SLACK = 1e-3
+"""How far the skinning weights of a vertex may be from a sum of 1 before the file is called wrong."""
+ROUNDING = 1e-6
+"""How far before they are divided by it."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """What a body model is made of; float32 or float64 arrays, metres.
+
+    Attributes:
+        source: where it comes from, for messages.
+        template: the vertices of the mean shape in the rest pose.
+        faces: rows of `template`, corners counter-clockwise seen from outside.
+        weights: how much of each joint's motion a vertex follows, ≥ 0, of sum 1 (divided by their sum here).
+        parents: of each joint the one it hangs on, -1 for the only root.
+        joints: positions in the rest pose of the mean shape.
+        shapes, joint_shapes: displacement of vertices and joints by each shape coefficient.
+        pose_shapes: displacement of vertices by each pose feature; None for a body without. There are either 9
+            features a joint but the root, rotation matrix less identity, row by row (Loper et al. 2015, eq. 9); or 4,
+            unit quaternion (x, y, z, w) less identity, and the second shape coefficient (Osman et al. 2020, eq. 4).
+        names: of the joints; empty where they have none.
+
+    Raises:
+        DataError: parts that do not fit together, a number that is not finite, weights that are no shares, parents
+            that are no tree, faces that name vertices that are not there.
+    """
+
+    source: str
+    template: Float[np.ndarray, "_vertex 3"]
+    faces: Int[np.ndarray, "face 3"]
+    weights: Float[np.ndarray, "_vertex _joint"]
+    parents: tuple[int, ...]
+    joints: Float[np.ndarray, "_joint 3"]
+    shapes: Float[np.ndarray, "_vertex 3 _shape"]
+    joint_shapes: Float[np.ndarray, "_joint 3 _shape"]
+    pose_shapes: Float[np.ndarray, "_vertex 3 _feature"] | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        vertices, joints, shapes = len(self.template), len(self.parents), self.shapes.shape[-1]
+        wanted = {
+            "template": (vertices, 3),
+            "weights": (vertices, joints),
+            "joints": (joints, 3),
+            "shapes": (vertices, 3, shapes),
+            "joint_shapes": (joints, 3, shapes),
+        }
+        if self.pose_shapes is not None:
+            features = 4 * joints - 3 if self.pose_shapes.shape[-1] == 4 * joints - 3 else 9 * joints - 9
+            wanted["pose_shapes"] = (vertices, 3, features)
+        for name, shape in wanted.items():
+            values = getattr(self, name)
+            if values.shape != shape:
+                raise DataError(
+                    f"{self.source}: {name} has the shape {values.shape}; wanted {shape} for {vertices} vertices, "
+                    f"{joints} joints and as many shape coefficients as `shapes` has. Restore it from its source."
+                )
+            if not np.isfinite(values).all():
+                raise DataError(
+                    f"{self.source}: {int((~np.isfinite(values)).sum())} numbers of {name} are not finite. Restore it "
+                    "from its source."
+                )
+        if self.names and len(self.names) != joints:
+            raise DataError(f"{self.source}: {len(self.names)} names for {joints} joints; wanted one each.")
+        self._check_weights()
+        self._check_tree()
+        if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < vertices):
+            raise DataError(
+                f"{self.source}: faces name the vertices {self.faces.min()} to {self.faces.max()}, but there are 0 to "
+                f"{vertices - 1}. Restore it from its source."
+            )
+
+    def _check_weights(self) -> None:
+        total = self.weights.sum(1, dtype=np.float64, keepdims=True)
+        if (self.weights < 0).any() or (np.abs(total - 1) > SLACK).any():
+            worst = int(np.abs(total[:, 0] - 1).argmax())
+            raise DataError(
+                f"{self.source}: skinning weights are from {self.weights.min():g}, and those of vertex {worst} (from "
+                f"0) sum to {total[worst, 0]:g}; wanted none below 0 and sums of 1. Restore it from its source."
+            )
+        if (np.abs(total - 1) > ROUNDING).any():
+            object.__setattr__(self, "weights", (self.weights / total).astype(self.weights.dtype))
+
+    def _check_tree(self) -> None:
+        roots = [joint for joint, parent in enumerate(self.parents) if parent < 0]
+        depths = _depths(self.parents)
+        if len(roots) != 1 or max(self.parents, default=0) >= len(self.parents) or min(depths) < 0:
+            raise DataError(
+                f"{self.source}: the parents {self.parents} of its joints are no tree; wanted one joint without a "
+                "parent, -1, from which every other descends. Restore it from its source."
+            )
+
+
+def _depths(parents: Sequence[int]) -> list[int]:
+    """Steps from each joint up to a root; -1 where none is reached."""
+    found = []
+    for joint in range(len(parents)):
+        depth, at = 0, joint
+        while 0 <= parents[at] < len(parents) and depth <= len(parents):
+            depth, at = depth + 1, parents[at]
+        found.append(depth if parents[at] < 0 else -1)
+    return found
+
+
+def with_joints(body: Body, names: Sequence[str]) -> Body:
+    """The same body with these joints alone; the others never bend: each moves with the next joint above it.
+
+    Poses of the joints kept give the same vertices, for less work. Without pose shapes only: those count all joints.
+
+    Raises:
+        ConfigError: a joint of no such name, the root not among them, or a body with pose shapes.
+    """
+    for name in names:
+        if name not in body.names:
+            raise ConfigError(
+                f"{body.source} has no joint {name!r}.{did_you_mean(name, body.names)} Its joints: "
+                f"{', '.join(body.names)}."
+            )
+    kept = [joint for joint, name in enumerate(body.names) if name in set(names)]
+    root = body.parents.index(-1)
+    if root not in kept or body.pose_shapes is not None:
+        raise ConfigError(
+            f"{body.source}: wanted its root {body.names[root]!r} among the joints kept, and a body without pose "
+            "shapes (they count every joint). Keep the root, or all joints."
+        )
+    place = {joint: number for number, joint in enumerate(kept)}
+    weights = np.zeros((len(body.template), len(kept)), body.weights.dtype)
+    for joint in range(len(body.parents)):
+        weights[:, place[_kept_above(body.parents, joint, place)]] += body.weights[:, joint]
+    parents = [body.parents[joint] for joint in kept]
+    return replace(
+        body,
+        weights=weights,
+        parents=tuple(-1 if up < 0 else place[_kept_above(body.parents, up, place)] for up in parents),
+        joints=body.joints[kept],
+        joint_shapes=body.joint_shapes[kept],
+        names=tuple(body.names[joint] for joint in kept),
+    )
+
+
+def _kept_above(parents: Sequence[int], joint: int, kept: dict[int, int]) -> int:
+    while joint not in kept:
+        joint = parents[joint]
+    return joint
+
+
+class BodyModel(nn.Module):
+    """Vertices of a body from shape coefficients and joint rotations, batched and differentiable in all of them.
+
+    X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). A joint's rotation is relative to its parent,
+    about axes that are those of the world in the rest pose. With a pose of zeros the result is template plus shapes, to
+    the last bit where there are no pose shapes.
+
+    Args:
+        body: its arrays; they become buffers, so that `.to` changes their type and device.
+    """
+
+    template: Tensor
+    weights: Tensor
+    joints: Tensor
+    shapes: Tensor
+    joint_shapes: Tensor
+    pose_shapes: Tensor | None
+    faces: Tensor
+
+    def __init__(self, body: Body) -> None:
+        super().__init__()
+        self.parents = body.parents
+        self.names = body.names
+        self.quaternions = (
+            body.pose_shapes is not None and body.pose_shapes.shape[-1] == 4 * len(body.parents) - 3
+        )
+        depths = _depths(body.parents)
+        levels = [
+            [joint for joint, depth in enumerate(depths) if depth == level]
+            for level in range(max(depths) + 1)
+        ]
+        self.levels = [(level, [body.parents[joint] for joint in level]) for level in levels]
+        arrays = {
+            # coordinates first: all x, all y, all z, which is how they are read; one row a coefficient
+            "template": _rows(body.template[..., None])[0],
+            "weights": body.weights.T,
+            "joints": body.joints,
+            "shapes": _rows(body.shapes),
+            "joint_shapes": np.moveaxis(body.joint_shapes, 2, 0),
+            "faces": body.faces.astype(np.int64),
+        }
+        if body.pose_shapes is not None:
+            arrays["pose_shapes"] = _rows(body.pose_shapes)
+        else:
+            self.pose_shapes = None
+        for name, values in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(values)), persistent=False)
+
+    def forward(
+        self,
+        shape: Float[Tensor, "_batch _shape"],
+        pose: Float[Tensor, "_batch _joint 3"],
+        translation: Float[Tensor, "_batch 3"] | None = None,
+    ) -> Float[Tensor, "batch vertex 3"]:
+        """Posed vertices, metres, of the model's dtype.
+
+        Args:
+            shape: coefficients β; fewer than the model has are the first of them.
+            pose: θ, axis times angle of each joint, radians; any number of turns.
+            translation: of the whole body, metres.
+
+        Raises:
+            ValueError: other shapes, or numbers that are not finite; names the first such row.
+        """
+        self._check(shape, pose, translation)
+        count = shape.shape[1]
+        rest = torch.addmm(self.template, shape, self.shapes[:count])
+        # rotations in float64: an angle of many turns has no digits to lose, and there are few of them
+        turns = turns_less_identity(pose.double())
+        if self.pose_shapes is not None:
+            rest = rest + self._features(turns, pose, shape) @ self.pose_shapes
+        rest = rest.unflatten(1, (3, -1))
+        transforms = self._transforms(shape, turns).to(rest.dtype)
+        blended = transforms.transpose(1, 2) @ self.weights  # (batch, 12, vertex)
+        # Σ_j w_j (R_j x + t_j) = x + Σ_j w_j ((R_j - 1) x + t_j), which is x where nothing turns
+        moved = (blended[:, :9].unflatten(1, (3, 3)) * rest[:, None]).sum(2)
+        posed = rest + (moved + blended[:, 9:])
+        if translation is not None:
+            posed = posed + translation[..., None]
+        return posed.transpose(1, 2).contiguous()
+
+    def rest_joints(self, shape: Float[Tensor, "batch shape"]) -> Float[Tensor, "batch joint 3"]:
+        """J(β), joint positions in the rest pose, metres."""
+        return self.joints + torch.einsum("bs,sjk->bjk", shape, self.joint_shapes[: shape.shape[1]])
+
+    def posed_joints(
+        self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
+    ) -> Float[Tensor, "batch joint 3"]:
+        """Where the joints are in a pose, metres."""
+        self._check(shape, pose, None)
+        joints = self.rest_joints(shape).double()
+        found = self._transforms(shape, turns_less_identity(pose.double()))
+        moved = torch.einsum("bjmn,bjn->bjm", found[..., :9].unflatten(-1, (3, 3)), joints)
+        return (joints + moved + found[..., 9:]).to(self.template.dtype)
+
+    def _transforms(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch joint 12"]:
+        """Of each joint (R - 1, t), such that x becomes R x + t: the chain of the rotations up to the root, float64."""
+        joints = self.rest_joints(shape).double()
+        rotations = list(turns.unbind(1))
+        shifts = list(joints.unbind(1))
+        for level, above in self.levels:
+            if above[0] < 0:  # the root turns about itself: R j + t = j
+                rotation = turns[:, level]
+                shift = -(rotation @ joints[:, level, :, None])[..., 0]
+            else:
+                up = torch.stack([rotations[joint] for joint in above], 1)
+                local = turns[:, level]
+                rotation = up + local + up @ local  # (1 + U)(1 + L) - 1
+                # a joint stays where its parent takes it: R j + t = R_up j + t_up
+                shift = torch.stack([shifts[joint] for joint in above], 1)
+                shift = shift + ((up - rotation) @ joints[:, level, :, None])[..., 0]
+            for number, joint in enumerate(level):
+                rotations[joint], shifts[joint] = rotation[:, number], shift[:, number]
+        return torch.cat([torch.stack(rotations, 1).flatten(2), torch.stack(shifts, 1)], -1)
+
+    def _features(self, turns: Tensor, pose: Tensor, shape: Tensor) -> Float[Tensor, "batch feature"]:
+        others = [joint for joint, parent in enumerate(self.parents) if parent >= 0]
+        if not self.quaternions:
+            return turns[:, others].flatten(1).to(self.template.dtype)
+        second = shape[:, 1:2] if shape.shape[1] > 1 else shape.new_zeros(len(shape), 1)
+        found = quaternions_less_identity(pose[:, others].double()).flatten(1)
+        return torch.cat([found.to(shape.dtype), second], 1)
+
+    def _check(self, shape: Tensor, pose: Tensor, translation: Tensor | None) -> None:
+        batch, most, joints = len(shape), len(self.shapes), len(self.parents)
+        fits = shape.dim() == 2 and shape.shape[1] <= most and pose.shape == (batch, joints, 3)
+        if not fits or (translation is not None and translation.shape != (batch, 3)):
+            moved = "" if translation is None else f" and translation {tuple(translation.shape)}"
+            raise ValueError(
+                f"shape {tuple(shape.shape)}, pose {tuple(pose.shape)}{moved}; wanted (batch, at most {most}), (batch, "
+                f"{joints}, 3) and (batch, 3)."
+            )
+        for name, values in (("shape", shape), ("pose", pose), ("translation", translation)):
+            # also refused: angles whose squares are infinite in float64
+            if values is not None and not (finite := values.double().square().isfinite()).all():
+                row = int((~finite.flatten(1).all(1)).nonzero()[0])
+                raise ValueError(f"{name} is not finite in batch row {row}; wanted numbers below 1e150.")
+
+
+def _rows(values: np.ndarray) -> np.ndarray:
+    """(vertex, 3, row) as (row, 3 · vertex)."""
+    return np.moveaxis(values, 0, 2).transpose(1, 0, 2).reshape(values.shape[2], -1)
+
+
+def turns_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """R - 1 of rotations about an axis by an angle, axis times angle in radians; tiny angles keep their digits.
+
+    R - 1 = (sin θ / θ) K + ((1 - cos θ) / θ²) K² with K x = v × x (Rodrigues; Murray, Li & Sastry 1994, eq. 2.14).
+    """
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    square = vectors.square().sum(-1)
+    first = sine_over_angle(square)[..., None, None]
+    half = sine_over_angle(square / 4)[..., None, None]  # (1 - cos θ) / θ² = (sin(θ/2) / (θ/2))² / 2
+    return first * cross + half.square() / 2 * (cross @ cross)
+
+
+def quaternions_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """(x, y, z, w) of unit quaternions with 1 taken from w, of rotations given as axis times angle, radians."""
+    square = vectors.square().sum(-1, keepdim=True)
+    quarter = sine_over_angle(square / 16)
+    # cos(θ/2) - 1 = -2 sin²(θ/4)
+    return torch.cat([sine_over_angle(square / 4) * vectors / 2, -quarter.square() * square / 8], -1)
+
+
+def sine_over_angle(square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """sin θ / θ from θ², smooth in it, also at 0."""
+    small = square < 1e-2
+    root = square.where(~small, 1).sqrt()
+    # the series of sin θ / θ; what is left out is below 1e-20 up to 1e-2
+    t = square.where(small, 0)
+    series = 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72 * (1 - t / 110))))
+    return series.where(small, root.sin() / root)

@@ -1,0 +1,1 @@
+"""Blocks of fully connected layers whose outputs are joined to their inputs."""

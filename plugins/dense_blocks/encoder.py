@@ -1,0 +1,88 @@
+"""Blocks of fully connected layers, each block's output beside its input; a narrow last layer on request."""
+
+import math
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+
+
+class DenseBlocks(Encoder):
+    """A fully connected network in the manner of DenseNet: two blocks of two layers, for mesh registration.
+
+    A block is `layers` times a linear layer, batch norm where asked for, ReLU and dropout; what leaves it is its input
+    with its output appended, so that later layers read the features themselves and all that was made of them (thesis
+    Figure 6.2, §6.5.2-6.5.3; Huang et al. 2017).
+
+    Args:
+        input_shape: any; a sample is flattened.
+        blocks, layers: how many blocks, and layers of each.
+        width: outputs of a layer.
+        dropout: probability of dropping an output of a layer.
+        standardise: whether features are first brought to mean 0 and deviation 1, each by its own mean over all of
+            training (in training by the batch's): features that hardly vary about a mean train many times slower.
+        batch_norm: whether layers normalise over the batch. With either, training needs batches of at least two.
+        bottleneck: length of a last linear layer without activation; None for none. The linear layer in front of a
+            density head of very many numbers then has this rank, and is as much smaller and faster.
+
+    Raises:
+        ConfigError: a sample holds no numbers.
+    """
+
+    bibtex = """@inproceedings{huang2017densely,
+  title = {Densely Connected Convolutional Networks},
+  author = {Huang, Gao and Liu, Zhuang and van der Maaten, Laurens and Weinberger, Kilian Q.},
+  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year = {2017}
+}"""
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        blocks: Annotated[int, Field(ge=1, le=100)] = 2,
+        layers: Annotated[int, Field(ge=1, le=100)] = 2,
+        width: Annotated[int, Field(gt=0)] = 1024,
+        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0,
+        standardise: bool = False,
+        batch_norm: bool = False,
+        bottleneck: Annotated[int, Field(gt=0)] | None = None,
+    ) -> None:
+        super().__init__()
+        length = math.prod(input_shape)
+        if length == 0:
+            raise ConfigError(
+                f"dense_blocks got samples of shape {input_shape}, which hold no numbers; wanted at least one. "
+                "Check what `data` yields, or the encoder before it."
+            )
+        # no decay of older batches (momentum=None), and nothing learnt
+        self.standard = nn.BatchNorm1d(length, affine=False, momentum=None) if standardise else nn.Identity()
+        self.blocks = nn.ModuleList()
+        for _ in range(blocks):
+            parts: list[nn.Module] = []
+            inner = length
+            for _ in range(layers):
+                parts.append(nn.Linear(inner, width, bias=not batch_norm))  # batch norm has its own
+                if batch_norm:
+                    parts.append(nn.BatchNorm1d(width))
+                parts += [nn.ReLU(inplace=True), nn.Dropout(dropout)]
+                inner = width
+            self.blocks.append(nn.Sequential(*parts))
+            length += width
+        self.bottleneck = nn.Identity() if bottleneck is None else nn.Linear(length, bottleneck)
+        self.vectorises = not (batch_norm or standardise)  # whose running moments are buffers
+        self.output_shape = (bottleneck or length,)
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        numbers = inputs.flatten(1).to(next(self.parameters()).dtype)
+        if inputs.dtype == torch.uint8:
+            numbers = numbers / 255
+        numbers = self.standard(numbers)
+        for block in self.blocks:
+            numbers = torch.cat([numbers, block(numbers)], 1)
+        return self.bottleneck(numbers)

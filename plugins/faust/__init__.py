@@ -1,0 +1,1 @@
+"""FAUST: real scans of ten people with registered meshes."""

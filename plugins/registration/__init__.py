@@ -1,0 +1,1 @@
+"""Registering a body's mesh to a scan: synthetic bodies, scanned."""

@@ -1,0 +1,1 @@
+"""How far predicted vertices are from the true ones."""
