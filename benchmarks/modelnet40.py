@@ -4,7 +4,7 @@
         experiment=modelnet40/bps_mlp,modelnet40/occ_mlp_8,...   (all of conf/experiment/modelnet40 but base)
     python benchmarks/modelnet40.py outputs/sweeps/modelnet40
 
-A second sweep into another folder (more seeds, fewer epochs for a slow row) is named beside the first. Latencies are
+Further sweeps (more seeds, fewer epochs or a coarser grid for a slow row) are named beside the first. Latencies are
 measured here, on one thread; encoding is in them. Writes modelnet40.md beside this file.
 """
 
@@ -34,7 +34,7 @@ ROWS = {  # table and row, what the thesis reports: accuracy, FLOPs, parameters
     "bps_mlp_ball_grid": ("6.1, 8", "BPS-MLP (512, ball grid)", "87.7 %", "1.1e6", "5.5e5"),
     "bps_mlp": ("6.1, 9; 6.2; 6.3", "BPS-MLP (512, random)", "88.0 %", "1.1e6", "5.5e5"),
     "bps_mlp_hexagonal": ("6.1, 10", "BPS-MLP (512, hexagonal)", "88.1 %", "1.1e6", "5.5e5"),
-    "bps_conv3d": ("6.1, 11; 6.2; 6.3", "BPS-Conv3D (32³ grid)", "89.8 %", "3.5e8", "1.7e7"),
+    "bps_conv3d": ("6.1, 11; 6.2; 6.3", "BPS-Conv3D", "89.8 %", "3.5e8", "1.7e7"),
     "bps_mlp_delta": ("6.1, 12", "BPS-MLP, deltas", "86.2 %", "2.2e6", "1.1e6"),
     "bps_conv3d_delta": ("6.1, 13", "BPS-Conv3D, deltas", "90.8 %", "3.8e8", "1.7e7"),
     "bps_extra_trees": ("6.1, 14", "BPS-ERT (16³ grid)", "85.4 %", "-", "-"),
@@ -73,6 +73,8 @@ def found(sweep: Path, clouds: torch.Tensor) -> list[dict[str, Any]]:
         config = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))
         key = numbers["experiment"].rpartition("/")[2]
         table, method, *thesis = ROWS[key]
+        if "conv3d" in key:
+            method = f"{method} ({round(config['encoder']['bps']['points'] ** (1 / 3))}³ grid)"
         model = framework.load(path.parent)
         with torch.inference_mode():
             one = wall_time(lambda model=model: model(clouds[:1]), torch.device("cpu"), budget_seconds=2)

@@ -35,6 +35,10 @@ class Encoder(nn.Module, ABC):
     fixed: bool = False
     """Whether features are a function of the input alone: nothing in them is learned or drawn. The framework computes
     them once per sample then, not once per epoch, where neither the data nor an objective varies its inputs."""
+    starts_flat: bool = False
+    """Whether the linear layer to the head starts with weights of 0 where this encoder is last, so that all inputs are
+    given one density at first: for heads of very many numbers, whose usual first weights are noise that takes long to
+    unlearn. May be set by the constructor."""
     output_shape: tuple[int, ...]
     """Shape of the features of one sample; set by the constructor. The last encoder's is (length,)."""
 

@@ -66,6 +66,8 @@ class Model(Predictor):
             self.projection: nn.Module = nn.Flatten()
         elif len(shape) == 1:
             self.projection = nn.Linear(shape[0], head.size)
+            if encoders and encoders[-1].starts_flat:
+                nn.init.zeros_(self.projection.weight)
         else:
             raise ConfigError(
                 f"The last encoder ends in features of shape {shape}; wanted a vector. "

@@ -76,6 +76,7 @@ class DenseBlocks(Encoder):
             length += width
         self.bottleneck = nn.Identity() if bottleneck is None else nn.Linear(length, bottleneck)
         self.vectorises = not (batch_norm or standardise)  # whose running moments are buffers
+        self.starts_flat = bottleneck is not None
         self.output_shape = (bottleneck or length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:

@@ -63,7 +63,8 @@ class GaussianHead(DensityHead):
         self.size = 2 * self.numbers + pairs if self.predicted else self.numbers
         if not self.predicted:
             self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
-            self.register_buffer("coefficients", torch.zeros(self.numbers, self.numbers, dtype=torch.float64))
+            side = self.numbers if self.full else 0  # of a diagonal covariance none: numbers may be very many
+            self.register_buffer("coefficients", torch.zeros(side, side, dtype=torch.float64))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Gaussian:
         raw = require_finite(raw, self.size)
@@ -88,7 +89,10 @@ class GaussianHead(DensityHead):
         if len(raw) == 0:
             raise ValueError("a fixed covariance is calibrated on validation data, but got none of it.")
         residual = target.double() - self(raw).location.double()
-        scale, coefficients = fit(residual, full=self.full)
+        if not self.full:  # each σ by itself
+            self.scale.copy_(residual.square().mean(0).sqrt().clamp(min=self.floor))
+            return
+        scale, coefficients = fit(residual)
         self.scale.copy_(scale.clamp(min=self.floor))
         self.coefficients.copy_(coefficients)
 
@@ -112,14 +116,14 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 
 def fit(
-    residual: Float[Tensor, "sample number"], *, full: bool
+    residual: Float[Tensor, "sample number"],
 ) -> tuple[Float[Tensor, "number"], Float[Tensor, "number number"]]:
     """Maximum-likelihood σ and φ of zero-mean residuals: least squares of each number on those before it."""
     count = residual.shape[-1]
     scale, coefficients = residual.new_zeros(count), residual.new_zeros(count, count)
     for number in range(count):
         left = residual[:, number]
-        if full and number:
+        if number:
             before = residual[:, :number]
             # the driver that copes with collinear residuals
             solution = torch.linalg.lstsq(before, left[:, None], driver="gelsd").solution[:, 0]
