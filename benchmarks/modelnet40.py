@@ -75,6 +75,8 @@ def found(sweep: Path, clouds: torch.Tensor) -> list[dict[str, Any]]:
         table, method, *thesis = ROWS[key]
         if "conv3d" in key:
             method = f"{method} ({round(config['encoder']['bps']['points'] ** (1 / 3))}³ grid)"
+        cut = config["encoder"].get("tdf", {}).get("truncation", 1.0)
+        method += "" if cut == 1 else f", cut off at {cut:g} cells"
         model = framework.load(path.parent)
         with torch.inference_mode():
             one = wall_time(lambda model=model: model(clouds[:1]), torch.device("cpu"), budget_seconds=2)
