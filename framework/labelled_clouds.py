@@ -33,6 +33,7 @@ VERSION = 1
 """Of what `cloud` makes of a file; a change takes a new number, and with it a new place in the cache."""
 SURFACE_POINTS = 2048
 """Drawn from a mesh where no number is asked for (thesis §6.5.1)."""
+SPLITS = ("train", "validation", "test")
 COARSE = 1e-3
 """Rounding to float32, as a share of a cloud's extent, that is refused."""
 
@@ -259,6 +260,35 @@ def folds(
     fold = np.empty(len(labels), np.int64)
     fold[order] = np.arange(len(labels)) % count
     return fold
+
+
+def apart(
+    packed: Packed,
+    labels: Int[np.ndarray, "clouds"],
+    split: NDArray,
+    where: str,
+    *,
+    source: Mapping[str, str] | None = None,
+    **fields: Tensor,
+) -> dict[str, Clouds]:
+    """The clouds of each split, with "target", "group" (one for all) and the `fields` of every cloud.
+
+    Args:
+        split: the name of each cloud's split.
+        where: what is split, for messages.
+        source: of a split whose clouds are another's.
+
+    Raises:
+        DataError: a split is empty.
+    """
+    found = {}
+    for name in SPLITS:
+        chosen = np.flatnonzero(split == (source or {}).get(name, name))
+        own = {key: values[torch.from_numpy(chosen)] for key, values in fields.items()}
+        target, group = torch.from_numpy(labels[chosen]), torch.zeros(len(chosen), dtype=torch.int64)
+        found[name] = Clouds(packed, chosen, target=target, group=group, **own)
+    require_samples({name: len(clouds) for name, clouds in found.items()}, where)
+    return found
 
 
 def require_samples(sizes: Mapping[str, int], where: str) -> None:

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from framework import cloud_picture, labelled_clouds
 from framework.data import Batch, Data
-from framework.labelled_clouds import Clouds, Packed, Reading
+from framework.labelled_clouds import Packed, Reading
 from framework.meshes import stream
 from framework.target import Target
 from plugins.dales.archive import Archive, read_archive
@@ -74,19 +74,8 @@ class Dales(Data):
         random = stream(seed, f"validation {self.fold}")
         held_out = labelled_clouds.spared(archive.label[learned], self.validation_share, random)
         split[learned[held_out]] = "validation"
-        self._splits = {}
-        for name in SPLITS:
-            chosen = np.flatnonzero(split == name)
-            self._splits[name] = Clouds(
-                packed,
-                chosen,
-                target=torch.from_numpy(archive.label[chosen]),
-                group=torch.zeros(len(chosen), dtype=torch.int64),
-                object=torch.from_numpy(archive.identity[chosen]),
-            )
-        labelled_clouds.require_samples(
-            {name: len(clouds) for name, clouds in self._splits.items()}, str(self.root)
-        )
+        identity = torch.from_numpy(archive.identity)
+        self._splits = labelled_clouds.apart(packed, archive.label, split, str(self.root), object=identity)
         names = [str(number) for number in archive.identity]
         self._digest = labelled_clouds.digest(names, archive.label.tolist(), split.tolist())
 

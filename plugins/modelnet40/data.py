@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -15,7 +14,7 @@ from framework import cloud_picture, images, labelled_clouds
 from framework.data import Batch, Data
 from framework.errors import DataError
 from framework.generated import read_mark
-from framework.labelled_clouds import Clouds, Reading
+from framework.labelled_clouds import Reading
 from framework.mesh_files import NORMALS
 from framework.meshes import stream
 from framework.target import Target
@@ -100,13 +99,7 @@ class ModelNet40(Data):
         random = stream(self.reading.seed, "validation")
         held_out = labelled_clouds.spared(labels[learned], self.validation_share, random)
         split[learned[held_out]] = "validation"
-        self._splits = {}
-        for name in ("train", "validation", "test"):
-            chosen = np.flatnonzero(split == name)
-            target = torch.from_numpy(labels[chosen])
-            group = torch.zeros(len(chosen), dtype=torch.int64)
-            self._splits[name] = Clouds(loaded.packed, chosen, target=target, group=group)
-        labelled_clouds.require_samples({name: len(one) for name, one in self._splits.items()}, str(root))
+        self._splits = labelled_clouds.apart(loaded.packed, labels, split, str(root))
         names = [files[number].name for number in loaded.good]
         self._digest = labelled_clouds.digest(names, labels.tolist(), split.tolist())
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -13,11 +12,11 @@ from torch.utils.data import Dataset
 from framework import cloud_picture, images, labelled_clouds
 from framework.data import Batch, Data
 from framework.errors import DataError
-from framework.labelled_clouds import Clouds, Reading
+from framework.labelled_clouds import Reading
 from framework.mesh_files import XYZ
 from framework.meshes import stream
 from framework.target import Target
-from plugins.point_cloud_folder.layout import SPLITS, WANTED, listed
+from plugins.point_cloud_folder.layout import WANTED, listed
 
 
 class PointCloudFolder(Data):
@@ -83,14 +82,8 @@ class PointCloudFolder(Data):
         self._ignored = found.ignored
         labels = np.array(found.labels)[list(loaded.good)]
         split = self._split(labels, [found.splits[number] for number in loaded.good])
-        self._splits = {}
-        for name in SPLITS:
-            source = "train" if name == "validation" and not self.shares[0] and name not in split else name
-            chosen = np.flatnonzero(split == source)
-            target = torch.from_numpy(labels[chosen])
-            group = torch.zeros(len(chosen), dtype=torch.int64)
-            self._splits[name] = Clouds(loaded.packed, chosen, target=target, group=group)
-        labelled_clouds.require_samples({name: len(one) for name, one in self._splits.items()}, str(root))
+        source = {"validation": "train"} if not self.shares[0] and "validation" not in split else None
+        self._splits = labelled_clouds.apart(loaded.packed, labels, split, str(root), source=source)
         missing = set(range(len(found.classes))) - set(labels[split == "train"].tolist())
         if missing:
             raise DataError(
