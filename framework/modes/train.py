@@ -123,7 +123,7 @@ def _train(
 
 def _fit_at_once(run: Run, predictor: Predictor, resolved: Resolved, data: Data, console: Console) -> float:
     """Of heads that learn from the whole training split; the validation loss, nats."""
-    if build_objectives(resolved):
+    if resolved["objective"]:
         raise ConfigError(
             f"density_head={resolved['density_head']['name']} is fitted at once and has no gradient, which objectives "
             "work by. Leave objective out."

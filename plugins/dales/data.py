@@ -18,7 +18,6 @@ from framework.target import Target
 from plugins.dales.archive import Archive, read_archive
 
 FOLDS = 5
-SPLITS = ("train", "validation", "test")
 
 
 class Dales(Data):
