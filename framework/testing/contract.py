@@ -142,9 +142,8 @@ def _examine_encoder(name: str, row: EncoderRow) -> Iterator[Finding]:
     from framework.testing.encoders import examine_encoder
 
     config = resolve("encoder", {"name": name, **row.config})
-    shape, columns = row.input_shape, row.columns
     yield from examine_encoder(
-        row, lambda: build("encoder", config, input_shape=shape, input_columns=columns)
+        row, lambda shape: build("encoder", config, input_shape=shape, input_columns=row.columns)
     )
 
 

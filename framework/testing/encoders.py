@@ -8,18 +8,26 @@ from torch import Tensor
 
 from framework.encoder import Encoder
 from framework.errors import UserError
+from framework.testing.cloud_encoders import (
+    any_order,
+    bad_clouds,
+    different_clouds,
+    gradients_of_padding,
+    other_shapes,
+    padding,
+)
 from framework.testing.finding import SEED, Finding, Worst, examined
-from framework.testing.rows import EncoderRow
+from framework.testing.rows import CloudRow, EncoderRow
 
 Make = Callable[[], Encoder]
 
 
-def examine_encoder(row: EncoderRow, build: Make) -> Iterator[Finding]:
-    """Every property of one encoder, fresh for each."""
+def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]) -> Iterator[Finding]:
+    """Every property of one encoder, built for a shape of input, fresh for each."""
 
-    def make() -> Encoder:
-        torch.manual_seed(SEED)
-        return build().eval()
+    def make(seed: int = SEED) -> Encoder:
+        torch.manual_seed(seed)
+        return build(row.input_shape).eval()
 
     def inputs(count: int) -> Tensor:
         """Images in [0, 1], or normal vectors."""
@@ -33,13 +41,22 @@ def examine_encoder(row: EncoderRow, build: Make) -> Iterator[Finding]:
         "number types": (0.0, lambda worst: _number_types(make, inputs, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, inputs, worst)),
         "rows of a batch apart": (1e-4, lambda worst: _rows_apart(make, inputs, worst)),
-        "state-dict round trip": (0.0, lambda worst: _round_trip(make, build, inputs, worst)),
+        "state-dict round trip": (0.0, lambda worst: _round_trip(make, inputs, worst)),
         "gradients reach every parameter": (0.0, lambda worst: _gradients(make, inputs, worst)),
         "gradient": (1e-4, lambda worst: _against_differences(make, inputs, worst)),
         "finite on extreme inputs": (0.0, lambda worst: _extremes(make, inputs, worst)),
     }
     if len(row.input_shape) == 3:
         checks["bytes are read as 0 to 1"] = (1e-5, lambda worst: _bytes(make, row, worst))
+    if isinstance(row, CloudRow):
+        clouds = different_clouds(*row.input_shape)
+        checks |= {
+            "padding": (1e-5, lambda worst: padding(make, clouds, worst)),
+            "points in any order": (1e-5, lambda worst: any_order(make, clouds, worst)),
+            "gradients of padding": (0.0, lambda worst: gradients_of_padding(make, clouds, worst)),
+            "bad clouds are named": (0.0, lambda worst: bad_clouds(make, clouds, worst)),
+            "what is no cloud is refused": (0.0, lambda worst: other_shapes(build, worst)),
+        }
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield examined(name, row.limits.get(name, limit), check)
@@ -93,10 +110,9 @@ def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> No
             worst.see((whole[index] - alone).abs().max() / scale, f"sample {index} alone")
 
 
-def _round_trip(make: Make, build: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
     encoder = make()
-    torch.manual_seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
-    other = build().eval()
+    other = make(SEED + 7)  # so that a parameter which is not stored starts elsewhere
     other.load_state_dict(encoder.state_dict())
     with torch.no_grad():
         worst.same_bits("features of the stored state", other(inputs(3)), encoder(inputs(3)))

@@ -58,7 +58,7 @@ class HeadRow:
 
 @dataclass(frozen=True)
 class EncoderRow:
-    """One parametrisation of an encoder: images of 3 or fewer channels, a point cloud, a vector.
+    """One parametrisation of an encoder: of images of 3 or fewer channels, of vectors; of clouds see CloudRow.
 
     Attributes:
         name: what distinguishes it from the plugin's other rows.
@@ -73,6 +73,14 @@ class EncoderRow:
     limits: Mapping[str, float] = field(default_factory=dict)
     leave_out: Mapping[str, str] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CloudRow(EncoderRow):
+    """One parametrisation of an encoder of point clouds, of shape (points, columns) with x, y, z in the first three.
+
+    Such an encoder sees a set: neither padding nor the order of its points matters, and bad clouds are named.
+    """
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,9 @@ def _turned(
     if read & {columns.index(name) for name in NORMAL if name in columns}:
         vectors.append(columns_of("normal", columns))
     for places in vectors:
-        along = (local[..., places].double() @ axes).to(local.dtype)
+        vector = local[..., places].double()
+        padding = vector.isnan()  # is no summand of the axes' gradient
+        along = (vector.where(~padding, 0) @ axes).where(~padding, torch.nan).to(local.dtype)
         for place, part in zip(places, along.unbind(-1), strict=True):
             parts[place] = part
     return torch.stack(parts, -1)

@@ -396,12 +396,6 @@ def test_the_runs_seed_has_no_part_in_it():
     assert torch.equal(encoder()(clouds), first)
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 32, 32), (100, 2)])
-def test_what_is_no_cloud_is_refused(shape):
-    with pytest.raises(ConfigError, match=r"encoder bps got inputs of shape .* wanted clouds"):
-        encoder(shape)
-
-
 def test_features_that_are_not_there_are_refused():
     with pytest.raises(
         ConfigError, match=r"'color' wants a column 'red' of the clouds, whose columns are not named"
@@ -444,15 +438,6 @@ def test_clouds_that_were_not_normalised_are_refused_by_none(factor):
     torch.testing.assert_close(made(clouds), encoder().double()(clouds), rtol=0, atol=1e-6)
     with pytest.raises(DataError, match=r"Cloud 0 of the batch reaches .* encoder bps with normalise=none"):
         made(clouds * factor)
-
-
-def test_bad_points_and_empty_clouds_are_refused():
-    clouds = batch_of([5, 3])
-    clouds[1, 1, 2] = math.inf
-    with pytest.raises(DataError, match="Cloud 1 of the batch holds inf in column 2 of its point 1"):
-        encoder()(clouds)
-    with pytest.raises(DataError, match="Cloud 1 of the batch has no point"):
-        encoder()(torch.stack([torch.zeros(4, 3), torch.full((4, 3), math.nan)]))
 
 
 @pytest.mark.parametrize("rotation_invariant", [False, True])

@@ -2,20 +2,18 @@
 
 from typing import Annotated, Literal
 
-import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
 from framework.clouds import Normalisation
-from framework.encoder import Encoder
-from framework.point_sets import columns_read, in_parts, largest, points_of, to_points
+from framework.point_sets import PointSetEncoder, largest, to_points
 
 Width = Annotated[int, Field(gt=0)]
 ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
 
 
-class DeepSets(Encoder):
+class DeepSets(PointSetEncoder):
     """Equivariant layers: each point's numbers relative to the largest over its cloud; then the maximum over the cloud.
 
     x ↦ σ(β + (x - 1 max x) Γ), the layer that the paper uses on clouds. Neither the order of the points nor padding
@@ -54,10 +52,9 @@ class DeepSets(Encoder):
         normalise: Normalisation = "unit_ball",
         attributes: bool = False,
     ) -> None:
-        super().__init__()
-        self.columns = columns_read(input_shape, "encoder deepsets", attributes)
-        self.points = points
-        self.normalise: Normalisation = normalise
+        super().__init__(
+            input_shape, "encoder deepsets", points=points, normalise=normalise, attributes=attributes
+        )
         lengths = [self.columns, *channels]
         self.equivariant = nn.ModuleList(
             nn.Linear(before, after) for before, after in zip(lengths, channels, strict=False)
@@ -71,16 +68,7 @@ class DeepSets(Encoder):
         self.whole = nn.Sequential(*after)
         self.output_shape = (length,)
 
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        dtype = next(self.parameters()).dtype
-        values, counts = points_of(
-            inputs, self.normalise, columns=self.columns, most=self.points, dtype=dtype
-        )
-        if self.training or torch.is_grad_enabled():
-            return self._described(values, counts)
-        return in_parts(self._described, values, counts)
-
-    def _described(
+    def described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         for layer in self.equivariant:

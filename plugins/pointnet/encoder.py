@@ -8,15 +8,14 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from framework.clouds import Normalisation
-from framework.encoder import Encoder
-from framework.point_sets import columns_read, in_parts, largest, points_of
+from framework.point_sets import PointSetEncoder, largest
 
 Width = Annotated[int, Field(gt=0)]
 LOCAL = 2
 """Layers that every point passes before its features are transformed."""
 
 
-class PointNet(Encoder):
+class PointNet(PointSetEncoder):
     """Every point passes the same layers; the largest number of each channel over the cloud describes it.
 
     "full" also predicts from the cloud a 3 × 3 matrix that every point is multiplied by, and one that the features of
@@ -58,10 +57,9 @@ class PointNet(Encoder):
         normalise: Normalisation = "unit_ball",
         attributes: bool = False,
     ) -> None:
-        super().__init__()
-        self.columns = columns_read(input_shape, "encoder pointnet", attributes)
-        self.points = points
-        self.normalise: Normalisation = normalise
+        super().__init__(
+            input_shape, "encoder pointnet", points=points, normalise=normalise, attributes=attributes
+        )
         after = point_widths[LOCAL:]
         full = variant == "full"
         self.input_matrix = Matrix(3, after, widths) if full else None
@@ -72,16 +70,7 @@ class PointNet(Encoder):
         self.dropout = nn.Dropout(dropout)
         self.output_shape = (widths[-1],)
 
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        dtype = next(self.parameters()).dtype
-        values, counts = points_of(
-            inputs, self.normalise, columns=self.columns, most=self.points, dtype=dtype
-        )
-        if self.training or torch.is_grad_enabled():
-            return self._described(values, counts)
-        return in_parts(self._described, values, counts)
-
-    def _described(
+    def described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if self.input_matrix is not None:

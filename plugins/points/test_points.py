@@ -1,5 +1,4 @@
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -8,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.clouds import normalised, pad
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError
 from framework.schema import build, resolve
 from plugins.points.farthest import farthest
 
@@ -105,20 +104,7 @@ def test_the_features_are_fixed_and_nothing_is_learned():
         assert made(torch.zeros(0, 40, 4)).shape == made(torch.zeros(0, 0, 4)).shape == (0, 8, 4)
 
 
-@pytest.mark.parametrize("shape", [(3,), (3, 32, 32), (100, 2)])
-def test_what_is_no_cloud_is_refused(shape):
-    with pytest.raises(ConfigError, match=r"encoder points got inputs of shape .* wanted clouds"):
-        encoder(shape)
-
-
 @pytest.mark.parametrize("config", [{"points": 0}, {"choice": "first"}, {"seed": -1}, {"normalise": "ball"}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
         encoder(**config)
-
-
-def test_bad_clouds_are_refused():
-    clouds = batch_of([5, 3])
-    clouds[1, 1, 0] = math.nan
-    with pytest.raises(DataError, match="Cloud 1 of the batch holds nan in column 0 of its point 1"):
-        encoder()(clouds)
