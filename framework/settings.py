@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from framework.errors import ConfigError, did_you_mean
 from framework.registry import GROUPS
@@ -22,9 +22,20 @@ class OptimizerSettings(_Strict):
 
     name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
+    momentum: Annotated[float, Field(ge=0, lt=1)] | None = None
+    """Of sgd alone, and 0 where nothing is said; the others have moments of their own."""
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
     warmup_steps: NotNegative = 0
+
+    @field_validator("momentum")
+    @classmethod
+    def _momentum_is_sgds(cls, value: float | None, info: ValidationInfo) -> float | None:
+        if value is not None and info.data.get("name") != "sgd":
+            raise ValueError(
+                f"{info.data.get('name')} has none, sgd alone. Leave it out, or choose optimizer=sgd"
+            )
+        return value
 
 
 class LoggerSettings(_Strict):

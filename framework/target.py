@@ -6,6 +6,8 @@ from typing import Literal
 from framework.errors import ConfigError
 
 Kind = Literal["angle", "real", "class"]
+MOST = 40
+"""Names that a sentence lists in full."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,13 @@ class Target:
     kind: Kind
     names: tuple[str, ...]
 
+    @property
+    def told(self) -> str:
+        """The names, for a sentence; of very many the first ones, and how many there are beside them."""
+        first = self.names if len(self.names) <= MOST else self.names[: MOST // 4]
+        rest = f" and {len(self.names) - len(first)} more" if len(first) < len(self.names) else ""
+        return ", ".join(first) + rest
+
     def require(self, kind: Kind, by: str) -> None:
         """Refuse a target that `by` cannot describe.
 
@@ -31,5 +40,5 @@ class Target:
         if self.kind != kind:
             raise ConfigError(
                 f"{by} describes targets of kind {kind!r}, but this data set's are {self.kind!r} "
-                f"({', '.join(self.names)}). Choose another density_head, or other data."
+                f"({self.told}). Choose another density_head, or other data."
             )

@@ -90,8 +90,9 @@ class Training(pl.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         chosen = self.optimizer_settings
+        momentum = {} if chosen.momentum is None else {"momentum": chosen.momentum}
         optimizer = OPTIMIZERS[chosen.name](
-            self.parameters(), lr=chosen.learning_rate, weight_decay=chosen.weight_decay
+            self.parameters(), lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **momentum
         )
         total = self._planned_steps()
 

@@ -271,7 +271,7 @@ def test_clouds_that_were_not_normalised_are_refused():
     good /= good.norm(dim=-1).max()
     batch = pad([good, good[:7] * 0, good * 1.9, good * 0.02])
     require_normalised(batch, 1.0, sizes(batch), by="a grid")
-    for factor, reach in ((2.1, "2.1"), (1e8, r"1e\+08"), (0.005, "0.005"), (1e-8, "1e-08")):
+    for factor, reach in ((10, "10"), (1e8, r"1e\+08"), (0.005, "0.005"), (1e-8, "1e-08")):
         batch = pad([good[:9], good * factor])
         with pytest.raises(
             DataError, match=rf"Cloud 1 of the batch reaches {reach} .* a grid with normalise=none"
@@ -279,6 +279,17 @@ def test_clouds_that_were_not_normalised_are_refused():
             require_normalised(batch, 1.0, sizes(batch), by="a grid")
     require_normalised(torch.zeros(0, 0, 3), 1.0, torch.zeros(0), by="a grid")
     assert LOOSE == 2
+
+
+def test_a_minority_of_far_outliers_is_no_sign_of_clouds_that_were_not_normalised():
+    good = cloud(50)
+    good /= good.norm(dim=-1).max()
+    strays = torch.cat([good, good[:20] * 1e6])
+    batch = pad([strays, good[:9]])
+    require_normalised(batch, 1.0, sizes(batch), by="a grid")
+    batch = pad([good, torch.cat([good[:10], good[:20] * 1e6])])
+    with pytest.raises(DataError, match="Cloud 1 of the batch reaches"):
+        require_normalised(batch, 1.0, sizes(batch), by="a grid")
 
 
 def test_cells_are_those_of_the_cube_x_slowest():

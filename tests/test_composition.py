@@ -92,6 +92,10 @@ def test_plural_groups_keep_their_order() -> None:
     [
         (["seed=-1"], "seed = -1"),
         (["optimizer.learning_rate=nan"], r"optimizer\.learning_rate = nan"),
+        (
+            ["optimizer=adam", "+optimizer.momentum=0.9"],
+            r"optimizer\.momentum = 0\.9: .*adam has none, sgd alone",
+        ),
         (["optimizer.name=adamm"], r"Did you mean 'r?adamw?'\?"),
         (["trainer.max_epochs=0"], r"trainer\.max_epochs = 0"),
         (["+typo=1"], "typo: unknown key"),

@@ -74,7 +74,7 @@ class CalibrationError(Metric, Pictured):
         if probability == "positive" and len(target.names) != 2:
             raise ConfigError(
                 "metric calibration_error with probability=positive reads p(y = 1) of two classes; this data set has "
-                f"{len(target.names)}: {', '.join(target.names)}. Choose probability=predicted."
+                f"{len(target.names)}: {target.told}. Choose probability=predicted."
             )
         self.names = target.names
         self.bins = bins

@@ -61,7 +61,7 @@ class BernoulliHead(DensityHead):
         if len(target.names) != 2:
             raise ConfigError(
                 f"density_head bernoulli describes two classes; this data set has {len(target.names)}: "
-                f"{', '.join(target.names)}. Choose density_head=categorical."
+                f"{target.told}. Choose density_head=categorical."
             )
         self.size = 1
 

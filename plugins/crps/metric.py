@@ -57,7 +57,7 @@ class CRPS(Metric):
         if target.kind == "class":
             raise ConfigError(
                 "crps measures distances, and classes have none between them (this data set's: "
-                f"{', '.join(target.names)}). Leave this metric out; `brier` is the like of it for classes."
+                f"{target.told}). Leave this metric out; `brier` is the like of it for classes."
             )
         self.samples = samples
         self.unit = "_deg" if target.kind == "angle" else ""

@@ -65,7 +65,7 @@ class PIT(Metric, Pictured):
         if target.kind == "class":
             raise ConfigError(
                 "pit asks which share of a density lies below the target, and classes have no order (this data "
-                f"set's: {', '.join(target.names)}). Leave this metric out; `coverage` judges classes too."
+                f"set's: {target.told}). Leave this metric out; `coverage` judges classes too."
             )
         self.numbers = len(target.names)
         self.bins = bins

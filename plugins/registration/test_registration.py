@@ -1,4 +1,8 @@
+import json
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -320,3 +324,38 @@ def test_a_picture_shows_the_front_and_the_left_side(tmp_path):
     share = (np.abs(left - skin).max(-1) <= 1).mean()
     assert 0.05 < share < 0.15  # the bar alone, 0.3 by 2 of 2.12 by 2.12
     assert (image[:, :100] != 255).any(-1).sum() == 2  # the cloud alone
+
+
+def command(folder, *arguments):
+    """`python -m ...` as a user calls it: exit code, output."""
+    call = [sys.executable, "-m", *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_a_trained_run_registers_a_users_scan(file, tmp_path):
+    small = ["data.train=64", "data.validation=16", "data.test=16", "data.points=200", "trainer.max_epochs=2"]
+    code, told = command(
+        tmp_path, "framework", "experiment=registration/quick", f"data.body={file}", *small, "batch_size=16",
+        "encoder.bps.points=64", "encoder.dense_blocks.width=32", "workers=0", "logger=none", "hydra.run.dir=run",
+    )  # fmt: skip
+    assert code == 0, told
+    found = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
+    assert found["synthetic"]
+    assert 0 < found["vertex_error_median_cm"] < 100
+    points = prepared(file).test().__getitems__([0])
+    cloud = denormalised(points["input"], points["centre"], points["scale"])[0, :400].numpy()
+    np.save(tmp_path / "me.npy", cloud)
+    code, told = command(tmp_path, "plugins.registration", "run", "me.npy", "--folder", "meshes")
+    assert code == 0, told
+    assert told.split() == ["meshes/me_registered.ply", "meshes/me_registered.png"]
+    mesh = read(tmp_path / "meshes" / "me_registered.ply")
+    assert np.array_equal(mesh.faces, doll()["f"])
+    np.testing.assert_allclose(mesh.vertices[6 * 22 :], cloud, atol=1e-5)
+    body = mesh.vertices[: 6 * 22]
+    assert np.linalg.norm(body.mean(0) - cloud.mean(0)) < 1
+    assert Image.open(tmp_path / "meshes" / "me_registered.png").size[1] > 100
+    code, told = command(tmp_path, "plugins.registration", "run", "nobody.ply")
+    assert code == 1
+    assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told

@@ -1,0 +1,113 @@
+"""The contract of encoders of point clouds is held by a sound one, and each unsound one is caught by what it breaks."""
+
+import pytest
+import torch
+
+from framework.clouds import require_clouds, sizes
+from framework.encoder import Encoder
+from framework.errors import ConfigError, DataError
+from framework.testing.encoders import examine_encoder
+from framework.testing.finding import require
+from framework.testing.rows import CloudRow
+
+ROW = CloudRow("mean and spread", (12, 4))
+
+
+class Moments(Encoder):
+    """Mean and mean square of each column, over the points that are no padding."""
+
+    bibtex = ""
+
+    def __init__(self, input_shape):
+        super().__init__()
+        require_clouds(input_shape, by="encoder moments")
+        self.output_shape = (2 * input_shape[1],)
+
+    def forward(self, inputs):
+        counts = sizes(inputs)[:, None].to(inputs)
+        points = inputs.where(~inputs.isnan(), 0)
+        return torch.cat([points.sum(1), points.square().sum(1)], 1) / counts
+
+
+class Padded(Moments):
+    """Padding counts as points at 0."""
+
+    def forward(self, inputs):
+        return super().forward(inputs.nan_to_num(0))
+
+
+class First(Moments):
+    """The first point has a say of its own."""
+
+    def forward(self, inputs):
+        return super().forward(inputs) + inputs[:, 0, :1]
+
+
+class Leaking(Moments):
+    """NaN times 0 is NaN: padding spoils the gradient, though not the features."""
+
+    def forward(self, inputs):
+        weight = (~inputs.isnan()).to(inputs)
+        return super().forward(inputs) + 0 * (inputs * weight).nansum((1, 2))[:, None] ** 1
+
+
+class Silent(Moments):
+    """Points that are not finite are left out without a word."""
+
+    def forward(self, inputs):
+        return super().forward(inputs.where(inputs.isfinite().all(-1, keepdim=True), torch.nan))
+
+
+class Vague(Moments):
+    """Its errors name nothing."""
+
+    def forward(self, inputs):
+        try:
+            return super().forward(inputs)
+        except DataError as error:
+            raise DataError("bad cloud") from error
+
+
+class Greedy(Moments):
+    """Takes whatever comes."""
+
+    def __init__(self, input_shape):
+        super().__init__((1, 3))
+        self.output_shape = (2 * input_shape[-1],)
+
+
+class Curt(Moments):
+    """Refuses without saying what came."""
+
+    def __init__(self, input_shape):
+        if len(input_shape) != 2 or input_shape[1] < 3:
+            raise ConfigError("no cloud")
+        super().__init__(input_shape)
+
+
+def test_a_sound_encoder_passes():
+    require(*examine_encoder(ROW, Moments))
+
+
+@pytest.mark.parametrize(
+    "kind, caught",
+    [
+        (Padded, "padding"),
+        (First, "points in any order"),
+        (Leaking, "gradients of padding"),
+        (Silent, "bad clouds are named"),
+        (Vague, "bad clouds are named"),
+        (Greedy, "what is no cloud is refused"),
+        (Curt, "what is no cloud is refused"),
+    ],
+)
+def test_an_unsound_encoder_is_caught(kind, caught):
+    failed = [finding.name for finding in examine_encoder(ROW, kind) if not finding.holds]
+    assert caught in failed
+
+
+def test_what_a_row_leaves_out_is_not_examined():
+    row = CloudRow("first", ROW.input_shape, leave_out={"points in any order": "the first counts"})
+    findings = list(examine_encoder(row, First))
+    require(*findings)
+    assert "points in any order" not in [finding.name for finding in findings]
