@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from rich.console import Console
+from torch.utils.data import Subset
 
 from framework.assembly import Resolved
 from framework.batches import Batches
 from framework.circular import angular_distance
+from framework.class_probabilities import class_probabilities
 from framework.cost import Cost
 from framework.data import Batch, Data
 from framework.density import circular_entropy, circular_grid
@@ -113,6 +115,8 @@ def _pictures(
         yield "predicted_densities.png", gallery(predictor, data, batches, device, run.settings.samples)
     if data.target.kind == "class" and data.input_shape == (2,):
         yield "landscape.png", landscape(predictor, data, outliers, device, results["method"])
+    elif data.target.kind == "class":
+        yield "classified.png", contact_sheet(predictor, data, batches, device)
 
 
 def _results(
@@ -232,6 +236,34 @@ def gallery(
         ],
         rows={name: len(row) for name, row in chosen.items()},
         title=f"{', '.join(data.groups)}: predicted density of the {data.target.names[0]}",
+        synthetic=data.synthetic,
+    )
+
+
+@torch.no_grad()
+def contact_sheet(predictor: Predictor, data: Data, batches: Batches, device: torch.device) -> "Figure":
+    """Classified samples from all over the test split: certain, ambiguous, failed."""
+    from framework.class_picture import choose_classified, classified
+
+    dataset = data.test()
+    length: int = len(dataset)  # pyright: ignore[reportArgumentType]
+    some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
+    inputs: list[torch.Tensor] = []
+    probabilities, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
+    for batch in on_device(batches.of(some), device):
+        probabilities.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
+        labels.append(batch["target"].cpu().numpy())
+        inputs.extend(batch["input"].cpu())
+    probability, label = np.concatenate(probabilities), np.concatenate(labels)
+    chosen = choose_classified(probability, label)
+    order = [index for row in chosen.values() for index in row]
+    return classified(
+        [data.picture(inputs[index]) for index in order],
+        probability[order],
+        label[order],
+        data.target.names,
+        rows={name: len(row) for name, row in chosen.items()},
+        title=f"{', '.join(data.groups)}: samples of the test split",
         synthetic=data.synthetic,
     )
 
