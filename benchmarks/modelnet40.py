@@ -62,7 +62,6 @@ COLUMNS = {
     "n": "seeds",
     "thesis": "thesis: accuracy (ModelNet40), FLOPs, parameters",
 }
-UNCOUNTED = ("flops_per_sample", "parameters")
 BETTER = {"accuracy": "higher", "nll": "lower", "ece": "lower", "one_ms": "lower", "many_ms": "lower"}
 
 
@@ -97,8 +96,6 @@ def found(sweep: Path, clouds: torch.Tensor) -> list[dict[str, Any]]:
             | {"seconds": job["ended"] - job["started"], "synthetic": numbers["synthetic"]}
             | {"epochs": "at once" if fitted else str(config["trainer"]["max_epochs"])}
         )
-        if fitted:  # of trees no products of matrices and no weights are counted
-            rows[-1] = {name: value for name, value in rows[-1].items() if name not in UNCOUNTED}
     return rows
 
 

@@ -91,9 +91,7 @@ def classified(
     return figure
 
 
-def _bars(
-    axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]
-) -> None:
+def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]) -> None:
     """The likeliest classes, the true one in place of the last where it is not among them."""
     shown = np.argsort(-probability, kind="stable")[:LISTED].tolist()
     if label not in shown:

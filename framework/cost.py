@@ -24,8 +24,9 @@ class Cost:
         flops_per_sample: floating-point operations of matrix products, convolutions and attention, one
             multiply-add counted as two. Not counted: element-wise and special functions, normalisation,
             pooling, sorting, random numbers, compiled graphs, and what runs outside torch; 0 says that
-            nothing of the first kind ran, not that the work was free.
-        parameters: numbers the predictor holds, as the caller counted them.
+            nothing of the first kind ran, not that the work was free. None where `parameters` is.
+        parameters: numbers the predictor holds, as the caller counted them; None where what it has learned is no
+            numbers that torch computes with (trees), so that neither they nor FLOPs can be counted.
         peak_memory_mib: the most memory one call on the batch held beyond what was held before it, MiB:
             neither weights nor inputs are in it. On a CPU the growth of resident memory, on CUDA of
             allocated memory; NaN where the system does not tell (a CPU without Linux's /proc or without
@@ -37,8 +38,8 @@ class Cost:
 
     milliseconds_per_sample: float
     latency_milliseconds: float
-    flops_per_sample: int
-    parameters: int
+    flops_per_sample: int | None
+    parameters: int | None
     peak_memory_mib: float
     batch_size: int
     device: str
@@ -50,7 +51,7 @@ def measure(
     predict: Callable[[Tensor], object],
     inputs: Tensor,
     *,
-    parameters: int,
+    parameters: int | None,
     repeats: int = 20,
     budget_seconds: float = 5.0,
 ) -> Cost:
@@ -59,7 +60,7 @@ def measure(
     Args:
         predict: what a user waits for, the density and the point prediction, say; without gradient.
         inputs: a batch, first dimension the samples, on the device to measure.
-        parameters: to be reported beside.
+        parameters: to be reported beside; None as of `Cost`.
         repeats: timed calls of the batch, and of the batch of one.
         budget_seconds: where `repeats` calls would take longer than this, fewer are timed; three at least.
 
@@ -85,7 +86,7 @@ def measure(
     return Cost(
         milliseconds_per_sample=1e3 * batch_seconds / size,
         latency_milliseconds=1e3 * single_seconds,
-        flops_per_sample=round(counter.get_total_flops() / size),
+        flops_per_sample=None if parameters is None else round(counter.get_total_flops() / size),
         parameters=parameters,
         peak_memory_mib=memory / 2**20,
         batch_size=size,

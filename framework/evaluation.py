@@ -9,6 +9,7 @@ import torch
 from framework.batches import seed_step
 from framework.cost import Cost, measure
 from framework.data import Batch
+from framework.density_head import Fitted
 from framework.metric import Metric
 from framework.model import Predictor
 from framework.prediction import Prediction, Split
@@ -95,5 +96,7 @@ def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.devi
     def predict(inputs: torch.Tensor) -> torch.Tensor:
         return Prediction(predictor(inputs), {}, samples).point
 
-    parameters = sum(parameter.numel() for parameter in predictor.parameters())
+    # what a head fitted at once holds is no weights
+    fitted = any(isinstance(part, Fitted) for part in predictor.modules())
+    parameters = None if fitted else sum(parameter.numel() for parameter in predictor.parameters())
     return measure(predict, batch["input"].to(device), parameters=parameters)

@@ -32,7 +32,9 @@ def test_rows_hold_the_surest_of_each_class_the_closest_and_the_surest_mistakes(
 
 @settings(deadline=None, max_examples=60)
 @given(
-    logits=arrays.arrays(np.float64, st.tuples(st.integers(0, 9), st.integers(1, 4)), elements=st.floats(-9, 9)),
+    logits=arrays.arrays(
+        np.float64, st.tuples(st.integers(0, 9), st.integers(1, 4)), elements=st.floats(-9, 9)
+    ),
     count=st.integers(1, 4),
 )
 def test_no_sample_stands_twice_and_each_in_its_row(logits, count):
@@ -61,7 +63,16 @@ def test_each_sample_has_its_picture_and_its_likeliest_classes(tmp_path):
     figure = sheet({"certain": 2, "ambiguous": 0, "failed": 2}, [0, 2, 5, 4])
     assert len([axes for axes in figure.axes if axes.images]) == 4
     said = words(figure)
-    for word in ("certain", "ambiguous", "failed", "no such sample", "cone", "a_chair_with_a_ve…", "0.95", "0.04"):
+    for word in (
+        "certain",
+        "ambiguous",
+        "failed",
+        "no such sample",
+        "cone",
+        "a_chair_with_a_ve…",
+        "0.95",
+        "0.04",
+    ):
         assert word in said
     assert "Things (synthetic data)" in said
     drawn(figure, tmp_path)

@@ -9,7 +9,11 @@ from torch import Tensor, nn
 
 from framework import cost
 from framework.cost import Cost, device_name, measure, peak_memory, wall_time
+from framework.evaluation import cost as evaluated_cost
+from framework.model import Model
+from framework.schema import build, resolve
 from framework.table import COST_COLUMNS
+from framework.target import Target
 
 CPU = torch.device("cpu")
 
@@ -32,6 +36,24 @@ def test_flops_of_a_convolution_are_two_per_weight_and_pixel(groups: int) -> Non
 
 def test_element_wise_work_counts_no_flops() -> None:
     assert quick(torch.special.i0e, torch.randn(5, 7)).flops_per_sample == 0
+
+
+def test_what_cannot_be_counted_is_not_said_to_be_none() -> None:
+    found = measure(nn.Linear(3, 2), torch.randn(8, 3), parameters=None, repeats=3, budget_seconds=0.1)
+    assert found.flops_per_sample is None and found.parameters is None
+    assert found.milliseconds_per_sample > 0
+
+
+@pytest.mark.parametrize("name, counted", [("extra_trees", False), ("categorical", True)])
+def test_of_trees_neither_flops_nor_parameters_are_counted(name: str, counted: bool) -> None:
+    head = build("density_head", resolve("density_head", {"name": name}), target=Target("class", ("a", "b")))
+    batch = {"input": torch.randn(20, 4), "target": torch.arange(20) % 2, "index": torch.arange(20)}
+    if not counted:
+        head.fit(batch["input"], batch["target"], 0)
+    found = evaluated_cost(Model([], head, (4,)), batch, samples=1, device=CPU)
+    assert (found.parameters is not None) == (found.flops_per_sample is not None) == counted
+    if counted:
+        assert (found.parameters, found.flops_per_sample) == (2 * 4 + 2, 2 * 2 * 4)
 
 
 def test_every_field_says_what_was_measured() -> None:
