@@ -81,8 +81,8 @@ def main() -> None:
     text = (
         f"# How far codes are apart\n\n{len(CLASSES) * MODELS} generated shapes (synthetic data), {BASIS} basis "
         "points, float32; root mean square difference of the distances (eq. 6.4) of two clouds, in units of the "
-        "normalised cloud. Axes are not determined where two moments are nearly equal, as of round or square things: those are "
-        f"the shapes of which two samples of one surface are more than {LIMIT:g} apart.\n\n"
+        "normalised cloud. Axes are not determined where two moments are nearly equal, as of round or square things: "
+        f"of those shapes two samples of one surface are more than {LIMIT:g} apart.\n\n"
         f"{markdown(rows, columns)}\n{machine('torch', 'numba')}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
