@@ -1,10 +1,9 @@
 """Nearest neighbours on the processor: which kernel for which cloud, and in how many threads."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from itertools import count
 from threading import local
 from typing import NamedTuple, no_type_check
 
@@ -265,25 +264,35 @@ def answers(
             solve_one(problem, i, cells, threads)
         return found
     threads = 1 if points * asked * batch < 2**20 else min(threads, batch)  # a thread's start takes as long
-    step = max(1, batch // (32 * threads))
-    turns = count()
+    turns = ranges(batch, threads)
 
     def share(_: int) -> None:
         mine = DESKS.of(points, 0 if shared else asked, clouds.dtype)
-        for turn in turns:  # next() of a count is atomic
-            if turn * step >= batch:
-                return
-            answer(problem, turn * step, min(batch, (turn + 1) * step), cells, *mine)
+        for begin, end in turns:
+            answer(problem, begin, end, cells, *mine)
 
     POOL.run(share, threads)
     return found
 
 
+def ranges(number: int, threads: int) -> Iterator[tuple[int, int]]:
+    """0…number in parts that threads take in turns: a third of each one's share of what is left, so that calls are few
+    and the threads end together. Threads may share the iterator: next() of a list's is atomic."""
+    found: list[tuple[int, int]] = []
+    begin = 0
+    while begin < number:
+        left = number - begin
+        end = begin + (left if threads == 1 else max(1, left // (3 * threads)))
+        found.append((begin, end))
+        begin = end
+    return iter(found)
+
+
 def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
     """One large cloud, or one with many queries, in several threads; to the bit what one thread finds."""
     cloud, size = problem.clouds[i], int(problem.sizes[i])
-    box = np.empty(6, cloud.dtype)
-    if not extent(cloud, size, box):
+    box = extent_together(cloud, size, threads)
+    if box is None:
         problem.outcome[i] = BAD_CLOUD
         return
     largest = max(float(largest_of(box)), problem.largest)
@@ -295,14 +304,10 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
     packed = room(size, cloud.dtype) if packing else None
     if packed is not None:
         pack_together(cloud, size, box, cells, packed, threads)
-    step = max(1, number // (16 * threads))
-    turns = count()
+    turns = ranges(number, threads)
 
     def share(_: int) -> None:
-        for turn in turns:
-            begin, end = turn * step, min(number, (turn + 1) * step)
-            if begin >= number:
-                return
+        for begin, end in turns:
             if packed is None:
                 search_all(cloud, size, problem.packets, begin, end, problem.distance[i], problem.index[i])
             else:
@@ -310,6 +315,20 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
 
     POOL.run(share, threads)
     problem.outcome[i] = FINE
+
+
+def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
+    """`extent` in several threads: the box; None where a number is not finite."""
+    threads = max(1, min(threads, size // LARGE))
+    cuts = [size * thread // threads for thread in range(threads + 1)]
+    boxes, finite = np.empty((threads, 6), cloud.dtype), [False] * threads
+
+    def look(thread: int) -> None:
+        begin, end = cuts[thread], cuts[thread + 1]
+        finite[thread] = extent(cloud[3 * begin : 3 * end], end - begin, boxes[thread])
+
+    POOL.run(look, threads)
+    return np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)]) if all(finite) else None
 
 
 def pack_together(

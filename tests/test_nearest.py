@@ -239,6 +239,18 @@ def test_threads_change_nothing():
         assert torch.equal(a.distance, b.distance) and torch.equal(a.index, b.index)
 
 
+@pytest.mark.parametrize("place", [0, 70_000, 149_999])
+def test_a_bad_number_is_named_whichever_thread_reads_it(place):
+    cloud = torch.rand(1, 150_000, 3)
+    cloud[0, place, 2] = torch.nan
+    try:
+        torch.set_num_threads(3)
+        with pytest.raises(DataError, match=rf"point {place} of number 0"):
+            nearest(cloud, torch.rand(1000, 3))
+    finally:
+        torch.set_num_threads(THREADS)
+
+
 def test_after_a_fork_the_child_has_threads_of_its_own():
     code = """
 import os, sys, torch
