@@ -1,6 +1,5 @@
 """Functions of sets: the points of a batch of clouds one after the other, and the largest numbers over each cloud."""
 
-from abc import abstractmethod
 from collections.abc import Callable
 
 import torch
@@ -8,56 +7,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.clouds import Normalisation, normalised, require_clouds, sizes
-from framework.encoder import Encoder
 from framework.errors import ConfigError
 
 AT_ONCE = 2**12
 """Points that a CPU takes through a network together: more leave its caches (2^16 are half as fast)."""
 AT_ONCE_ON_DEVICE = 2**19
-
-
-class PointSetEncoder(Encoder):
-    """An encoder that is a function of the set of a cloud's points; a subclass writes `described`.
-
-    Args:
-        input_shape: (points, columns).
-        by: who refuses, in errors.
-        points: of each cloud at most so many are read, the first; None for all.
-        normalise: as of framework.clouds.normalised.
-        attributes: whether columns after x, y, z are read too.
-
-    Raises:
-        ConfigError: the input is no cloud, or has no attributes to read.
-    """
-
-    def __init__(
-        self,
-        input_shape: tuple[int, ...],
-        by: str,
-        *,
-        points: int | None,
-        normalise: Normalisation,
-        attributes: bool,
-    ) -> None:
-        super().__init__()
-        self.columns = columns_read(input_shape, by, attributes)
-        self.points = points
-        self.normalise: Normalisation = normalise
-
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        dtype = next(self.parameters()).dtype
-        values, counts = points_of(
-            inputs, self.normalise, columns=self.columns, most=self.points, dtype=dtype
-        )
-        if self.training or torch.is_grad_enabled():
-            return self.described(values, counts)
-        return in_parts(self.described, values, counts)
-
-    @abstractmethod
-    def described(
-        self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
-    ) -> Float[Tensor, "batch length"]:
-        """Features of clouds whose points come one after the other, `counts` of each."""
 
 
 def columns_read(input_shape: tuple[int, ...], by: str, attributes: bool) -> int:
@@ -72,6 +26,27 @@ def columns_read(input_shape: tuple[int, ...], by: str, attributes: bool) -> int
             f"{by} with attributes=true wants clouds with more columns than x, y, z, these have none. Leave it out."
         )
     return input_shape[1] if attributes else 3
+
+
+def over_points(
+    network: Callable[[Tensor, Tensor], Tensor],
+    clouds: Float[Tensor, "batch points columns"],
+    normalise: Normalisation,
+    *,
+    columns: int,
+    most: int | None,
+    dtype: torch.dtype,
+    training: bool,
+) -> Float[Tensor, "batch features"]:
+    """What a network says of clouds, given their points (as `points_of`) and how many each has; in parts where it may.
+
+    Args:
+        training: whether the whole batch is wanted at once, as batch norm does.
+    """
+    values, counts = points_of(clouds, normalise, columns=columns, most=most, dtype=dtype)
+    if training or torch.is_grad_enabled():
+        return network(values, counts)
+    return in_parts(network, values, counts)
 
 
 def points_of(

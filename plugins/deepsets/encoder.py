@@ -7,13 +7,14 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from framework.clouds import Normalisation
-from framework.point_sets import PointSetEncoder, largest, to_points
+from framework.encoder import Encoder
+from framework.point_sets import columns_read, largest, over_points, to_points
 
 Width = Annotated[int, Field(gt=0)]
 ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
 
 
-class DeepSets(PointSetEncoder):
+class DeepSets(Encoder):
     """Equivariant layers: each point's numbers relative to the largest over its cloud; then the maximum over the cloud.
 
     x ↦ σ(β + (x - 1 max x) Γ), the layer that the paper uses on clouds. Neither the order of the points nor padding
@@ -52,9 +53,10 @@ class DeepSets(PointSetEncoder):
         normalise: Normalisation = "unit_ball",
         attributes: bool = False,
     ) -> None:
-        super().__init__(
-            input_shape, "encoder deepsets", points=points, normalise=normalise, attributes=attributes
-        )
+        super().__init__()
+        self.columns = columns_read(input_shape, "encoder deepsets", attributes)
+        self.points = points
+        self.normalise: Normalisation = normalise
         lengths = [self.columns, *channels]
         self.equivariant = nn.ModuleList(
             nn.Linear(before, after) for before, after in zip(lengths, channels, strict=False)
@@ -68,7 +70,18 @@ class DeepSets(PointSetEncoder):
         self.whole = nn.Sequential(*after)
         self.output_shape = (length,)
 
-    def described(
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        return over_points(
+            self._described,
+            inputs,
+            self.normalise,
+            columns=self.columns,
+            most=self.points,
+            dtype=next(self.parameters()).dtype,
+            training=self.training,
+        )
+
+    def _described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         for layer in self.equivariant:

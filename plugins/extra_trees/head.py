@@ -1,7 +1,7 @@
 """Extremely randomised trees (Geurts et al. 2006) as a density head."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -11,7 +11,16 @@ from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
 from framework.density import Mixture
-from framework.fitted_head import FLOOR, FittedHead, IndependentNormals, single
+from framework.density_head import DensityHead, Fitted
+from framework.fitted_head import (
+    FLOOR,
+    IndependentNormals,
+    require_fitted,
+    require_no_angle,
+    single,
+    take_shapes,
+)
+from framework.raw_numbers import require_finite
 from framework.target import Target
 from plugins.extra_trees.forest import frequencies, leaves
 
@@ -20,7 +29,7 @@ ROUNDS = 200
 """Of expectation and maximisation at most; they end when no width changes by a millionth."""
 
 
-class ExtraTreesHead(FittedHead):
+class ExtraTreesHead(DensityHead, Fitted):
     """A forest of trees with random thresholds, fitted to all training samples at once (Geurts et al. 2006).
 
     Classes: with f_k the mean over T trees of the share of class k in the leaf, p_k = (T f_k + a) / (T + a K), which is
@@ -64,6 +73,8 @@ class ExtraTreesHead(FittedHead):
     label: Tensor
     count: Tensor
     mean: Tensor
+    width: Tensor
+    read: Tensor
 
     def __init__(
         self,
@@ -75,14 +86,20 @@ class ExtraTreesHead(FittedHead):
         depth: Annotated[int, Field(gt=0)] | None = None,
         smoothing: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     ) -> None:
-        super().__init__(target, "density_head extra_trees")
+        super().__init__()
+        require_no_angle(target, by="density_head extra_trees")
+        self.classes = len(target.names) if target.kind == "class" else 0
         self.trees = trees
         self.share, self.leaf, self.depth = features, leaf, depth
         self.smoothing = smoothing
+        numbers = 0 if self.classes else len(target.names)
         for name in INTEGERS:
             self.register_buffer(name, torch.zeros(0, dtype=torch.int32))
         self.register_buffer("threshold", torch.zeros(0))
-        self.register_buffer("mean", torch.zeros(0, self.numbers, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(0, numbers, dtype=torch.float64))
+        self.register_buffer("width", torch.ones(numbers, dtype=torch.float64))
+        self.register_buffer("read", torch.zeros((), dtype=torch.int64))
+        self.size = 0
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         from plugins.extra_trees.fitting import grown  # scikit-learn, which a stored forest does not need
@@ -102,9 +119,12 @@ class ExtraTreesHead(FittedHead):
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(array)).to(target.device))
         if not self.classes:
             self.width.copy_(target.double().std(0, correction=0).clamp(min=FLOOR))
-        self.was_fitted(features.shape[1])
+        self.size = features.shape[1]
+        self.read.fill_(self.size)
 
-    def predicted(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        require_fitted(self.size, by="density_head extra_trees")
+        raw = require_finite(raw, self.size)
         batch = raw.shape[:-1]
         root = self.root[: max(1, self.trees)]
         feature, threshold, branch = map(array, (self.feature, self.threshold, self.branch))
@@ -123,12 +143,24 @@ class ExtraTreesHead(FittedHead):
         components = IndependentNormals(means, self.width.to(raw).expand_as(means))
         return Mixture(means.new_zeros(means.shape[:-1]), components)
 
-    def likeliest_width(
-        self, raw: Float[Tensor, "batch size"], target: Float[Tensor, "batch number"]
-    ) -> Float[Tensor, "number"]:
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        if self.classes:
+            return
+        if len(raw) == 0:
+            raise ValueError("widths are calibrated on validation data, but got none of it.")
         density = self(raw.double())
         assert isinstance(density, Mixture)
-        return fitted_width(target.unsqueeze(1) - density.components.mean)  # (sample, tree, number)
+        means = density.components.mean  # (sample, tree, number)
+        self.width.copy_(fitted_width(target.double().unsqueeze(1) - means))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        take_shapes(self, state_dict, prefix)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+        self.size = int(self.read)
 
 
 def fitted_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "number"]:

@@ -8,14 +8,15 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from framework.clouds import Normalisation
-from framework.point_sets import PointSetEncoder, largest
+from framework.encoder import Encoder
+from framework.point_sets import columns_read, largest, over_points
 
 Width = Annotated[int, Field(gt=0)]
 LOCAL = 2
 """Layers that every point passes before its features are transformed."""
 
 
-class PointNet(PointSetEncoder):
+class PointNet(Encoder):
     """Every point passes the same layers; the largest number of each channel over the cloud describes it.
 
     "full" also predicts from the cloud a 3 × 3 matrix that every point is multiplied by, and one that the features of
@@ -57,9 +58,10 @@ class PointNet(PointSetEncoder):
         normalise: Normalisation = "unit_ball",
         attributes: bool = False,
     ) -> None:
-        super().__init__(
-            input_shape, "encoder pointnet", points=points, normalise=normalise, attributes=attributes
-        )
+        super().__init__()
+        self.columns = columns_read(input_shape, "encoder pointnet", attributes)
+        self.points = points
+        self.normalise: Normalisation = normalise
         after = point_widths[LOCAL:]
         full = variant == "full"
         self.input_matrix = Matrix(3, after, widths) if full else None
@@ -70,7 +72,18 @@ class PointNet(PointSetEncoder):
         self.dropout = nn.Dropout(dropout)
         self.output_shape = (widths[-1],)
 
-    def described(
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        return over_points(
+            self._described,
+            inputs,
+            self.normalise,
+            columns=self.columns,
+            most=self.points,
+            dtype=next(self.parameters()).dtype,
+            training=self.training,
+        )
+
+    def _described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if self.input_matrix is not None:

@@ -10,14 +10,23 @@ from pydantic import Field
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
+from framework.density_head import DensityHead, Fitted
 from framework.errors import ConfigError
-from framework.fitted_head import FLOOR, FittedHead, IndependentNormals, single
+from framework.fitted_head import (
+    FLOOR,
+    IndependentNormals,
+    require_fitted,
+    require_no_angle,
+    single,
+    take_shapes,
+)
+from framework.raw_numbers import require_finite
 from framework.target import Target
 
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
-class XGBoostHead(FittedHead):
+class XGBoostHead(DensityHead, Fitted):
     """Trees that each correct the sum of those before, fitted to all training samples at once.
 
     Classes: the softmax of the trees' sums, one for each class, trained by cross-entropy. Reals: a normal density about
@@ -55,6 +64,8 @@ class XGBoostHead(FittedHead):
 }"""
 
     model: Tensor
+    width: Tensor
+    read: Tensor
 
     def __init__(
         self,
@@ -68,13 +79,15 @@ class XGBoostHead(FittedHead):
         weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0,
         splits: Literal["hist", "exact"] = "hist",
     ) -> None:
-        super().__init__(target, "density_head xgboost")
+        super().__init__()
+        require_no_angle(target, by="density_head xgboost")
+        self.classes = len(target.names) if target.kind == "class" else 0
         if self.classes == 1:
             raise ConfigError(
                 f"density_head xgboost tells two classes or more apart; this data set has one, {target.names[0]}. "
                 "Choose other data."
             )
-        self.sums = self.classes or self.numbers
+        self.numbers = self.classes or len(target.names)
         self.rounds = rounds
         self.options = {
             "max_depth": depth,
@@ -85,6 +98,9 @@ class XGBoostHead(FittedHead):
             "tree_method": splits,
         }
         self.register_buffer("model", torch.zeros(0, dtype=torch.uint8))
+        self.register_buffer("width", torch.ones(0 if self.classes else self.numbers, dtype=torch.float64))
+        self.register_buffer("read", torch.zeros((), dtype=torch.int64))
+        self.size = 0
         self.booster: xgboost.Booster | None = None
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
@@ -100,30 +116,35 @@ class XGBoostHead(FittedHead):
         fitted = xgboost.train(options, matrix, self.rounds, verbose_eval=False)
         stored = torch.frombuffer(fitted.save_raw("ubj"), dtype=torch.uint8)
         self.model = stored.clone().to(target.device)
-        self.was_fitted(features.shape[1])
+        self.read.fill_(features.shape[1])
+        self._open()
         if not self.classes:
-            self.width.copy_(self.likeliest_width(features, target.double()).clamp(min=FLOOR))
+            self._measure_width(features, target)
 
-    def was_fitted(self, features: int) -> None:
-        """Also reads the stored model."""
-        super().was_fitted(features)
-        self.booster = None
-        if self.size:
-            self.booster = xgboost.Booster({"nthread": torch.get_num_threads()})
-            self.booster.load_model(bytearray(self.model.cpu().numpy()))
-
-    def predicted(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
-        sums = self._sums(raw.reshape(-1, self.size)).to(raw).reshape(*raw.shape[:-1], self.sums)
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        require_fitted(self.size, by="density_head xgboost")
+        raw = require_finite(raw, self.size)
+        sums = self._sums(raw.reshape(-1, self.size)).to(raw).reshape(*raw.shape[:-1], self.numbers)
         if raw.requires_grad:  # piecewise constant: a gradient is asked for as of any head, and is 0
             sums = sums + (raw * 0).sum(-1, keepdim=True)
         if self.classes:
             return Categorical(logits=sums.log_softmax(-1), validate_args=False)
         return IndependentNormals(sums, self.width.to(raw).expand_as(sums))
 
-    def likeliest_width(
-        self, raw: Float[Tensor, "batch size"], target: Float[Tensor, "batch number"]
-    ) -> Float[Tensor, "number"]:
-        return (target - self._sums(raw).to(target.device)).square().mean(0).sqrt()
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        if self.classes:
+            return
+        if len(raw) == 0:
+            raise ValueError("a standard deviation is calibrated on validation data, but got none of it.")
+        self._measure_width(raw, target)
+
+    def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        residual = target.double() - self._sums(raw).to(target.device)
+        self.width.copy_(residual.square().mean(0).sqrt().clamp(min=FLOOR))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:
         """Of the trees, float32."""
@@ -132,4 +153,17 @@ class XGBoostHead(FittedHead):
         found = self.booster.inplace_predict(
             single(raw).numpy(), iteration_range=(0, rounds), predict_type="margin"
         )
-        return torch.from_numpy(found).reshape(len(raw), self.sums)
+        return torch.from_numpy(found).reshape(len(raw), self.numbers)
+
+    def _open(self) -> None:
+        """Read the stored model."""
+        self.size = int(self.read)
+        self.booster = None
+        if self.size:
+            self.booster = xgboost.Booster({"nthread": torch.get_num_threads()})
+            self.booster.load_model(bytearray(self.model.cpu().numpy()))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *rest: Any) -> None:
+        take_shapes(self, state_dict, prefix)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+        self._open()
