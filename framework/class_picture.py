@@ -93,7 +93,7 @@ def classified(
 
 def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]) -> None:
     """The likeliest classes, the true one in place of the last where it is not among them."""
-    shown = np.argsort(-probability, kind="stable")[:LISTED].tolist()
+    shown: list[int] = np.argsort(-probability, kind="stable")[:LISTED].tolist()
     if label not in shown:
         shown[-1] = label
     axes.set(xlim=(0, 1), ylim=(LISTED - 0.5, -0.5))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from framework.errors import ConfigError, did_you_mean
 from framework.registry import GROUPS
@@ -28,14 +28,13 @@ class OptimizerSettings(_Strict):
     schedule: Literal["constant", "cosine"] = "constant"
     warmup_steps: NotNegative = 0
 
-    @field_validator("momentum")
-    @classmethod
-    def _momentum_is_sgds(cls, value: float | None, info: ValidationInfo) -> float | None:
-        if value is not None and info.data.get("name") != "sgd":
+    @model_validator(mode="after")
+    def _momentum_is_sgds(self) -> "OptimizerSettings":
+        if self.momentum is not None and self.name != "sgd":
             raise ValueError(
-                f"{info.data.get('name')} has none, sgd alone. Leave it out, or choose optimizer=sgd"
+                f"momentum is a setting of sgd, {self.name} has none. Leave it out, or choose sgd"
             )
-        return value
+        return self
 
 
 class LoggerSettings(_Strict):

@@ -94,7 +94,7 @@ def test_plural_groups_keep_their_order() -> None:
         (["optimizer.learning_rate=nan"], r"optimizer\.learning_rate = nan"),
         (
             ["optimizer=adam", "+optimizer.momentum=0.9"],
-            r"optimizer\.momentum = 0\.9: .*adam has none, sgd alone",
+            r"optimizer = .*momentum is a setting of sgd, adam has none",
         ),
         (["optimizer.name=adamm"], r"Did you mean 'r?adamw?'\?"),
         (["trainer.max_epochs=0"], r"trainer\.max_epochs = 0"),

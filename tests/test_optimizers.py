@@ -1,9 +1,8 @@
 """Every optimiser that a config may name is built, with its own settings and fused where torch can."""
 
-from types import SimpleNamespace
-
 import pytest
 
+from framework.schema import build, resolve
 from framework.settings import OptimizerSettings
 from framework.target import Target
 from framework.testing.wrappers import Plain
@@ -16,11 +15,11 @@ def test_settings_reach_the_optimiser(
     monkeypatch: pytest.MonkeyPatch, name: str, momentum: float | None
 ) -> None:
     if momentum is not None and name != "sgd":
-        with pytest.raises(ValueError, match=f"{name} has none, sgd alone"):
+        with pytest.raises(ValueError, match=f"momentum is a setting of sgd, {name} has none"):
             OptimizerSettings(name=name, momentum=momentum)
         return
     settings = OptimizerSettings(name=name, learning_rate=0.25, weight_decay=0.5, momentum=momentum)
-    data = SimpleNamespace(augment=None)
+    data = build("data", resolve("data", {"name": "moons"}))
     training = Training(Plain(Target("real", ("x",))), [], data, settings, 0, {})
     monkeypatch.setattr(training, "_planned_steps", lambda: 10)
     made = training.configure_optimizers()["optimizer"]
