@@ -276,13 +276,13 @@ def answers(
 
 
 def ranges(number: int, threads: int) -> Iterator[tuple[int, int]]:
-    """0…number in parts that threads take in turns: a third of each one's share of what is left, so that calls are few
-    and the threads end together. Threads may share the iterator: next() of a list's is atomic."""
+    """0…number in parts that threads take in turns: long ones first, since each costs a call, and short ones at last,
+    so that the threads end together. They may share the iterator: next() of a list's is atomic."""
     found: list[tuple[int, int]] = []
-    begin = 0
+    begin, least = 0, max(1, number // (32 * threads))
     while begin < number:
         left = number - begin
-        end = begin + (left if threads == 1 else max(1, left // (3 * threads)))
+        end = begin + (left if threads == 1 else min(left, max(least, left // (3 * threads))))
         found.append((begin, end))
         begin = end
     return iter(found)
