@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
+from framework.body import Body
 from framework.clouds import sizes
 from framework.nearest import nearest
 from framework.pictures import titled_figure
@@ -23,6 +24,7 @@ from framework.table import markdown
 from plugins.bps.basis import basis
 from plugins.bps.encoding import Basis, encode, per_point, prepared
 from plugins.registration import poses
+from plugins.registration.data import chosen_body
 
 HERE = Path(__file__).resolve()
 TRAIN, TEST, BASIS = 2_000, 200, 512
@@ -31,9 +33,8 @@ EPOCHS, SCANS, POINTS = 40, 8, 256
 LIMBS = ("neck", "arm", "elbow", "wrist", "hip", "knee", "ankle")
 
 
-def parts_of(data) -> tuple[list[str], Tensor]:
+def parts_of(body: Body) -> tuple[list[str], Tensor]:
     """Names of the parts, and of each vertex the part that its weightiest joint hangs on."""
-    body = data._body
     where = poses.skeleton(body)
     names, start = ["torso"], {}
     for limb in LIMBS:
@@ -142,7 +143,7 @@ def main() -> None:
     torch.set_num_threads(1)
     data = build("data", resolve("data", {"name": "registration", "train": TRAIN, "test": TEST}))
     data.prepare()
-    names, vertex_part = parts_of(data)
+    names, vertex_part = parts_of(chosen_body(None)[0])
     clouds, labels = labelled(data.train(), TRAIN, vertex_part)
     held = labelled(data.test(), TEST, vertex_part)
     made = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
