@@ -10,7 +10,7 @@ from framework.composition import plain
 from framework.errors import ConfigError, did_you_mean
 from framework.settings import settings
 
-MODES = ("train", "test", "combine", "predict", "work_precision", "check", "plugins", "sync")
+MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
 
 
 def run(config: DictConfig) -> float | None:

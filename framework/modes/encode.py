@@ -1,0 +1,228 @@
+"""mode=encode: features of very many files, in parts that several jobs write and a stopped one goes on with."""
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from rich.console import Console
+from torch import Tensor
+
+from framework.assembly import citations
+from framework.batches import Batches
+from framework.data import Data
+from framework.encoder import Encoder
+from framework.errors import ConfigError, DataError
+from framework.journal import write_atomically
+from framework.modes.train import record_citations
+from framework.run import opened
+from framework.schema import build, check, resolve
+from framework.settings import Settings
+
+DESCRIPTION, NAMES = "encoding.json", "files.txt"
+"""What stands beside the parts: what was computed, and of which files, a line each."""
+
+
+class _Options(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    files: str
+    into: str
+    part: Annotated[int, Field(gt=0)] = 1000
+    share: Annotated[str, Field(pattern=r"^[1-9]\d*/[1-9]\d*$")] = "1/1"
+
+
+@dataclass(frozen=True)
+class Collection:
+    """Files whose features are wanted, in parts of so many, and where the features go.
+
+    Attributes:
+        root: what the names are relative to.
+        names: of the files, in order.
+        part: files of a part.
+        into: the folder of the parts.
+    """
+
+    root: Path
+    names: Sequence[str]
+    part: int
+    into: Path
+
+    @property
+    def parts(self) -> int:
+        return -(-len(self.names) // self.part)
+
+    def files(self, number: int) -> list[Path]:
+        """Those of a part."""
+        return [self.root / name for name in self.names[number * self.part : (number + 1) * self.part]]
+
+    def path(self, number: int) -> Path:
+        return self.into / f"part-{number:06}.npy"
+
+    def missing(self) -> list[int]:
+        return [number for number in range(self.parts) if not self.path(number).is_file()]
+
+
+def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+    """Write this job's share of the parts; those that are there already are left as they are."""
+    options = _Options.model_validate(check(_Options, values["mode"], "mode"))
+    config = {
+        "data": resolve("data", values.get("data") or {}),
+        "encoder": [
+            resolve("encoder", part, f"encoder.{key}") for key, part in (values.get("encoder") or {}).items()
+        ],
+    }
+    with opened(folder, values, settings, overrides) as run:
+        if settings.threads:
+            torch.set_num_threads(settings.threads)
+        record_citations(run, citations(config))
+        collection = collected(
+            Path(options.files).expanduser(), Path(options.into).expanduser(), options.part
+        )
+        describe(collection, config)
+        mine = share(collection.parts, options.share)
+        written = encode(collection, config, mine, settings)
+        left = len(collection.missing())
+        Console().print(
+            f"{written} parts written, {len(mine) - written} of this job's {len(mine)} were there; "
+            f"{left} of all {collection.parts} are missing: {collection.into}",
+            soft_wrap=True,
+        )
+
+
+def share(parts: int, which: str) -> range:
+    """The parts of job "2/4": every fourth from the second.
+
+    Raises:
+        ConfigError: a job beyond the last.
+    """
+    number, jobs = map(int, which.split("/"))
+    if number > jobs:
+        raise ConfigError(
+            f"mode.share={which}: there is no job {number} of {jobs}; wanted 1/{jobs} to {jobs}/{jobs}."
+        )
+    return range(number - 1, parts, jobs)
+
+
+def collected(root: Path, into: Path, part: int) -> Collection:
+    """All files of a folder and its subfolders but hidden ones, by name.
+
+    Raises:
+        DataError: there are none.
+        ConfigError: the features would go among them.
+    """
+    if into.resolve().is_relative_to(root.resolve()):
+        raise ConfigError(
+            f"mode.into={into} lies in mode.files={root}, and would be read itself. Give another folder."
+        )
+    found = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
+    names = sorted(
+        path.as_posix() for path in found if not any(piece.startswith(".") for piece in path.parts)
+    )
+    if not names:
+        raise DataError(f"mode.files={root} is no folder that holds files. Give the folder to encode.")
+    if broken := [name for name in names if "\n" in name]:
+        raise DataError(
+            f"{root}: the name {broken[0]!r} has two lines, and would be two in {NAMES}. Rename it."
+        )
+    return Collection(root, names, part, into)
+
+
+def describe(collection: Collection, config: Mapping[str, Any]) -> None:
+    """Say beside the parts what they are; several jobs say the same.
+
+    Raises:
+        ConfigError: there are parts of something else.
+    """
+    text = "".join(f"{name}\n" for name in collection.names).encode()
+    said = {
+        "version": 1,
+        **config,
+        "part": collection.part,
+        "files": len(collection.names),
+        "names": hashlib.sha256(text).hexdigest(),
+    }
+    collection.into.mkdir(parents=True, exist_ok=True)
+    path = collection.into / DESCRIPTION
+    if path.is_file():
+        there = json.loads(path.read_text(encoding="utf-8"))
+        for key, value in said.items():
+            if there.get(key) != value:
+                raise ConfigError(
+                    f"{path} says {key} = {there.get(key)}, this job {value}: its parts are of something else. "
+                    "Give the same files and settings, or another mode.into."
+                )
+        return
+    write_atomically(collection.into / NAMES, text)
+    write_atomically(path, json.dumps(said, indent=1).encode())
+
+
+@torch.no_grad()
+def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int], settings: Settings) -> int:
+    """Write those parts that are not there; returns how many. A part is whole or absent.
+
+    Raises:
+        ConfigError: an encoder learns, or there is none.
+        DataError: a file cannot be read, or holds several samples; names it. Parts before it are kept.
+    """
+    data: Data = build("data", config["data"])
+    encoders: list[Encoder] = []
+    written = 0
+    for number in mine:
+        if collection.path(number).is_file():
+            continue
+        files = collection.files(number)
+        dataset = data.read(files)
+        if len(dataset) != len(files):  # type: ignore[arg-type]
+            raise DataError(
+                f"{files[0]} … {files[-1]}: {len(files)} files hold {len(dataset)} samples; "  # type: ignore[arg-type]
+                "mode=encode wants one of each. Split the files."
+            )
+        batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0).of(dataset)
+        found: list[Tensor] = []
+        for batch in batches:
+            features = batch["input"]
+            if not encoders:
+                encoders = chain(config["encoder"], tuple(features.shape[1:]), data.columns)
+            for encoder in encoders:
+                features = encoder(features)
+            found.append(features)
+        content = io.BytesIO()
+        np.save(content, torch.cat(found).numpy(), allow_pickle=False)
+        write_atomically(collection.path(number), content.getvalue())
+        written += 1
+    return written
+
+
+def chain(
+    parts: Sequence[Mapping[str, Any]], shape: tuple[int, ...], columns: tuple[str, ...]
+) -> list[Encoder]:
+    """The encoders, each built for the features of the one before it.
+
+    Raises:
+        ConfigError: there is none, or one learns.
+    """
+    if not parts:
+        raise ConfigError("mode=encode wants an encoder. Name one: encoder=[bps], say.")
+    return list(_chained(parts, shape, columns))
+
+
+def _chained(
+    parts: Sequence[Mapping[str, Any]], shape: tuple[int, ...], columns: tuple[str, ...]
+) -> Iterator[Encoder]:
+    for part in parts:
+        encoder: Encoder = build("encoder", part, input_shape=shape, input_columns=columns)
+        if not encoder.fixed:
+            raise ConfigError(
+                f"encoder {part['name']} learns, or draws what it says; mode=encode keeps features that follow from "
+                "the input alone. Leave it out, and train it on the features."
+            )
+        yield encoder.eval()
+        shape, columns = encoder.output_shape, ()
