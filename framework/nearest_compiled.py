@@ -4,9 +4,10 @@ import os
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
-from numba import config, njit
+from numba import config, njit, types
+from numba.core.extending import intrinsic
 
 from framework.cache import folder
 from framework.errors import DataError
@@ -48,3 +49,15 @@ def compiled(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """A part of compiled functions that is written into each of them, so that vectors stay in registers."""
     return njit(inline="always", error_model="numpy")(function)
+
+
+@intrinsic
+@no_type_check
+def taken_from(typing, counter, number):
+    """counter[0], an int64, which grows by the number in the same moment: of several threads each gets another."""
+
+    def generate(context, builder, sig, values):
+        array = context.make_array(sig.args[0])(context, builder, values[0])
+        return builder.atomic_rmw("add", array.data, values[1], "seq_cst")
+
+    return types.int64(counter, types.int64), generate

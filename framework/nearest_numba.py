@@ -1,7 +1,7 @@
 """Nearest neighbours on the processor: which kernel for which cloud, and in how many threads."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from threading import local
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from framework.nearest_compiled import compiled
+from framework.nearest_compiled import compiled, taken_from
 from framework.nearest_lanes import LANES
 from framework.nearest_pack import (
     BITS,
@@ -40,6 +40,10 @@ ASKED = 17
 """Where packed queries keep their number, among the levels."""
 LARGE = 2**15
 """Points or queries from which one cloud is worth several threads."""
+TURNS = 16
+"""Parts of each thread's share of the work: so little is left to one while the others have ended."""
+AT_ONCE = 2**24
+"""Points and queries of one call, some tenths of a second: signals are heard between calls."""
 
 
 class Problem(NamedTuple):
@@ -114,6 +118,44 @@ def answer(problem, begin, end, cells, work, packed, own):
         else:
             search_all(cloud, size, packets, 0, number, problem.distance[i], problem.index[i])
         problem.outcome[i] = FINE
+
+
+@compiled
+@no_type_check
+def answer_share(problem, taken, step, limit, cells, work, packed, own):
+    """What one thread answers of a batch: the next `step` clouds in turn, until it has answered `limit` or all are."""
+    batch = problem.sizes.shape[0]
+    answered = 0
+    while answered < limit:
+        begin = taken_from(taken, step)
+        if begin >= batch:
+            return
+        answer(problem, begin, min(batch, begin + step), cells, work, packed, own)
+        answered += step
+
+
+@compiled
+@no_type_check
+def search_share(packed, packets, taken, step, distance, index):
+    """What one thread searches for: the next `step` packets in turn, until there are none."""
+    number = packets.levels[8]
+    while True:
+        begin = taken_from(taken, step)
+        if begin >= number:
+            return
+        search(packed, packets, begin, min(number, begin + step), distance, index)
+
+
+@compiled
+@no_type_check
+def search_all_share(cloud, size, packets, taken, step, distance, index):
+    """As above, of a cloud that was not packed."""
+    number = packets.levels[8]
+    while True:
+        begin = taken_from(taken, step)
+        if begin >= number:
+            return
+        search_all(cloud, size, packets, begin, min(number, begin + step), distance, index)
 
 
 @lru_cache(maxsize=BITS)
@@ -264,28 +306,17 @@ def answers(
             solve_one(problem, i, cells, threads)
         return found
     threads = 1 if points * asked * batch < 2**20 else min(threads, batch)  # a thread's start takes as long
-    turns = ranges(batch, threads)
+    limit = max(1, AT_ONCE // (points + asked))
+    step = min(limit, max(1, batch // (TURNS * threads)))
+    taken = np.zeros(1, np.int64)
 
     def share(_: int) -> None:
         mine = DESKS.of(points, 0 if shared else asked, clouds.dtype)
-        for begin, end in turns:
-            answer(problem, begin, end, cells, *mine)
+        while taken[0] < batch:
+            answer_share(problem, taken, step, limit, cells, *mine)
 
     POOL.run(share, threads)
     return found
-
-
-def ranges(number: int, threads: int) -> Iterator[tuple[int, int]]:
-    """0…number in parts that threads take in turns: long ones first, since each costs a call, and short ones at last,
-    so that the threads end together. They may share the iterator: next() of a list's is atomic."""
-    found: list[tuple[int, int]] = []
-    begin, least = 0, max(1, number // (32 * threads))
-    while begin < number:
-        left = number - begin
-        end = begin + (left if threads == 1 else min(left, max(least, left // (3 * threads))))
-        found.append((begin, end))
-        begin = end
-    return iter(found)
 
 
 def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
@@ -304,14 +335,14 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
     packed = room(size, cloud.dtype) if packing else None
     if packed is not None:
         pack_together(cloud, size, box, cells, packed, threads)
-    turns = ranges(number, threads)
+    step = max(1, number // (TURNS * threads))
+    taken = np.zeros(1, np.int64)
 
     def share(_: int) -> None:
-        for begin, end in turns:
-            if packed is None:
-                search_all(cloud, size, problem.packets, begin, end, problem.distance[i], problem.index[i])
-            else:
-                search(packed, problem.packets, begin, end, problem.distance[i], problem.index[i])
+        if packed is None:
+            search_all_share(cloud, size, problem.packets, taken, step, problem.distance[i], problem.index[i])
+        else:
+            search_share(packed, problem.packets, taken, step, problem.distance[i], problem.index[i])
 
     POOL.run(share, threads)
     problem.outcome[i] = FINE

@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from framework.errors import DataError
 from framework.nearest import Queries, chamfer, nearest, prepare
-from framework.nearest_numba import ranges
 from framework.nearest_torch import nearest_of
 from framework.streamed_nearest import Middle, Reach, Stream, normal
 
@@ -238,15 +237,6 @@ def test_threads_change_nothing():
         torch.set_num_threads(THREADS)
     for a, b in zip(one, three, strict=True):
         assert torch.equal(a.distance, b.distance) and torch.equal(a.index, b.index)
-
-
-@given(st.integers(0, 5000), st.integers(1, 9))
-def test_parts_are_all_of_it_in_order_and_few(number, threads):
-    parts = list(ranges(number, threads))
-    assert [begin for begin, _ in parts] == [0, *(end for _, end in parts)][: len(parts)]
-    assert all(begin < end for begin, end in parts)
-    assert not parts or parts[-1][1] == number
-    assert len(parts) <= (1 if threads == 1 else 64 * threads)
 
 
 @pytest.mark.parametrize("place", [0, 70_000, 149_999])
