@@ -3,9 +3,13 @@
 The thesis's classifier of basis point sets (512-400-400-40, batch norm, dropout), alone and with its encoder on clouds
 of 2048 points: the predictor in torch without gradient, other ways to deploy it, and framework.frozen, one after the
 other in each round of one process. Weights are random: they do not change the cost, but for the zeros that ReLU leaves
-(about half, as after training). Run it on one core (`taskset -c 0`, OMP_NUM_THREADS=1). Writes frozen.md beside this
+(about half, as after training). Run it on one core (`taskset -c 0`). Writes frozen.md beside this
 file.
 """
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of NumPy's products too
 
 import statistics
 import sys
