@@ -1,6 +1,7 @@
 """The names of everything installed, read from package metadata; reading them imports nothing."""
 
 import ast
+import re
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -67,7 +68,7 @@ def load(group: str, name: str) -> type[Any]:
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) needs the module {error.name!r}, "
-            f"which is not installed. Install that package's dependencies, e.g. `pip install {error.name}`."
+            f"which is not installed. {_remedy(entry, str(error.name))}"
         ) from error
     except Exception as error:
         raise ConfigError(
@@ -80,6 +81,17 @@ def load(group: str, name: str) -> type[Any]:
             f"the {group} base in framework.{group}. See that module's docstring for the contract."
         )
     return found
+
+
+def _remedy(entry: Entry, module: str) -> str:
+    """What installs a missing module: an extra of the plugin's own package, where one asks for it by that name."""
+    wanted = module.partition(".")[0].lower()
+    for requirement in (entry.dist.requires if entry.dist else None) or ():
+        asked = re.match(r"[\w.-]+", requirement)
+        extra = re.search(r"extra == ['\"]([^'\"]+)", requirement)
+        if asked and extra and extra[1] != "dev" and asked[0].lower().replace("-", "_").startswith(wanted):
+            return f"Install that package's extra, e.g. `pip install -e '.[{extra[1]}]'` in its folder."
+    return f"Install that package's dependencies, e.g. `pip install {module}`."
 
 
 def group_of(annotation: object) -> str | None:

@@ -11,13 +11,13 @@ from framework.registry import GROUPS, config_folders, describe, find, installed
 
 
 class Distribution:
-    def __init__(self, name: str) -> None:
-        self.name, self.version = name, "1.0"
+    def __init__(self, name: str, requires: list[str] | None = None) -> None:
+        self.name, self.version, self.requires = name, "1.0", requires
 
 
-def entry(name: str, value: str, group: str, package: str) -> EntryPoint:
+def entry(name: str, value: str, group: str, package: str, requires: list[str] | None = None) -> EntryPoint:
     made = EntryPoint(name=name, value=value, group=group)
-    vars(made)["dist"] = Distribution(package)
+    vars(made)["dist"] = Distribution(package, requires=requires)
     return made
 
 
@@ -70,6 +70,27 @@ def test_a_plugin_that_raises_on_import_is_named_and_breaks_only_itself(
         load("encoder", "away")
     with pytest.raises(ConfigError, match="does not derive from"):
         load("encoder", "alien")
+
+
+@pytest.mark.parametrize(
+    "requires, remedy",
+    [
+        (
+            ["gone-cpu>=3; (sys_platform == 'linux') and extra == 'trees'"],
+            r"package's extra, e\.g\. `pip install -e '\.\[trees\]'`",
+        ),
+        (['Gone>=3; extra == "trees"'], r"`pip install -e '\.\[trees\]'`"),
+        (["gone>=3; extra == 'dev'", "other; extra == 'trees'"], r"dependencies, e\.g\. `pip install gone`"),
+        (["gone>=3"], r"dependencies, e\.g\. `pip install gone`"),
+        (None, r"dependencies, e\.g\. `pip install gone`"),
+    ],
+)
+def test_a_missing_module_is_had_by_the_extra_that_asks_for_it(
+    fake: list[EntryPoint], requires: list[str] | None, remedy: str
+) -> None:
+    fake.append(entry("trees", "gone.head:X", "framework.density_head", "forest", requires))
+    with pytest.raises(ConfigError, match=rf"needs the module 'gone', which is not installed\. .*{remedy}"):
+        load("density_head", "trees")
 
 
 def test_two_plugins_with_one_config_are_refused(
