@@ -315,7 +315,10 @@ def answers(
         while taken[0] < batch:
             answer_share(problem, taken, step, limit, cells, *mine)
 
-    POOL.run(share, threads)
+    try:
+        POOL.run(share, threads)
+    finally:
+        taken[0] = batch  # where this thread was interrupted, the others stop too
     return found
 
 
