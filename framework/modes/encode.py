@@ -210,7 +210,7 @@ def chain(
         ConfigError: there is none, or one learns.
     """
     if not parts:
-        raise ConfigError("mode=encode wants an encoder. Name one: encoder=[bps], say.")
+        raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
     return list(_chained(parts, shape, columns))
 
 
