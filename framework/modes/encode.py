@@ -3,7 +3,7 @@
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -172,6 +172,8 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
         ConfigError: an encoder learns, or there is none.
         DataError: a file cannot be read, or holds several samples; names it. Parts before it are kept.
     """
+    if not config["encoder"]:
+        raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
     data: Data = build("data", config["data"])
     encoders: list[Encoder] = []
     written = 0
@@ -207,16 +209,9 @@ def chain(
     """The encoders, each built for the features of the one before it.
 
     Raises:
-        ConfigError: there is none, or one learns.
+        ConfigError: one learns.
     """
-    if not parts:
-        raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
-    return list(_chained(parts, shape, columns))
-
-
-def _chained(
-    parts: Sequence[Mapping[str, Any]], shape: tuple[int, ...], columns: tuple[str, ...]
-) -> Iterator[Encoder]:
+    found: list[Encoder] = []
     for part in parts:
         encoder: Encoder = build("encoder", part, input_shape=shape, input_columns=columns)
         if not encoder.fixed:
@@ -224,5 +219,6 @@ def _chained(
                 f"encoder {part['name']} learns, or draws what it says; mode=encode keeps features that follow from "
                 "the input alone. Leave it out, and train it on the features."
             )
-        yield encoder.eval()
+        found.append(encoder.eval())
         shape, columns = encoder.output_shape, ()
+    return found
