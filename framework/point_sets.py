@@ -1,6 +1,7 @@
 """Functions of sets: the points of a batch of clouds one after the other, and the largest numbers over each cloud."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -28,14 +29,20 @@ def columns_read(input_shape: tuple[int, ...], by: str, attributes: bool) -> int
     return input_shape[1] if attributes else 3
 
 
+class Reading(NamedTuple):
+    """What an encoder reads of its clouds: the first `columns`, of `most` points at most (None for all), normalised."""
+
+    columns: int
+    most: int | None
+    normalise: Normalisation
+
+
 def over_points(
     network: Callable[[Tensor, Tensor], Tensor],
     clouds: Float[Tensor, "batch points columns"],
-    normalise: Normalisation,
-    *,
-    columns: int,
-    most: int | None,
+    reading: Reading,
     dtype: torch.dtype,
+    *,
     training: bool,
 ) -> Float[Tensor, "batch features"]:
     """What a network says of clouds, given their points (as `points_of`) and how many each has; in parts where it may.
@@ -43,6 +50,7 @@ def over_points(
     Args:
         training: whether the whole batch is wanted at once, as batch norm does.
     """
+    columns, most, normalise = reading
     values, counts = points_of(clouds, normalise, columns=columns, most=most, dtype=dtype)
     if training or torch.is_grad_enabled():
         return network(values, counts)

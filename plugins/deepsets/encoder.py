@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from framework.clouds import Normalisation
 from framework.encoder import Encoder
-from framework.point_sets import columns_read, largest, over_points, to_points
+from framework.point_sets import Reading, columns_read, largest, over_points, to_points
 
 Width = Annotated[int, Field(gt=0)]
 ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
@@ -54,10 +54,9 @@ class DeepSets(Encoder):
         attributes: bool = False,
     ) -> None:
         super().__init__()
-        self.columns = columns_read(input_shape, "encoder deepsets", attributes)
-        self.points = points
-        self.normalise: Normalisation = normalise
-        lengths = [self.columns, *channels]
+        columns = columns_read(input_shape, "encoder deepsets", attributes)
+        self.reading = Reading(columns, points, normalise)
+        lengths = [columns, *channels]
         self.equivariant = nn.ModuleList(
             nn.Linear(before, after) for before, after in zip(lengths, channels, strict=False)
         )
@@ -71,15 +70,8 @@ class DeepSets(Encoder):
         self.output_shape = (length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        return over_points(
-            self._described,
-            inputs,
-            self.normalise,
-            columns=self.columns,
-            most=self.points,
-            dtype=next(self.parameters()).dtype,
-            training=self.training,
-        )
+        dtype = next(self.parameters()).dtype
+        return over_points(self._described, inputs, self.reading, dtype, training=self.training)
 
     def _described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]

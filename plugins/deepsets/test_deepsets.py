@@ -22,7 +22,7 @@ def by_hand(made, cloud, activation):
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: made.points, : made.columns]
+    points = points[: made.reading.most, : made.reading.columns]
     for layer in made.equivariant:
         weight, bias = layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy()
         most = points.max(0)

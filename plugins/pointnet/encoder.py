@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from framework.clouds import Normalisation
 from framework.encoder import Encoder
-from framework.point_sets import columns_read, largest, over_points
+from framework.point_sets import Reading, columns_read, largest, over_points
 
 Width = Annotated[int, Field(gt=0)]
 LOCAL = 2
@@ -59,13 +59,12 @@ class PointNet(Encoder):
         attributes: bool = False,
     ) -> None:
         super().__init__()
-        self.columns = columns_read(input_shape, "encoder pointnet", attributes)
-        self.points = points
-        self.normalise: Normalisation = normalise
+        columns = columns_read(input_shape, "encoder pointnet", attributes)
+        self.reading = Reading(columns, points, normalise)
         after = point_widths[LOCAL:]
         full = variant == "full"
         self.input_matrix = Matrix(3, after, widths) if full else None
-        self.local = layers(self.columns, point_widths[:LOCAL])
+        self.local = layers(columns, point_widths[:LOCAL])
         self.feature_matrix = Matrix(point_widths[LOCAL - 1], after, widths) if full else None
         self.deep = layers(point_widths[LOCAL - 1], after)
         self.whole = layers(after[-1], widths)
@@ -73,15 +72,8 @@ class PointNet(Encoder):
         self.output_shape = (widths[-1],)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        return over_points(
-            self._described,
-            inputs,
-            self.normalise,
-            columns=self.columns,
-            most=self.points,
-            dtype=next(self.parameters()).dtype,
-            training=self.training,
-        )
+        dtype = next(self.parameters()).dtype
+        return over_points(self._described, inputs, self.reading, dtype, training=self.training)
 
     def _described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]

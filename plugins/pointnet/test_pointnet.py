@@ -44,7 +44,7 @@ def by_hand(made, cloud):
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: made.points, : made.columns]
+    points = points[: made.reading.most, : made.reading.columns]
     if made.input_matrix is not None:
         points[:, :3] = points[:, :3] @ matrix(made.input_matrix, points[:, :3])
     points = passed(made.local, points)
