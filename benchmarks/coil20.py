@@ -13,7 +13,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.table import aggregate, markdown
+from framework.reports.table import aggregate, markdown
 
 COLUMNS = {
     "objects": "objects",
@@ -44,7 +44,7 @@ def main() -> None:
         "20 objects, 18 training views each (every 20°), 36 test views each, 5° from the nearest learnt one; "
         "32 × 32 pixels, `biternion_vgg`, 200 epochs on views interpolated by a periodic cubic spline. ± is the "
         "standard deviation over seeds. `look-alikes` are the 8 objects whose training views half a turn apart are "
-        "nearer to one another than neighbouring ones are (`plugins/coil20`). Commands in `coil20.py`.\n\n"
+        "nearer to one another than neighbouring ones are (`plugins/data/coil20`). Commands in `coil20.py`.\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")

@@ -20,10 +20,10 @@ from torch.distributions import Categorical, Distribution
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
+from framework.configuration.schema import build, resolve
 from framework.data import Batch
+from framework.distributions.prediction_set import PredictionSet
 from framework.model import Predictor
-from framework.prediction_set import PredictionSet
-from framework.schema import build, resolve
 from framework.target import Target
 
 SPLITS, POOL = 200, 2000

@@ -16,7 +16,7 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.table import markdown
+from framework.reports.table import markdown
 
 COLUMNS = {"fold": "fold", "accuracy": "accuracy", "nll": "NLL (nats)", "ece": "ECE"}
 

@@ -22,14 +22,14 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.assembly import build_predictor, resolve_all
-from framework.batches import Batches, epoch_order
+from framework.configuration.assembly import build_predictor, resolve_all
+from framework.configuration.schema import build, resolve
+from framework.configuration.settings import OptimizerSettings
 from framework.data import Data
 from framework.model import Model, Predictor
-from framework.schema import build, resolve
-from framework.settings import OptimizerSettings
-from framework.training import Training
-from plugins.ensemble.wrapper import Ensemble, network
+from framework.training.batches import Batches, epoch_order
+from framework.training.module import Training
+from plugins.uncertainty.members.ensemble.wrapper import Ensemble, network
 
 MEMBERS, BATCH, EPOCHS, ROUNDS = 10, 50, 20, 3
 LEARNING_RATE = 1e-3

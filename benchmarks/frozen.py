@@ -1,7 +1,7 @@
 """What freezing a trained model gains on one core: python benchmarks/frozen.py
 
 The thesis's classifier of basis point sets (512-400-400-40, batch norm, dropout), alone and with its encoder on clouds
-of 2048 points: the predictor in torch without gradient, other ways to deploy it, and framework.frozen, one after the
+of 2048 points: the predictor in torch without gradient, other ways to deploy it, and deployment.frozen, one after the
 other in each round of one process. Weights are random: they do not change the cost, but for the zeros that ReLU leaves
 (about half, as after training). Run it on one core (`taskset -c 0`). Writes frozen.md beside this
 file.
@@ -23,10 +23,10 @@ import numpy as np
 import torch
 
 from benchmarks.machine import machine
-from framework.assembly import build_predictor
-from framework.frozen import frozen
+from framework.configuration.assembly import build_predictor
+from framework.configuration.schema import resolve
+from framework.deployment.frozen import frozen
 from framework.model import Model, Preceded, Predictor
-from framework.schema import resolve
 from framework.target import Target
 
 ROUNDS = 9

@@ -19,12 +19,12 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework import table
+from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
-from framework.monte_carlo import NormalPoints, estimate, lattice, normal_quantile
-from framework.schema import build, resolve
+from framework.distributions.monte_carlo import NormalPoints, estimate, lattice, normal_quantile
+from framework.evaluation.work_precision import front, run_times
+from framework.reports import table
 from framework.target import Target
-from framework.work_precision import front, run_times
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -60,7 +60,7 @@ COLUMNS = {
 
 
 class IndependentPoints:
-    """Ordinary Monte Carlo in the place of framework.monte_carlo.NormalPoints."""
+    """Ordinary Monte Carlo in the place of framework.distributions.monte_carlo.NormalPoints."""
 
     def __init__(
         self,
@@ -159,8 +159,8 @@ def points(kind: str) -> Iterator[None]:
         yield
         return
     with (
-        patch("plugins.scvae.density.NormalPoints", IndependentPoints),
-        patch("plugins.cvae.density.NormalPoints", IndependentPoints),
+        patch("plugins.density_head.latent.scvae.density.NormalPoints", IndependentPoints),
+        patch("plugins.density_head.latent.cvae.density.NormalPoints", IndependentPoints),
     ):
         yield
 

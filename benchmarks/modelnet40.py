@@ -21,9 +21,9 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.machine import machine
-from framework.cost import wall_time
-from framework.schema import build, resolve
-from framework.table import aggregate, markdown
+from framework.configuration.schema import build, resolve
+from framework.evaluation.cost import wall_time
+from framework.reports.table import aggregate, markdown
 
 ROWS = {  # table and row, what the thesis reports: accuracy, FLOPs, parameters
     "voxnet": ("6.1, 1", "VoxNet (32³ flags)", "83.0 %", "> 1e8", "9.0e5"),

@@ -24,12 +24,12 @@ from matplotlib.image import imread
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.machine import machine
-from framework.batches import Batches
-from framework.evaluation import evaluate
-from framework.landscape_picture import Plane, landscapes, probabilities
+from framework.configuration.schema import build, resolve
+from framework.evaluation.splits import evaluate
 from framework.metric import Pictured
-from framework.schema import build, resolve
-from framework.table import aggregate, markdown
+from framework.reports.landscape_picture import Plane, landscapes, probabilities
+from framework.reports.table import aggregate, markdown
+from framework.training.batches import Batches
 
 HERE = Path(__file__).parent
 METHODS = {

@@ -17,10 +17,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.machine import machine
-from framework.batches import as_batch
-from framework.schema import build, resolve
-from framework.tradeoff import rows, tradeoff, write
-from framework.tradeoff_picture import tradeoff as drawn
+from framework.configuration.schema import build, resolve
+from framework.evaluation.tradeoff import rows, tradeoff, write
+from framework.reports.tradeoff_picture import tradeoff as drawn
+from framework.training.batches import as_batch
 
 HERE = Path(__file__).parent
 KNOBS = {

@@ -30,8 +30,8 @@ from sklearn.neighbors import NearestNeighbors
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.nearest import Queries, nearest, prepare
-from framework.streamed_nearest import Middle, Reach, Stream, normal
+from framework.geometry.nearest import Queries, nearest, prepare
+from framework.geometry.nearest.streamed import Middle, Reach, Stream, normal
 
 Array = NDArray[np.floating]
 ROWS = ((2048, 512, 24, 12), (10_000, 1000, 12, 8), (100_000, 1000, 3, 5), (1_000_000, 4096, 3, 2))
@@ -40,7 +40,7 @@ TARGETS = {2048: (15, 3.5), 10_000: (10, 2.5), 100_000: (18, 4), 1_000_000: (18,
 """Times faster than the ball tree, and than the best of the others."""
 FIRST_CALL = """
 import time, torch
-from framework.nearest import nearest
+from framework.geometry.nearest import nearest
 clouds, queries = torch.rand(1, 5000, 3), torch.rand(500, 3)
 wall, cpu = time.perf_counter(), time.process_time()
 nearest(clouds, queries)

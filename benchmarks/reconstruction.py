@@ -24,16 +24,16 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.clouds import Normalised, normalised, sizes
-from framework.nearest import chamfer
-from framework.pictures import COLOURS, MARKERS, titled_figure
-from framework.schema import build, resolve
-from framework.table import csv, markdown
-from plugins.bps.basis import Strategy, basis
-from plugins.bps.encoding import decode, encode, prepared
-from plugins.occupancy.grid import decode as centres
-from plugins.occupancy.grid import occupancy
-from plugins.points.subset import chosen
+from framework.configuration.schema import build, resolve
+from framework.geometry.clouds import Normalised, normalised, sizes
+from framework.geometry.nearest import chamfer
+from framework.reports.pictures import COLOURS, MARKERS, titled_figure
+from framework.reports.table import csv, markdown
+from plugins.encoder.bps.basis import Strategy, basis
+from plugins.encoder.bps.encoding import decode, encode, prepared
+from plugins.encoder.grids.occupancy.grid import decode as centres
+from plugins.encoder.grids.occupancy.grid import occupancy
+from plugins.encoder.points.subset import chosen
 
 HERE = Path(__file__).resolve()
 POINTS = 10_000

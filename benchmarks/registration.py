@@ -17,9 +17,9 @@ import torch
 from machine import machine
 
 import framework
-from framework.default_body import default_body
-from framework.density import median
-from framework.schema import build, resolve
+from framework.configuration.schema import build, resolve
+from framework.distributions.density import median
+from plugins.data.bodies.default_body import default_body
 
 HERE = Path(__file__).parent
 RANKS = (16, 32, 48, 64, 96, 128)
@@ -153,7 +153,7 @@ def trained(run: Path, split) -> list[str]:
 
 
 def picture(run: str, scan: Path) -> None:
-    from plugins.registration.__main__ import register
+    from plugins.data.bodies.registration.__main__ import register
 
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         written = register(run, [scan], Path(folder))

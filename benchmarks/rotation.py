@@ -13,11 +13,11 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.meshes import Mesh, sample
-from framework.table import markdown
-from plugins.bps.basis import basis
-from plugins.bps.encoding import channels, encode, prepared
-from plugins.modelnet40.generator import CLASSES, model
+from framework.geometry.meshes import Mesh, sample
+from framework.reports.table import markdown
+from plugins.data.labelled_clouds.modelnet40.generator import CLASSES, model
+from plugins.encoder.bps.basis import basis
+from plugins.encoder.bps.encoding import channels, encode, prepared
 
 MODELS = 3
 """Of each class."""

@@ -1,7 +1,7 @@
 """Parts of bodies, point by point, from the code of the whole cloud (thesis §8.2): `python benchmarks/segmentation.py`.
 
 Scans of data=registration; a point's part is that of the nearest vertex of its body. The same network reads a point's
-normalised coordinates alone, or with the code of its cloud (plugins.bps.encoding.per_point). Writes segmentation.md and
+normalised coordinates alone, or with the code of its cloud (`per_point`). Writes segmentation.md and
 segmentation.png beside this file; five minutes on one core. The default body is wanted: pip install -e '.[body]'.
 """
 
@@ -15,16 +15,16 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.body import Body
-from framework.clouds import sizes
-from framework.nearest import nearest
-from framework.pictures import titled_figure
-from framework.schema import build, resolve
-from framework.table import markdown
-from plugins.bps.basis import basis
-from plugins.bps.encoding import Basis, encode, per_point, prepared
-from plugins.registration import poses
-from plugins.registration.data import chosen_body
+from framework.configuration.schema import build, resolve
+from framework.geometry.clouds import sizes
+from framework.geometry.nearest import nearest
+from framework.reports.pictures import titled_figure
+from framework.reports.table import markdown
+from plugins.data.bodies.body import Body
+from plugins.data.bodies.registration import poses
+from plugins.data.bodies.registration.data import chosen_body
+from plugins.encoder.bps.basis import basis
+from plugins.encoder.bps.encoding import Basis, encode, per_point, prepared
 
 HERE = Path(__file__).resolve()
 TRAIN, TEST, BASIS = 2_000, 200, 512

@@ -17,15 +17,15 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.assembly import build_predictor, resolve_all
-from framework.batches import Batches
+from framework.configuration.assembly import build_predictor, resolve_all
+from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch
-from framework.fields import Fields
-from framework.settings import OptimizerSettings
-from framework.signals import Stopper
+from framework.datasets.fields import Fields
 from framework.target import Target
-from framework.tracking import NoTracker
-from framework.training import KeepCheckpoints, Report, StopAtBatch, Training
+from framework.tracking.signals import Stopper
+from framework.tracking.tracker import NoTracker
+from framework.training.batches import Batches
+from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
 
 BATCH, STEPS, ROUNDS = 64, 40, 7
 CONFIG = {

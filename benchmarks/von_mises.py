@@ -13,9 +13,9 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
-from framework.circular import circular_median, wrap
-from plugins.von_mises import functions, integrals
-from plugins.von_mises.fit_coefficients import bessel
+from framework.distributions.circular import circular_median, wrap
+from plugins.density_head.von_mises import functions, integrals
+from plugins.density_head.von_mises.fit_coefficients import bessel
 
 COUNT = 10**6
 DTYPES = (torch.float32, torch.float64)

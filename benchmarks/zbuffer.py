@@ -16,9 +16,9 @@ import numba
 import numpy as np
 import torch
 
-from framework.camera import look_from
+from framework.configuration.schema import build, resolve
+from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene
-from framework.schema import build, resolve
 
 HEIGHT, WIDTH = 410, 308
 FOCAL = 600  # pixels
@@ -27,7 +27,7 @@ ASKED = (("mask",), ("depth",), ("color",), ("color", "depth"))
 FIRST_CALL = """
 import time, torch
 from benchmarks.zbuffer import DISTANCE, figure, scene
-from plugins.zbuffer.renderer import ZBuffer
+from plugins.renderer.zbuffer.renderer import ZBuffer
 drawn = scene(*figure(), distance=DISTANCE)
 start = time.perf_counter()
 ZBuffer()(drawn, ("color", "depth", "face", "mask"))

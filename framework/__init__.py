@@ -2,24 +2,77 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import sys
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_loader
+from typing import TYPE_CHECKING, ClassVar
 
 if TYPE_CHECKING:
-    from framework.frozen import freeze as freeze
-    from framework.loading import load as load
+    from collections.abc import Sequence
+    from types import ModuleType
+
+    from framework.deployment.frozen import freeze as freeze
+    from framework.runs.loading import load as load
 
 __all__ = ["freeze", "load"]
 __version__ = "0.1.0"
 
+_LAZY = {"load": "framework.runs.loading", "freeze": "framework.deployment.frozen"}
+
 
 def __getattr__(name: str) -> object:
     # Lazy, so that `import framework` (and with it `--help`) stays free of torch.
-    if name == "load":
-        from framework.loading import load
-
-        return load
-    if name == "freeze":
-        from framework.frozen import freeze
-
-        return freeze
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'framework' has no attribute {name!r}")
+
+
+class _Moved(MetaPathFinder, Loader):
+    """Old names of modules that plugins import: each is the module that is at its new place, not a copy of it."""
+
+    NOW: ClassVar = {
+        f"framework.{old}": f"framework.{new}"
+        for old, new in {
+            "cache": "storage.cache",
+            "camera": "geometry.camera",
+            "cdf": "distributions.cdf",
+            "circular": "distributions.circular",
+            "circular_moments": "distributions.circular_moments",
+            "class_probabilities": "distributions.class_probabilities",
+            "clouds": "geometry.clouds",
+            "density": "distributions.density",
+            "fields": "datasets.fields",
+            "generated": "storage.generated",
+            "images": "datasets.images",
+            "meshes": "geometry.meshes",
+            "module_flags": "calibration.module_flags",
+            "monte_carlo": "distributions.monte_carlo",
+            "nan": "distributions.checks",
+            "nearest": "geometry.nearest",
+            "normals": "distributions.normals",
+            "prediction_set": "distributions.prediction_set",
+            "raw_numbers": "heads.parameters",
+            "rearranged": "distributions.batch_shapes",
+            "rotation": "geometry.rotation",
+            "temper": "distributions.tempering",
+            "validation": "calibration.validation",
+        }.items()
+    }
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return spec_from_loader(fullname, self) if fullname in self.NOW else None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = import_module(self.NOW[spec.name])
+        self.spec = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self.spec  # which the import system has just replaced by the old name's
+
+
+sys.meta_path.append(_Moved())

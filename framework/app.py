@@ -20,7 +20,7 @@ def main() -> None:
     except KeyboardInterrupt:
         _fail("interrupted.", 130)
     except Exception as error:
-        from framework.composition import sentence
+        from framework.configuration.composition import sentence
 
         message = None if full_error == "1" else sentence(error)
         if message is None:
@@ -44,7 +44,12 @@ def _run() -> None:
     import hydra
     from omegaconf import DictConfig
 
-    from framework.composition import folder, refuse_logging_overrides, register, swept_with_experiment
+    from framework.configuration.composition import (
+        folder,
+        refuse_logging_overrides,
+        register,
+        swept_with_experiment,
+    )
 
     sys.argv[1:] = _with_resumed_folder(sys.argv[1:])
     refuse_logging_overrides(sys.argv[1:])

@@ -24,7 +24,7 @@ class Data(ABC):
     that says which file, what was wanted and what to do; a sample that cannot be read is never replaced silently.
 
     A data set that cannot be shipped may be generated: its generator writes the official layout to the cache
-    (`framework.cache.folder`) and the same loader reads it; `synthetic` is then True, and the framework says so
+    (`framework.storage.cache.folder`) and the same loader reads it; `synthetic` is then True, and the framework says so
     wherever a number or picture made from it appears.
     """
 
@@ -57,7 +57,7 @@ class Data(ABC):
     @abstractmethod
     def train(self) -> Dataset[Batch]:
         """The training split. Items are dicts of tensors without batch dimension; a dataset that can fetch many
-        items faster at once also has `__getitems__(indices) -> Batch`, already batched (framework.fields.Fields)."""
+        items faster at once also has `__getitems__(indices) -> Batch`, already batched (datasets.fields.Fields)."""
 
     @abstractmethod
     def validation(self) -> Dataset[Batch]:

@@ -20,7 +20,7 @@ class Encoder(nn.Module, ABC):
     that reads images converts uint8 to float in [0, 1] itself and then normalises as it likes.
 
     Point clouds come as (batch, points, columns), coordinates in the first three columns; those of fewer points are
-    padded at their end with rows of NaN (framework.clouds). A cloud that cannot be read is refused with a UserError.
+    padded at their end with rows of NaN (geometry.clouds). A cloud that cannot be read is refused with a UserError.
 
     Encoders chain: `encoder=[biternion_vgg,mlp]` feeds the second with the first's output; each is built with the
     `output_shape` of the one before it.

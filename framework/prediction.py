@@ -6,10 +6,10 @@ from typing import Literal
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.class_probabilities import class_probabilities
 from framework.data import Batch
-from framework.density import marginal, median
-from framework.monte_carlo import Estimate, estimate
+from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.density import marginal, median
+from framework.distributions.monte_carlo import Estimate, estimate
 
 Split = Literal["test", "outliers"]
 """Where inputs come from: the test split, or data that belongs to nothing the model was trained on."""

@@ -8,7 +8,7 @@ from typing import ClassVar
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from framework.camera import Camera
+from framework.geometry.camera import Camera
 
 
 @dataclass(frozen=True)

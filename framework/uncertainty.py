@@ -17,7 +17,7 @@ class Uncertainty(Predictor):
 
     A constructor asks for `model: Callable[[], Predictor]` before `*`, which builds a fresh, differently initialised
     copy of what is wrapped at each call. The densities it returns are mixtures of densities (the Mixture of
-    framework.density), never densities of averaged parameters; wrapping one member gives that member's numbers to
+    distributions.density), never densities of averaged parameters; wrapping one member gives that member's numbers to
     the last bit. They compose: `uncertainty=[ensemble,temperature]` puts temperature around the ensemble.
     """
 

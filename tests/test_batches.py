@@ -23,12 +23,12 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.utils.data import Dataset
 
-from framework.batches import Batches, SeededBatches, as_batch, epoch_order, seed_step
-from framework.checkpoint import WholeCheckpoints
 from framework.data import Batch, Data
+from framework.datasets.fields import Fields
 from framework.errors import ConfigError, DataError
-from framework.fields import Fields
 from framework.target import Target
+from framework.training.batches import Batches, SeededBatches, as_batch, epoch_order, seed_step
+from framework.training.checkpoint import WholeCheckpoints
 
 SAMPLES = 165  # ten batches of 16, and a rest
 

@@ -1,4 +1,4 @@
-"""The Gaussian blur of images (framework.images), against SciPy's."""
+"""The Gaussian blur of images (framework.datasets.images), against SciPy's."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from framework.images import Crop, blurred
+from framework.datasets.images import Crop, blurred
 
 
 @pytest.mark.parametrize("deviation", [0.1, 0.5, 1.0, 2.3, 8.0, 40.0])

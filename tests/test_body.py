@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from framework.body import (
+from framework.errors import ConfigError, DataError
+from plugins.data.bodies.body import (
     Body,
     BodyModel,
     quaternions_less_identity,
@@ -15,7 +16,6 @@ from framework.body import (
     turns_less_identity,
     with_joints,
 )
-from framework.errors import ConfigError, DataError
 
 PARENTS = (1, -1, 1, 2, 0, 2)  # the root is not the first, and a child comes before its parent
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy import sparse
 
-from framework import body_files
-from framework.body import Body, BodyModel
 from framework.errors import DataError
+from plugins.data.bodies import body_files
+from plugins.data.bodies.body import Body, BodyModel
 
 JOINTS, VERTICES, SHAPES = 4, 12, 5
 

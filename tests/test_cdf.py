@@ -7,12 +7,12 @@ import torch
 from scipy import integrate, stats
 from torch.distributions import Independent, MultivariateNormal, Normal, StudentT
 
-from framework.cdf import arc, cdf, turn
-from framework.circular_moments import circular_moments
-from framework.density import Mixture, marginal
-from framework.normals import mahalanobis, normals
-from framework.rearranged import Reshaped, Stacked
-from framework.schema import build, resolve
+from framework.configuration.schema import build, resolve
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.cdf import arc, cdf, turn
+from framework.distributions.circular_moments import circular_moments
+from framework.distributions.density import Mixture, marginal
+from framework.distributions.normals import mahalanobis, normals
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.circular import angular_distance, circular_mean, circular_median, grid, wrap
+from framework.distributions.circular import angular_distance, circular_mean, circular_median, grid, wrap
 
 angles = st.floats(-1e6, 1e6, allow_nan=False)
 

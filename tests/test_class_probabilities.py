@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 from scipy import special
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
-from framework.class_probabilities import class_probabilities, require_labels
-from framework.density import Mixture
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.checks import refuse_nan
+from framework.distributions.class_probabilities import class_probabilities, require_labels
+from framework.distributions.density import Mixture
 from framework.errors import DataError, UserError
-from framework.nan import refuse_nan
-from framework.rearranged import Reshaped, Stacked
 
 
 def categorical(logits):

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.clouds import (
+from framework.errors import DataError
+from framework.geometry.clouds import (
     LOOSE,
     REACH,
     _composed,
@@ -20,7 +21,6 @@ from framework.clouds import (
     sizes,
     without_bad_points,
 )
-from framework.errors import DataError
 
 DTYPES = [torch.float32, torch.float64]
 NAN, INF = math.nan, math.inf

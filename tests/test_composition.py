@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from framework.app import _with_resumed_folder
-from framework.composition import (
+from framework.configuration.composition import (
     folder,
     plain,
     refuse_logging_overrides,
@@ -18,8 +18,8 @@ from framework.composition import (
     sentence,
     swept_with_experiment,
 )
+from framework.configuration.settings import check_trainer_keys, settings
 from framework.errors import ConfigError
-from framework.settings import check_trainer_keys, settings
 
 EXPERIMENTS = sorted(
     str(path.relative_to(folder() / "experiment").with_suffix(""))
@@ -37,7 +37,7 @@ def composed(*overrides: str) -> DictConfig:
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
-    from framework.assembly import resolve_all
+    from framework.configuration.assembly import resolve_all
 
     values = plain(composed(f"experiment={name}"))
     settings(values)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from framework.registry import installed
+from framework.configuration.registry import installed
 from framework.testing.contract import CONTRACTS, Row, contract
 from framework.testing.finding import require
 

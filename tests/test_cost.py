@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from framework import cost
-from framework.cost import Cost, device_name, measure, peak_memory, wall_time
-from framework.evaluation import cost as evaluated_cost
+from framework.configuration.schema import build, resolve
+from framework.evaluation import cost
+from framework.evaluation.cost import Cost, device_name, measure, peak_memory, wall_time
+from framework.evaluation.splits import cost as evaluated_cost
 from framework.model import Model
-from framework.schema import build, resolve
-from framework.table import COST_COLUMNS
+from framework.reports.table import COST_COLUMNS
 from framework.target import Target
 
 CPU = torch.device("cpu")

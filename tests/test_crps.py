@@ -11,14 +11,14 @@ from scipy import integrate, stats
 from scipy.interpolate import CubicHermiteSpline
 from torch.distributions import Categorical, Independent, MixtureSameFamily, MultivariateNormal, Normal
 
-from framework.circular import angular_distance
-from framework.circular_moments import circular_moments
-from framework.crps import crps, fair, mean_angular_distance, mean_distance
-from framework.density import Mixture, marginal
-from framework.rearranged import Reshaped, Stacked
-from framework.schema import build, resolve
+from framework.configuration.schema import build, resolve
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.circular import angular_distance
+from framework.distributions.circular_moments import circular_moments
+from framework.distributions.density import Mixture, marginal
 from framework.target import Target
 from framework.testing.metrics import Cardioid
+from plugins.metric.crps.score import crps, fair, mean_angular_distance, mean_distance
 
 WIDE = torch.float64
 
@@ -122,7 +122,7 @@ def test_however_normals_are_wrapped_the_score_is_the_same():
 
 
 def test_more_components_than_fit_into_the_memory_at_once(monkeypatch):
-    monkeypatch.setattr("framework.crps.CHUNK", 100)
+    monkeypatch.setattr("plugins.metric.crps.score.CHUNK", 100)
     torch.manual_seed(1)
     mean = torch.randn(7, 9, 1, dtype=WIDE)
     density, value = Mixture(torch.zeros(7, 9), normal(mean, mean.abs())), torch.zeros(7, 1, dtype=WIDE)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.csv_columns import mostly_numbers, number, numbers, read_columns, require
+from framework.datasets.csv_columns import mostly_numbers, number, numbers, read_columns, require
 from framework.errors import DataError
 
 

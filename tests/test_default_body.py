@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from framework import default_body
-from framework.body import BodyModel
-from framework.default_body import Traits, interpolation
 from framework.errors import DataError
+from plugins.data.bodies import default_body
+from plugins.data.bodies.body import BodyModel
+from plugins.data.bodies.default_body import Traits, interpolation
 
 
 @pytest.fixture(scope="module")

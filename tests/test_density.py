@@ -7,7 +7,15 @@ import pytest
 import torch
 from torch.distributions import Distribution, Independent, Normal, constraints
 
-from framework.density import Mixture, circular, circular_entropy, circular_grid, marginal, median, pick
+from framework.distributions.density import (
+    Mixture,
+    circular,
+    circular_entropy,
+    circular_grid,
+    marginal,
+    median,
+    pick,
+)
 from framework.errors import UserError
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from framework.configuration.schema import build, resolve
+from framework.configuration.settings import Settings
 from framework.errors import ConfigError, DataError
 from framework.modes.encode import collected, describe, encode, share
-from framework.schema import build, resolve
-from framework.settings import Settings
 
 CONFIG = {
     "data": resolve("data", {"name": "point_cloud_folder", "points": 50}),

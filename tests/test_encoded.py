@@ -7,18 +7,18 @@ import pytest
 import torch
 from torch.distributions import Categorical
 
-from framework.batches import Batches
+from framework.configuration.schema import build, resolve
 from framework.data import Data
+from framework.datasets.fields import Fields
 from framework.density_head import DensityHead, Fitted
-from framework.encoded import LARGEST, Encoded, fits
 from framework.encoder import Encoder
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.fields import Fields
-from framework.fitting import fit_at_once, fitted_models, mean_loss
 from framework.model import Model, Preceded
 from framework.modes.combine import _inner
-from framework.schema import build, resolve
 from framework.target import Target
+from framework.training.batches import Batches
+from framework.training.cached_features import LARGEST, Encoded, fits
+from framework.training.fitting import fit_at_once, fitted_models, mean_loss
 
 CLASSES = Target("class", ("low", "high"))
 

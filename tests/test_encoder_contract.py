@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from framework.clouds import require_clouds, sizes
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
+from framework.geometry.clouds import require_clouds, sizes
 from framework.testing.encoders import examine_encoder
 from framework.testing.finding import require
 from framework.testing.rows import CloudRow

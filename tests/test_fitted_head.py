@@ -5,10 +5,10 @@ import pytest
 import torch
 from scipy import stats
 
-from framework.density import Mixture, marginal, median, pick
-from framework.fitted_head import IndependentNormals, single, take_shapes
-from framework.normals import mahalanobis, normals
-from framework.temper import temper
+from framework.distributions.density import Mixture, marginal, median, pick
+from framework.distributions.normals import mahalanobis, normals
+from framework.distributions.tempering import temper
+from plugins.density_head.trees.fitted_head import IndependentNormals, single, take_shapes
 
 
 @pytest.mark.parametrize("shape", [(4, 3), (2, 5, 2), (0, 2), (3,)])

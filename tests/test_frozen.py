@@ -11,16 +11,16 @@ from scipy import special
 from torch import Tensor, nn
 
 import framework
-from framework.assembly import build_predictor
-from framework.checkpoint import WholeCheckpoints
+from framework.configuration.assembly import build_predictor
+from framework.configuration.schema import build, resolve
+from framework.deployment.frozen import frozen
+from framework.deployment.frozen_network import affine_logits, connected, read, softmax
 from framework.encoder import Encoder
 from framework.errors import CheckpointError
-from framework.frozen import frozen
-from framework.frozen_network import affine_logits, connected, read, softmax
-from framework.loading import PREFIX
 from framework.model import Model, Preceded, Predictor
-from framework.schema import build, resolve
+from framework.runs.loading import PREFIX
 from framework.target import Target
+from framework.training.checkpoint import WholeCheckpoints
 
 SEVEN = Target("class", tuple("abcdefg"))
 

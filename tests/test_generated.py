@@ -1,4 +1,4 @@
-"""Generated data in the cache (framework.generated): whole or absent, once, marked."""
+"""Generated data in the cache (framework.storage.generated): whole or absent, once, marked."""
 
 import json
 import threading
@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from framework import generated
-from framework.cache import folder
 from framework.errors import DataError
-from framework.generated import MARK, draw_all, read_mark
+from framework.storage import generated
+from framework.storage.cache import folder
+from framework.storage.generated import MARK, draw_all, read_mark
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The image code that data plugins share (framework.images), against independent references."""
+"""The image code that data plugins share (framework.datasets.images), against independent references."""
 
 import io
 import math
@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from framework import images
+from framework.datasets import images
+from framework.datasets.images import Crop, augmented, picture, square
 from framework.errors import DataError
-from framework.images import Crop, augmented, picture, square
 
 
 def ramp(width: int, height: int) -> Image.Image:

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework import journal as module
 from framework.errors import DataError
-from framework.journal import Journal, write_atomically
+from framework.tracking import journal as module
+from framework.tracking.journal import Journal, write_atomically
 
 
 @pytest.fixture
@@ -312,7 +312,7 @@ def test_each_line_is_synced_soon_and_at_close(path: Path, monkeypatch: pytest.M
 
 def test_one_writer_at_a_time(path: Path) -> None:
     program = (
-        "import sys, pathlib; from framework.journal import Journal\n"
+        "import sys, pathlib; from framework.tracking.journal import Journal\n"
         "journal = Journal(pathlib.Path(sys.argv[1]))\n"
         "journal.write({'a': 1.0}, 0, 0); print('ready', flush=True); sys.stdin.read()"
     )

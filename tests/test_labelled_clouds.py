@@ -8,10 +8,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework import cloud_picture, labelled_clouds, meshes
+from framework.datasets import cloud_picture
 from framework.errors import DataError
-from framework.labelled_clouds import Clouds, Packed, Reading, cloud, folds, load, spared, unlabelled
-from framework.mesh_files import COLOURS, NORMALS
+from framework.geometry import meshes
+from framework.geometry.mesh_files import COLOURS, NORMALS
+from plugins.data.labelled_clouds import labelled_clouds
+from plugins.data.labelled_clouds.labelled_clouds import (
+    Clouds,
+    Packed,
+    Reading,
+    cloud,
+    folds,
+    load,
+    spared,
+    unlabelled,
+)
 
 SQUARE = b"OFF\n4 1 0\n0 0 2\n1 0 2\n1 1 2\n0 1 2\n4 0 1 2 3\n"
 

@@ -1,4 +1,4 @@
-"""What the loaders of whole, labelled images share (framework.labelled_images)."""
+"""What the loaders of whole, labelled images share (plugins.data.head_pose.labelled_images)."""
 
 import math
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ import pytest
 import torch
 from PIL import Image
 
-from framework import images
+from framework.datasets import images
+from framework.datasets.images import Crops, blurred
 from framework.errors import DataError
-from framework.images import Crops, blurred
-from framework.labelled_images import SPLITS, Labelled, Splits, halves, own, read_splits, varied
+from plugins.data.head_pose.labelled_images import SPLITS, Labelled, Splits, halves, own, read_splits, varied
 
 
 def samples(place: Path, count: int = 12) -> dict[str, list[Labelled]]:

@@ -2,7 +2,7 @@
 
 import torch
 
-from framework.latent_decoder import LARGEST_FEATURE, LatentDecoder
+from plugins.density_head.latent.decoder import LARGEST_FEATURE, LatentDecoder
 
 
 def test_it_is_a_network_of_both_plus_a_path_of_each() -> None:

@@ -1,4 +1,4 @@
-"""MATLAB 5 files (framework.matlab): whole ones are read, damaged ones raise instead of ending the process."""
+"""MATLAB 5 files (framework.datasets.matlab): whole ones are read, damaged ones raise instead of ending the process."""
 
 import io
 import os
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from framework.matlab import check, read_variables
+from framework.datasets.matlab import check, read_variables
 
 
 def saved(compressed: bool) -> bytes:

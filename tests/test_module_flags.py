@@ -1,7 +1,7 @@
 import pytest
 from torch import nn
 
-from framework.module_flags import flagged
+from framework.calibration.module_flags import flagged
 
 
 def network():

@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal
 
-from framework import monte_carlo
-from framework.errors import ConfigError
-from framework.monte_carlo import (
+from framework.distributions import monte_carlo
+from framework.distributions.monte_carlo import (
     Effort,
     NormalPoints,
     SampledMixture,
@@ -20,6 +19,7 @@ from framework.monte_carlo import (
     normal_quantile,
     rows_of,
 )
+from framework.errors import ConfigError
 
 CPU = torch.device("cpu")
 ITEMS = 60

@@ -15,9 +15,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
 
 from framework.errors import DataError
-from framework.nearest import Queries, chamfer, nearest, prepare
-from framework.nearest_torch import nearest_of
-from framework.streamed_nearest import Middle, Reach, Stream, normal
+from framework.geometry.nearest import Queries, chamfer, nearest, prepare
+from framework.geometry.nearest.device import nearest_of
+from framework.geometry.nearest.streamed import Middle, Reach, Stream, normal
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 EXACT = {torch.float32: 2.5e-7, torch.float64: 1e-15}
@@ -164,9 +164,9 @@ def test_wild_clouds(cloud, queries, scale, dtype):
 @DTYPES
 @pytest.mark.parametrize("kind", KINDS)
 def test_search_finds_what_comparing_with_all_finds_to_the_bit(kind, dtype):
-    from framework.nearest_numba import packed_well
-    from framework.nearest_pack import bench, cell_bits, curve, extent, pack, room
-    from framework.nearest_search import search, search_all
+    from framework.geometry.nearest.pack import bench, cell_bits, curve, extent, pack, room
+    from framework.geometry.nearest.processor import packed_well
+    from framework.geometry.nearest.search import search, search_all
 
     generator = np.random.default_rng(3)
     queries = ball(700, generator).astype(str(dtype).removeprefix("torch."))
@@ -186,7 +186,7 @@ def test_search_finds_what_comparing_with_all_finds_to_the_bit(kind, dtype):
 
 @pytest.mark.parametrize("bits", [1, 2, 3, 4, 5, 6])
 def test_the_curve_visits_every_cell_and_steps_to_neighbours(bits):
-    from framework.nearest_pack import curve
+    from framework.geometry.nearest.pack import curve
 
     cells = curve(bits)[(8**bits - 8) // 7 :]
     assert np.array_equal(np.sort(cells), np.arange(8**bits))
@@ -254,7 +254,7 @@ def test_a_bad_number_is_named_whichever_thread_reads_it(place):
 def test_after_a_fork_the_child_has_threads_of_its_own():
     code = """
 import os, sys, torch
-from framework.nearest import nearest
+from framework.geometry.nearest import nearest
 torch.set_num_threads(2)
 clouds, queries = torch.rand(16, 2000, 3), torch.rand(300, 3)
 here = nearest(clouds, queries)
@@ -271,13 +271,13 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 def test_numba_is_imported_when_first_needed_and_code_kept_in_the_cache():
     code = """
 import sys, torch
-from framework.nearest import nearest, prepare
+from framework.geometry.nearest import nearest, prepare
 queries = prepare(torch.rand(3, 3))
 assert "numba" not in sys.modules
 nearest(torch.rand(1, 5, 3), queries)
 from pathlib import Path
-from framework.cache import folder
-from framework.nearest_compiled import KEPT_IN
+from framework.storage.cache import folder
+from framework.geometry.nearest.compiled import KEPT_IN
 assert Path(KEPT_IN).is_relative_to(folder("numba"))
 assert list(Path(KEPT_IN).glob("**/nearest_numba.answer-*.nbi"))
 from numba import config

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
-from framework.newton import derivatives, minimise
+from framework.calibration.newton import derivatives, minimise
 
 INFINITE = torch.tensor(math.inf, dtype=torch.float64)
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from framework.schema import build, resolve
-from framework.settings import OptimizerSettings
+from framework.configuration.schema import build, resolve
+from framework.configuration.settings import OptimizerSettings
 from framework.target import Target
 from framework.testing.wrappers import Plain
-from framework.training import Training
+from framework.training.module import Training
 
 
 @pytest.mark.parametrize("momentum", [None, 0.0, 0.9])

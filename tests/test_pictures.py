@@ -17,7 +17,8 @@ from matplotlib.text import Annotation, Text
 from scipy.special import logsumexp
 from scipy.stats import vonmises
 
-from framework.pictures import (
+from framework.evaluation.work_precision import Point
+from framework.reports.pictures import (
     RING,
     choose,
     comparison,
@@ -26,7 +27,6 @@ from framework.pictures import (
     viewing_circles,
     work_precision,
 )
-from framework.work_precision import Point
 
 ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
 
@@ -413,9 +413,9 @@ def test_many_methods_and_classes_stay_apart(tmp_path: Path) -> None:
 
 def test_tables_import_no_torch_costs_no_matplotlib_and_pictures_no_pyplot() -> None:
     code = (
-        "import sys, framework.table; assert not {'torch', 'matplotlib'} & set(sys.modules)\n"
-        "import framework.cost; assert 'matplotlib' not in sys.modules\n"
-        "import framework.pictures; assert 'matplotlib.pyplot' not in sys.modules"
+        "import sys, framework.reports.table; assert not {'torch', 'matplotlib'} & set(sys.modules)\n"
+        "import framework.evaluation.cost; assert 'matplotlib' not in sys.modules\n"
+        "import framework.reports.pictures; assert 'matplotlib.pyplot' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from framework.clouds import pad
 from framework.errors import ConfigError
-from framework.point_sets import columns_read, even, in_parts, largest, points_of, to_points
+from framework.geometry.clouds import pad
+from plugins.encoder.point_sets.point_sets import columns_read, even, in_parts, largest, points_of, to_points
 
 
 @pytest.mark.parametrize("numbers", [(5, 5, 5), (5, 2, 1), (1,)])

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from framework import sweep
 from framework.errors import ConfigError
+from framework.sweeps import jobs as sweep
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -24,7 +24,7 @@ APP = """
 import json, os, sys, types
 from pathlib import Path
 import hydra
-from framework import sweep
+from framework.sweeps import jobs as sweep
 
 HERE = Path(__file__).parent
 
@@ -36,7 +36,7 @@ def begin(folder, config):
 def summarise(folder, overrides):
     (HERE / "summarised.json").write_text(json.dumps([str(folder), overrides]))
 
-sys.modules["framework.comparison"] = types.SimpleNamespace(begin=begin, summarise=summarise)
+sys.modules["framework.sweeps.comparison"] = types.SimpleNamespace(begin=begin, summarise=summarise)
 sweep.COMMAND = json.loads(os.environ["JOB"])
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
@@ -377,7 +377,15 @@ def test_what_a_job_leaves_for_an_optimising_sweeper(tmp_path: Path) -> None:
 
 
 def test_the_launcher_costs_other_commands_nothing() -> None:
-    heavy = {"torch", "numpy", "pytorch_lightning", "mlflow", "pandas", "matplotlib", "framework.comparison"}
+    heavy = {
+        "torch",
+        "numpy",
+        "pytorch_lightning",
+        "mlflow",
+        "pandas",
+        "matplotlib",
+        "framework.sweeps.comparison",
+    }
     script = "import sys, hydra_plugins.framework_pool; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not heavy & set(done.stdout.split())

@@ -8,15 +8,15 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 from torch.distributions import Categorical, Independent, MultivariateNormal, Normal
 
-from framework.density import Mixture, circular_grid, marginal, median
-from framework.density_line import Line
+from framework.configuration.schema import build, resolve
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.density import Mixture, circular_grid, marginal, median
+from framework.distributions.highest_density import Line
+from framework.distributions.monte_carlo import SampledMixture, estimate
+from framework.distributions.prediction_set import PredictionSet
+from framework.distributions.tempering import temper
 from framework.errors import UserError
-from framework.monte_carlo import SampledMixture, estimate
-from framework.prediction_set import PredictionSet
-from framework.rearranged import Reshaped, Stacked
-from framework.schema import build, resolve
 from framework.target import Target
-from framework.temper import temper
 from framework.testing.metrics import Cardioid
 
 EVERYTHING = torch.tensor(math.inf, dtype=torch.float64)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.provenance import flatten, git_commit, package_versions
+from framework.runs.provenance import flatten, git_commit, package_versions
 
 
 @pytest.fixture

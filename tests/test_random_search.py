@@ -18,9 +18,9 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from framework import comparison
-from framework.composition import folder, register
+from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
+from framework.sweeps import comparison
 from hydra_plugins.framework_random_search import _best, _draws
 from tests.conftest import TINY, Framework
 
@@ -221,7 +221,7 @@ def test_the_experiment_composes_to_the_config_of_the_trial(
 APP = """
 import sys
 from pathlib import Path
-from framework import sweep
+from framework.sweeps import jobs as sweep
 sweep.COMMAND = [sys.executable, "-S", str(Path(__file__).with_name("job.py"))]
 sys.argv[0] = "framework"
 from framework.app import main
@@ -463,7 +463,15 @@ def test_the_best_of_a_real_search_can_be_run_and_repeats_its_trial(
 
 
 def test_the_sweeper_costs_other_commands_nothing() -> None:
-    heavy = {"torch", "numpy", "pytorch_lightning", "mlflow", "matplotlib", "rich", "framework.comparison"}
+    heavy = {
+        "torch",
+        "numpy",
+        "pytorch_lightning",
+        "mlflow",
+        "matplotlib",
+        "rich",
+        "framework.sweeps.comparison",
+    }
     script = "import sys, hydra_plugins.framework_random_search; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not heavy & set(done.stdout.split())

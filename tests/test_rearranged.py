@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.distributions import Categorical, Independent, Normal
 
-from framework.density import Mixture, marginal, median, pick
-from framework.rearranged import Reshaped, Stacked
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.density import Mixture, marginal, median, pick
 from framework.testing.metrics import Cardioid
 
 

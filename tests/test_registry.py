@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-import framework.registry as registry
+import framework.configuration.registry as registry
+from framework.configuration.registry import GROUPS, config_folders, describe, find, installed, load
 from framework.errors import ConfigError
-from framework.registry import GROUPS, config_folders, describe, find, installed, load
 
 
 class Distribution:

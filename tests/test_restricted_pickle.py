@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from framework.restricted_pickle import PickleRefused, load
+from plugins.data.bodies.restricted_pickle import PickleRefused, load
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 

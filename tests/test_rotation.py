@@ -8,7 +8,7 @@ import torch
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from framework.rotation import geodesic_distance, viewpoint_rotation
+from framework.geometry.rotation import geodesic_distance, viewpoint_rotation
 
 
 def test_rotation_is_the_zxz_product() -> None:

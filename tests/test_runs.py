@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.checkpoint import WholeCheckpoints
-from framework.run import run_name
-from framework.settings import Settings, store_experiment
+from framework.configuration.settings import Settings, store_experiment
+from framework.runs.run import run_name
+from framework.training.checkpoint import WholeCheckpoints
 from tests.conftest import TINY, Done, Framework, listed
 
 QUIET = [*TINY, "logger=none"]

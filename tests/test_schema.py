@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
-import framework.schema as schema
+import framework.configuration.schema as schema
+from framework.configuration.schema import build, forbid_targets, resolve
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from framework.schema import build, forbid_targets, resolve
 
 
 class Toy(Encoder):

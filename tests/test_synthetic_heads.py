@@ -1,12 +1,20 @@
-"""Drawn heads (framework.synthetic_heads): where the nose points, what a mirror does, what a ray meets."""
+"""Drawn heads (plugins.data.head_pose.synthetic_heads): where the nose points, what a mirror does, what a ray meets."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 
-from framework import synthetic_heads
-from framework.synthetic_heads import Conditions, Person, Pose, person, photograph, rendered, rotation
+from plugins.data.head_pose import synthetic_heads
+from plugins.data.head_pose.synthetic_heads import (
+    Conditions,
+    Person,
+    Pose,
+    person,
+    photograph,
+    rendered,
+    rotation,
+)
 
 SIDE = 60
 FROM_CAMERA = np.array([0.0, 0.0, 1.0])

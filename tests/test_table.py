@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from framework.errors import ConfigError
-from framework.table import aggregate, csv, format_number, markdown, results_table
+from framework.reports.table import aggregate, csv, format_number, markdown, results_table
 
 COLUMNS = {"method": "method", "log_likelihood": "log-likelihood nats", "maad_deg": "MAAD °"}
 ROWS = [

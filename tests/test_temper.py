@@ -7,14 +7,14 @@ import torch
 from scipy import integrate, special, stats
 from torch.distributions import Categorical, Independent, MultivariateNormal, Normal
 
-from framework.circular import wrap
-from framework.density import Mixture, circular
+from framework.configuration.schema import build, resolve
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.circular import wrap
+from framework.distributions.density import Mixture, circular
+from framework.distributions.monte_carlo import SampledMixture, estimate
+from framework.distributions.tempering import CircularPower, temper, tempered
 from framework.errors import UserError
-from framework.monte_carlo import SampledMixture, estimate
-from framework.rearranged import Reshaped, Stacked
-from framework.schema import build, resolve
 from framework.target import Target
-from framework.temper import CircularPower, temper, tempered
 from framework.testing.metrics import Cardioid
 from framework.testing.quadrature import cells
 

@@ -22,12 +22,20 @@ import pytest
 import sqlalchemy
 from werkzeug.serving import make_server
 
-from framework import sender, tracking
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
-from framework.journal import Journal
-from framework.run_info import RunInfo, Sidecar, default_uri, read_run_info, store_uri, without_password
-from framework.sender import Record, Sender, Store, batches
-from framework.tracking import MlflowTracker, NoTracker, mark_dead, sync
+from framework.tracking import sender
+from framework.tracking import tracker as tracking
+from framework.tracking.journal import Journal
+from framework.tracking.run_info import (
+    RunInfo,
+    Sidecar,
+    default_uri,
+    read_run_info,
+    store_uri,
+    without_password,
+)
+from framework.tracking.sender import Record, Sender, Store, batches
+from framework.tracking.tracker import MlflowTracker, NoTracker, mark_dead, sync
 
 
 @contextmanager
@@ -45,8 +53,8 @@ def metadata_read_as_before() -> Iterator[None]:
 with metadata_read_as_before():
     from mlflow import MlflowClient
 
-    from framework import mlflow_store
-    from framework.mlflow_store import run_folder
+    from framework.tracking import mlflow_store
+    from framework.tracking.mlflow_store import run_folder
 
 
 @pytest.fixture(scope="session")
@@ -631,8 +639,8 @@ def test_a_store_that_does_not_answer_does_not_hold_up_the_start(
 DYING = """
 import os, signal, sys, time
 from pathlib import Path
-from framework import run_info
-from framework.tracking import MlflowTracker
+from framework.tracking import run_info
+from framework.tracking.tracker import MlflowTracker
 
 tracker = MlflowTracker(
     Path(sys.argv[1]), uri=None, experiment="some/experiment", run_name="r", parent=None, run_id=None
@@ -894,8 +902,8 @@ def test_four_processes_begin_at_once_where_there_is_no_store(tmp_path: Path) ->
     program = """
 import os, sys
 from pathlib import Path
-import framework.mlflow_store
-from framework.tracking import MlflowTracker, read_run_info
+import framework.tracking.mlflow_store
+from framework.tracking.tracker import MlflowTracker, read_run_info
 
 children = []
 for number in range(4):
@@ -960,7 +968,7 @@ def test_nobody_else_touches_a_living_run(folder: Path) -> None:
     program = """
 import sys
 from pathlib import Path
-from framework import tracking
+from framework.tracking import tracker as tracking
 
 for act in (
     tracking.sync,
@@ -1096,7 +1104,7 @@ def test_run_json_that_cannot_be_written_stops_nobody(
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("framework.run_info.write_atomically", full)
+    monkeypatch.setattr("framework.tracking.run_info.write_atomically", full)
     log(tracker, range(5))
     tracker.close("FINISHED")
     assert history(folder) == losses(range(5))
@@ -1141,7 +1149,7 @@ def test_a_run_without_checkpoints_is_said(folder: Path) -> None:
 
 def test_nothing_heavy_is_imported_before_a_store_is_opened() -> None:
     program = (
-        "import sys, framework.journal, framework.tracking, framework.provenance\n"
+        "import sys, framework.tracking.journal, framework.tracking.tracker, framework.runs.provenance\n"
         "assert not {'mlflow', 'torch', 'pytorch_lightning', 'sqlalchemy', 'numpy'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

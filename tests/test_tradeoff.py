@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from framework.landscape_picture import POINTS, Plane, half_width, landscapes, probabilities
+from framework.evaluation.tradeoff import Turn, owners, rows, tradeoff
 from framework.model import Model
-from framework.schema import build, resolve
+from framework.reports.landscape_picture import POINTS, Plane, half_width, landscapes, probabilities
+from framework.reports.tradeoff_picture import tradeoff as drawn
 from framework.target import Target
-from framework.tradeoff import Turn, owners, rows, tradeoff
-from framework.tradeoff_picture import tradeoff as drawn
 
 TARGET = Target("class", ("a", "b"))
 

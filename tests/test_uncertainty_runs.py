@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import framework as package
-from framework.assembly import build_outliers, resolve_all
-from framework.density import Mixture
+from framework.configuration.assembly import build_outliers, resolve_all
+from framework.configuration.schema import build, resolve
+from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.modes.combine import common, found, joined
-from framework.schema import build, resolve
 from tests.conftest import Done, Framework, listed
 
 SMALL = [

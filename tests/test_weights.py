@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from framework.errors import CheckpointError, ConfigError
-from framework.weights import fill_from_file, read_weights
+from plugins.encoder.inception_resnet_v2.weights import fill_from_file, read_weights
 
 
 def network():
@@ -82,7 +82,7 @@ def test_half_precision_is_widened_and_a_missing_counter_is_no_fault(tmp_path):
 def test_the_classifier_is_left_out_and_said_to_be(tmp_path, caplog):
     file = tmp_path / "weights.pth"
     torch.save(state() | {"classif.weight": torch.zeros(1000, 4)}, file)
-    with caplog.at_level("INFO", "framework.weights"):
+    with caplog.at_level("INFO", "plugins.encoder.inception_resnet_v2.weights"):
         fill_from_file(network(), str(file), ignored=("classif.",))
     assert "ignored classif.weight" in caplog.text
 

@@ -15,12 +15,11 @@ from torch import Tensor
 from torch.distributions import Independent, Normal
 
 from framework.data import Batch
-from framework.density import Mixture
 from framework.density_head import DensityHead
+from framework.distributions.density import Mixture
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from framework.model import Model
-from framework.work_precision import (
+from framework.evaluation.work_precision import (
     Point,
     Reference,
     estimate,
@@ -32,6 +31,7 @@ from framework.work_precision import (
     work_precision,
     write,
 )
+from framework.model import Model
 
 CPU = torch.device("cpu")
 

@@ -6,9 +6,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from framework.composition import plain
+from framework.configuration.composition import plain
+from framework.configuration.settings import settings
 from framework.errors import ConfigError, did_you_mean
-from framework.settings import settings
 
 MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
 
@@ -38,8 +38,8 @@ def run(config: DictConfig) -> float | None:
 
 def _stored(folder: Path, overrides: list[str]) -> tuple[dict[str, Any], list[str]]:
     """The config and overrides the run in `folder` was started with: resuming changes neither."""
-    from framework.run import stored_config, stored_overrides
-    from framework.run_info import read_run_info
+    from framework.runs.run import stored_config, stored_overrides
+    from framework.tracking.run_info import read_run_info
 
     others = [item for item in overrides if not item.startswith("resume=")]
     if others:

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from framework.configuration.settings import Settings
 from framework.errors import ConfigError, UserError
-from framework.settings import Settings
-from framework.table import csv
+from framework.reports.table import csv
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
 from framework.testing.finding import Finding
 

@@ -8,19 +8,19 @@ import torch
 from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
-from framework.assembly import build_metrics, build_outliers, build_predictor, citations
-from framework.batches import Batches, seed_step
+from framework.configuration.assembly import build_metrics, build_outliers, build_predictor, citations
+from framework.configuration.schema import check, resolve
+from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
-from framework.evaluation import on_device
-from framework.loading import description, load_with_description
+from framework.evaluation.splits import on_device
 from framework.model import Preceded, Predictor
 from framework.modes.test import data_for
 from framework.modes.train import quiet, record_citations, save_model
-from framework.report import report_test
-from framework.run import Run, opened
-from framework.schema import check, resolve
-from framework.settings import Settings
+from framework.reports.report import report_test
+from framework.runs.loading import description, load_with_description
+from framework.runs.run import Run, opened
+from framework.training.batches import Batches, seed_step
 from framework.uncertainty import Joining
 
 

@@ -14,16 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 from torch import Tensor
 
-from framework.assembly import citations
-from framework.batches import Batches
+from framework.configuration.assembly import citations
+from framework.configuration.schema import build, check, resolve
+from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
-from framework.journal import write_atomically
 from framework.modes.train import record_citations
-from framework.run import opened
-from framework.schema import build, check, resolve
-from framework.settings import Settings
+from framework.runs.run import opened
+from framework.tracking.journal import write_atomically
+from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
 """What stands beside the parts: what was computed, and of which files, a line each."""

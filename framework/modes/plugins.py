@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from framework.registry import GROUPS, describe, installed
-from framework.settings import Settings
+from framework.configuration.registry import GROUPS, describe, installed
+from framework.configuration.settings import Settings
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:

@@ -11,16 +11,16 @@ from rich.console import Console
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from framework.batches import as_batch, seed_step
-from framework.circular import wrap
+from framework.configuration.settings import Settings
 from framework.data import Data
+from framework.distributions.circular import wrap
 from framework.errors import DataError
 from framework.model import Predictor
 from framework.modes.test import loaded
 from framework.prediction import Prediction
-from framework.run import opened
-from framework.settings import Settings
+from framework.runs.run import opened
 from framework.target import Target
+from framework.training.batches import as_batch, seed_step
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:

@@ -5,9 +5,9 @@ from typing import Any
 
 from rich.console import Console
 
+from framework.configuration.settings import Settings
 from framework.errors import ConfigError
-from framework.settings import Settings
-from framework.tracking import sync
+from framework.tracking.tracker import sync
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:

@@ -6,17 +6,23 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from framework.assembly import build_data, build_metrics, build_outliers, citations, require_outliers
-from framework.batches import Batches
+from framework.configuration.assembly import (
+    build_data,
+    build_metrics,
+    build_outliers,
+    citations,
+    require_outliers,
+)
+from framework.configuration.schema import resolve
+from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
-from framework.loading import load_with_description
 from framework.model import Predictor
 from framework.modes.train import describe_data, record_citations
-from framework.report import report_test
-from framework.run import Run, opened
-from framework.schema import resolve
-from framework.settings import Settings
+from framework.reports.report import report_test
+from framework.runs.loading import load_with_description
+from framework.runs.run import Run, opened
+from framework.training.batches import Batches
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:

@@ -14,7 +14,7 @@ import torch
 from pytorch_lightning.callbacks import EarlyStopping, RichProgressBar
 from rich.console import Console
 
-from framework.assembly import (
+from framework.configuration.assembly import (
     Resolved,
     build_data,
     build_metrics,
@@ -24,20 +24,20 @@ from framework.assembly import (
     citations,
     resolve_all,
 )
-from framework.batches import Batches, seed_step
-from framework.checkpoint import WholeCheckpoints, latest_good, read
+from framework.configuration.settings import TRAINER_OURS, Settings, check_trainer_keys
 from framework.data import Data
-from framework.encoded import Encoded, fits
 from framework.errors import ConfigError
-from framework.evaluation import on_device
-from framework.fitting import fit_at_once, fitted_models, mean_loss
-from framework.loading import PREFIX, description, fill, weights
+from framework.evaluation.splits import on_device
 from framework.model import Preceded, Predictor
-from framework.report import report_test, report_training
-from framework.run import Run, opened
-from framework.settings import TRAINER_OURS, Settings, check_trainer_keys
-from framework.sweep import RECORD, leave_value
-from framework.training import KeepCheckpoints, Report, StopAtBatch, Training
+from framework.reports.report import report_test, report_training
+from framework.runs.loading import PREFIX, description, fill, weights
+from framework.runs.run import Run, opened
+from framework.sweeps.jobs import RECORD, leave_value
+from framework.training.batches import Batches, seed_step
+from framework.training.cached_features import Encoded, fits
+from framework.training.checkpoint import WholeCheckpoints, latest_good, read
+from framework.training.fitting import fit_at_once, fitted_models, mean_loss
+from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
 
 TRAINED = {"last.ckpt", "previous.ckpt", "best.ckpt"}
 """Checkpoints that training can go on from; model.ckpt holds weights alone."""

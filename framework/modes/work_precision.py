@@ -8,21 +8,21 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
-from framework.assembly import build_metrics
-from framework.batches import Batches
+from framework.configuration.assembly import build_metrics
+from framework.configuration.schema import check
+from framework.configuration.settings import Positive, Settings
 from framework.data import Batch, Data
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
-from framework.evaluation import on_device
+from framework.evaluation.splits import on_device
+from framework.evaluation.work_precision import COLUMNS, rows, work_precision, write
 from framework.model import Model, Predictor
 from framework.modes.test import loaded
-from framework.report import picture
-from framework.run import Run, opened
-from framework.schema import check
-from framework.settings import Positive, Settings
-from framework.table import results_table
+from framework.reports.report import picture
+from framework.reports.table import results_table
+from framework.runs.run import Run, opened
+from framework.training.batches import Batches
 from framework.uncertainty import Uncertainty
-from framework.work_precision import COLUMNS, rows, work_precision, write
 
 
 class _Options(BaseModel):
@@ -44,7 +44,7 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
 
 
 def _run(run: Run, options: _Options) -> None:
-    from framework import pictures
+    from framework.reports import pictures
 
     predictor, data, described = loaded(run)
     if options.metrics is not None or not isinstance(predictor, Model):
@@ -107,7 +107,8 @@ def _metrics_against_time(
     run: Run, options: _Options, predictor: Predictor, data: Data, described: dict[str, Any]
 ) -> None:
     """The metrics of the test split themselves, where there is no reference to be off from: of wrappers, say."""
-    from framework import tradeoff, tradeoff_picture
+    from framework.evaluation import tradeoff
+    from framework.reports import tradeoff_picture
 
     config = described["config"]
     metrics = [metric for metric in build_metrics(config, data.target) if "outliers" not in metric.splits]

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from framework.clouds import pad
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
+from framework.geometry.clouds import pad
 from framework.testing.finding import SEED, Worst
 
 Make = Callable[[], Encoder]

@@ -6,9 +6,9 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from framework.configuration.registry import load
+from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from framework.registry import load
-from framework.schema import build, resolve
 from framework.target import Target
 from framework.testing.finding import Finding
 from framework.testing.rows import EncoderRow, HeadRow, MetricRow, ObjectiveRow, RendererRow, WrapperRow

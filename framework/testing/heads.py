@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.density import Circular, Mixture, median
 from framework.density_head import DensityHead, Fitted
+from framework.distributions.density import Circular, Mixture, median
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import HeadRow
@@ -201,7 +201,7 @@ def _round_trip(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
-    """framework.density.Mixture with one component, which every wrapper and mixture returns."""
+    """framework.distributions.density.Mixture with one component, which every wrapper and mixture returns."""
     head, raw, value = subject.make(), subject.raws(4), subject.values(4)
     with torch.no_grad():
         found = {}

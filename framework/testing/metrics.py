@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution, MultivariateNormal, constraints
 
-from framework.density import circular, marginal, median, pick, take
+from framework.distributions.density import circular, marginal, median, pick, take
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target

@@ -8,10 +8,10 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.data import Batch
+from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError
 from framework.model import Predictor, each_alone
 from framework.objective import Objective
-from framework.rearranged import Stacked
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.camera import Camera, look_from
+from framework.geometry.camera import Camera, look_from
 from framework.renderer import Renderer, Scene
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import RendererRow

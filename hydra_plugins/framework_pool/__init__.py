@@ -1,4 +1,4 @@
-"""Hydra's way to `framework.sweep`. Hydra imports this at every start: nothing heavy here."""
+"""Hydra's way to `framework.sweeps.jobs`. Hydra imports this at every start: nothing heavy here."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -11,7 +11,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from framework import sweep
+from framework.sweeps import jobs as sweep
 
 _OF_THE_SWEEP = (
     "hydra/launcher",
@@ -24,7 +24,7 @@ _OF_THE_SWEEP = (
 
 
 class PoolLauncher(Launcher):
-    """Runs each job of a multirun as a process of its own, several at once; `framework.sweep` says how.
+    """Runs each job of a multirun as a process of its own, several at once; `framework.sweeps.jobs` says how.
 
     Args:
         jobs: how many at once; None is half the cores.

@@ -98,7 +98,7 @@ class RandomSearch(Sweeper):
     ) -> None:
         from hydra_plugins.framework_random_search import _best
 
-        comparison = import_module("framework.comparison")
+        comparison = import_module("framework.sweeps.comparison")
         trials = [
             comparison.Trial(
                 folder=_folder(one),

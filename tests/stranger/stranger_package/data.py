@@ -7,12 +7,12 @@ from typing import Annotated
 
 import numpy as np
 import torch
+from framework.fields import Fields
 from pydantic import Field
 from torch import Tensor
 
 from framework.data import Batch, Data
 from framework.errors import DataError
-from framework.fields import Fields
 from framework.target import Target
 
 

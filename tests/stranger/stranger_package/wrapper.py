@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, ClassVar
 
 import torch
+from framework.density import Mixture
 from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.data import Batch
-from framework.density import Mixture
 from framework.model import Predictor
 from framework.uncertainty import Uncertainty
 

@@ -1,0 +1,1 @@
+"""What uncertainty wrappers and objectives of several families share."""

@@ -1,0 +1,1 @@
+"""From names to built parts: registry, schema, settings, composition, assembly."""

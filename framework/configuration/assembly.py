@@ -1,0 +1,172 @@
+"""Builds the parts of the density road from a config: data, predictor, objectives, metrics."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from framework.configuration.registry import GROUPS, installed, load
+from framework.configuration.schema import build, parts, resolve
+from framework.data import Data
+from framework.density_head import DensityHead
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+from framework.metric import Metric
+from framework.model import Model, Preceded, Predictor
+from framework.objective import Objective
+from framework.target import Target
+
+Resolved = dict[str, Any]
+"""Every plugin of a run with every parameter written out: plain values, by group; lists for plural groups."""
+
+
+def resolve_all(config: Mapping[str, Any]) -> Resolved:
+    """Check every plugin of a composed config before any data is read.
+
+    Raises:
+        ConfigError: a part of the road is missing, or a plugin's name, key or value is wrong.
+    """
+    for group in ("data", "density_head", "encoder"):
+        if not config.get(group):
+            raise ConfigError(
+                f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
+                f"or one of the installed: {group}={'|'.join(installed(group))}."
+            )
+    resolved: Resolved = {
+        "data": resolve("data", config["data"]),
+        "density_head": resolve("density_head", config["density_head"]),
+    }
+    for group in ("encoder", "uncertainty", "objective", "metric"):
+        chosen = config.get(group) or {}
+        resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
+    outliers = config.get("outliers")
+    resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
+    require_outliers(resolved)
+    return resolved
+
+
+def require_outliers(resolved: Resolved) -> None:
+    """Refuse metrics of outliers without outliers.
+
+    Raises:
+        ConfigError: a metric reads outliers and none are configured.
+    """
+    wanting = reading_outliers(resolved)
+    if wanting and not resolved.get("outliers"):
+        raise ConfigError(
+            f"metric {wanting[0]} compares the test split with outliers, but none are chosen. Name their data set, "
+            f"e.g. `data@outliers={resolved['data']['name']} outliers.<key>=...`, or leave this metric out."
+        )
+
+
+def reading_outliers(resolved: Resolved) -> list[str]:
+    """Names of the metrics that read predictions on outliers."""
+    return [part["name"] for part in resolved["metric"] if "outliers" in load("metric", part["name"]).splits]
+
+
+def build_outliers(resolved: Resolved, data: Data) -> Data | None:
+    """The data set of the outliers, prepared; None where no metric reads it.
+
+    Raises:
+        ConfigError: its inputs are not of the shape of `data`, which is prepared.
+        DataError: as `Data.prepare`.
+    """
+    if not reading_outliers(resolved):
+        return None
+    outliers: Data = build("data", resolved["outliers"])
+    outliers.prepare()
+    if outliers.input_shape != data.input_shape:
+        raise ConfigError(
+            f"outliers={resolved['outliers']['name']} has inputs of shape {outliers.input_shape}, the data "
+            f"{resolved['data']['name']} of shape {data.input_shape}; wanted one shape. Set the size of either."
+        )
+    return outliers
+
+
+def build_data(resolved: Resolved) -> Data:
+    """The data set, not yet prepared."""
+    return build("data", resolved["data"])
+
+
+def build_predictor(
+    resolved: Resolved,
+    target: Target,
+    input_shape: tuple[int, ...],
+    seed: int,
+    columns: tuple[str, ...] = (),
+) -> Predictor:
+    """The untrained predictor; its initial weights are a function of `seed` and the config.
+
+    Encoders with fixed features, as many as stand first, are outside what the wrappers of `uncertainty` wrap.
+    """
+    torch.manual_seed(seed)
+    parts = list(resolved["encoder"])
+    fixed: list[Encoder] = []
+    ready: list[Encoder] = []  # built already, for the first model
+    shape, names = input_shape, columns
+    while parts:
+        encoder: Encoder = build("encoder", parts[0], input_shape=shape, input_columns=names)
+        if not encoder.fixed:
+            ready.append(encoder)
+            break
+        fixed.append(encoder)
+        shape, names = encoder.output_shape, ()
+        del parts[0]
+
+    def model() -> Predictor:
+        encoders: list[Encoder] = []
+        inner, called = shape, names
+        for part in parts:
+            built = ready.pop() if ready else build("encoder", part, input_shape=inner, input_columns=called)
+            encoders.append(built)
+            inner, called = encoders[-1].output_shape, ()
+        head: DensityHead = build("density_head", resolved["density_head"], target=target)
+        return Model(encoders, head, inner)
+
+    factory: Callable[[], Predictor] = model
+    for part in resolved["uncertainty"]:
+        factory = _wrapped(part, factory, target)
+    return Preceded(fixed, factory()) if fixed else factory()
+
+
+def _wrapped(
+    part: Mapping[str, Any], inner: Callable[[], Predictor], target: Target
+) -> Callable[[], Predictor]:
+    return lambda: build("uncertainty", part, model=inner, target=target)
+
+
+def build_objectives(resolved: Resolved) -> Sequence[Objective]:
+    """The extra terms of the training loss; none by default."""
+    return [build("objective", part) for part in resolved["objective"]]
+
+
+def build_metrics(resolved: Resolved, target: Target) -> list[Metric]:
+    """Fresh metrics, in the order asked for."""
+    return [build("metric", part, target=target) for part in resolved["metric"]]
+
+
+def citations(resolved: Resolved) -> dict[str, str]:
+    """BibTeX of every plugin used, parts of parts included, keyed 'group name'."""
+    found: dict[str, str] = {}
+
+    def visit(group: str, part: Mapping[str, Any]) -> None:
+        cls = load(group, part["name"])
+        bibtex = str(getattr(cls, "bibtex", "")).strip()
+        if bibtex:
+            found[f"{group} {part['name']}"] = bibtex
+        for key, inner in parts(cls).items():
+            for item in _items(part.get(key)):
+                visit(inner.group, item)
+
+    for group in GROUPS:
+        for part in _items(resolved.get(group)):
+            visit(group, part)
+    for part in _items(resolved.get("outliers")):
+        visit("data", part)
+    return found
+
+
+def _items(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return list(value) if isinstance(value, list | tuple) else [value]

@@ -1,0 +1,135 @@
+"""Composes a config with Hydra, and turns what Hydra says of a mistake into one sentence."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, MissingConfigException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from framework.configuration.registry import config_folders
+from framework.errors import ConfigError, did_you_mean
+
+PLURAL = ("encoder", "uncertainty", "objective", "metric")
+"""Groups of which an experiment may choose several; their configs are keyed by name."""
+
+
+def folder() -> Path:
+    """The project's own conf/: inside the package in a wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parent.parent
+    for candidate in (package / "conf", package.parent / "conf"):
+        if (candidate / "config.yaml").is_file():
+            return candidate
+    raise ConfigError("conf/config.yaml is missing from this installation. Reinstall the package.")
+
+
+class PluginConfigs(SearchPathPlugin):
+    """Appends the config folders of installed plugins after the project's own, which therefore win."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for name, path in config_folders().items():
+            search_path.append(provider=name, path=f"file://{path}")
+
+
+def register() -> None:
+    """Make plugin configs known to Hydra; call before composing. Twice is harmless."""
+    config_folders()  # a clash is said here, not from inside Hydra
+    Plugins.instance().register(PluginConfigs)
+    OmegaConf.register_new_resolver("first", lambda *values: next(filter(None, values)), replace=True)
+
+
+def refuse_logging_overrides(arguments: list[str]) -> None:
+    """Hydra's logging configs go to logging.config.dictConfig, which calls what they name; keep them ours.
+
+    Raises:
+        ConfigError: an argument chooses or changes one.
+    """
+    for argument in arguments:
+        key = argument.lstrip("+~").partition("=")[0]
+        if key.replace(".", "/").startswith(("hydra/job_logging", "hydra/hydra_logging", "hydra/callbacks")):
+            raise ConfigError(
+                f"{argument}: refused, since Hydra's logging and callback configs can run code. "
+                "Set the level with hydra.verbose=true instead."
+            )
+
+
+def swept_with_experiment(arguments: list[str]) -> list[str]:
+    """The arguments of a sweep over experiments, single values written as sweeps of one.
+
+    Hydra first composes what is not swept, by itself: `data.x=1` beside `experiment=a,b` would meet a config in which
+    no data is chosen yet.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return arguments
+    overrides = [
+        argument for argument in arguments if "=" in argument and not argument.startswith(("-", "~"))
+    ]
+    try:
+        parsed = dict(zip(overrides, OverridesParser.create().parse_overrides(overrides), strict=True))
+    except HydraException:
+        return arguments  # Hydra itself will say what is wrong
+    if not any(one.key_or_group == "experiment" and one.is_sweep_override() for one in parsed.values()):
+        return arguments
+
+    def written(argument: str) -> str:
+        one = parsed.get(argument)
+        if one is None or one.is_sweep_override() or (one.key_or_group or "").startswith("hydra"):
+            return argument
+        key, _, value = argument.partition("=")
+        return f"{key}=choice({value})" if value else argument
+
+    return [written(argument) for argument in arguments]
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """The composed config as plain values, interpolations resolved; leftovers of replaced choices dropped.
+
+    An experiment that tunes `encoder.a` and is run with `encoder=b` leaves an `encoder.a` without a name.
+    """
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    for group in PLURAL:
+        chosen = values.get(group) or {}
+        values[group] = {
+            key: part for key, part in chosen.items() if isinstance(part, Mapping) and "name" in part
+        }
+    return {str(key): value for key, value in values.items()}
+
+
+def _options(group: str) -> list[str]:
+    """Every config of a group, sub-folders included, ours and the plugins'."""
+    roots = [folder(), *config_folders().values()]
+    found = {path.relative_to(root / group) for root in roots for path in (root / group).rglob("*.yaml")}
+    return sorted(str(path.with_suffix("")) for path in found)
+
+
+def sentence(error: BaseException) -> str | None:
+    """A composition error of Hydra or OmegaConf as one sentence with a suggestion; None for any other error."""
+    if isinstance(error, MissingConfigException):
+        wanted = error.missing_cfg_file or ""
+        group, _, name = wanted.partition("/")
+        options = [str(option) for option in error.options or ()] or _options(group)
+        available = f" Available in {group}: {', '.join(options)}." if options else ""
+        return f"No configuration {wanted!r}.{did_you_mean(name, options)}{available}"
+    if isinstance(error, ValueError) and "Config group override must be" in str(error):
+        return (
+            "A group cannot be set to null. Take it out with `~`, e.g. `~data@outliers` or `~density_head`."
+        )
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, OmegaConfBaseException):
+        cause = cause.__cause__ or cause.__context__
+    if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
+        known = [str(key) for key in cause.parent_node]
+        if "not in" in str(cause):
+            return (
+                f"{cause.full_key}: unknown key.{did_you_mean(str(cause.key), known)} Known keys: "
+                f"{', '.join(known)}. (+{cause.full_key}=... adds one the plugin knows but its yaml does not show.)"
+            )
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return str(error).split("\n\nSet the environment")[0].split("\nSee https://hydra.cc")[0]
+    return None

@@ -1,0 +1,326 @@
+"""Images on the way to a network: reading files, square crops, data sets of crops, augmentation, pictures."""
+
+import math
+import os
+import struct
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped, UInt8
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+from rich.console import Console
+from rich.progress import Progress
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.datasets.fields import Fields
+from framework.errors import DataError
+
+READERS = min(8, os.cpu_count() or 1)
+"""Threads that decode at once."""
+IN_MEMORY = 2 * 2**30
+"""Bytes of crops up to which they are kept in memory."""
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in pixels from the outer corner: (0, 0, width, height) is the whole image."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A square to be cut out of an image file.
+
+    Attributes:
+        file: where the image is.
+        box: what to show, in the middle of the square; None: the whole image.
+        margin: what to add on each side, as a share of the box's longer side.
+        side: of the result, pixels.
+        channels: 3 for colour, 1 for grey.
+        upright: turn the image as its EXIF entry says, as photo viewers do.
+        blur: standard deviation of a Gaussian the result is blurred with, pixels of the result; 0: none.
+    """
+
+    file: Path
+    box: Box | None
+    margin: float
+    side: int
+    channels: int = 3
+    upright: bool = False
+    blur: float = 0.0
+
+    def read(self) -> UInt8[Tensor, "channels side side"]:
+        """The pixels.
+
+        Raises:
+            DataError: the file is missing, is no image, is cut short, or the box lies outside the image.
+        """
+        with opened(self.file) as raw:
+            image = _plain(raw, self.channels, upright=self.upright)
+        whole = (0.0, 0.0, float(image.width), float(image.height))
+        pixels = square(image, self.box or whole, self.margin, self.side)
+        if pixels is None:
+            raise self._outside(image.size)
+        return blurred(torch.from_numpy(pixels), self.blur)
+
+    def check(self) -> None:
+        """Look at the file's header only.
+
+        Raises:
+            DataError: the file is missing, is no image, or the box lies outside the image.
+        """
+        with opened(self.file) as image:
+            if self.box is not None and clipped(self.box, image.size) is None:
+                raise self._outside(image.size)
+
+    def _outside(self, size: tuple[int, int]) -> DataError:
+        return DataError(
+            f"{self.file}: the box {self.box} lies outside the image of {size[0]} x {size[1]} pixels; "
+            "wanted left < right and top < bottom within it. Mend the annotation."
+        )
+
+
+@contextmanager
+def opened(file: Path) -> Iterator[Image.Image]:
+    """An image file for the time of decoding it.
+
+    Raises:
+        DataError: the file is missing, is no image, or is cut short; names it.
+    """
+    try:
+        with Image.open(file) as image:
+            yield image
+    except FileNotFoundError:
+        raise DataError(f"{file}: no such file; wanted an image. Mend the path, or restore it.") from None
+    except (OSError, SyntaxError, ValueError, IndexError, TypeError, struct.error, EOFError) as error:
+        # what Pillow's decoders raise on damaged files
+        raise DataError(
+            f"{file}: cannot be read as an image ({error}). Restore it from its source."
+        ) from error
+    except Image.DecompressionBombError as error:
+        raise DataError(f"{file}: {error}. Scale the image down.") from error
+
+
+def _plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
+    """Decoded to RGB or grey with eight bits, whatever it was stored as; the transparent becomes white."""
+    whole = ImageOps.exif_transpose(image) if upright else image
+    if whole.mode == "F":
+        raise ValueError("its pixels are floating-point numbers of unknown range; wanted 8 or 16 bits")
+    if whole.mode.startswith("I"):
+        whole = Image.fromarray((np.asarray(whole).clip(0, 65535) // 257).astype(np.uint8))
+    if "transparency" in whole.info or whole.mode in ("LA", "PA", "RGBA"):
+        whole = Image.alpha_composite(Image.new("RGBA", whole.size, "white"), whole.convert("RGBA"))
+    return whole.convert("RGB" if channels == 3 else "L")
+
+
+def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
+    """The square around a box, (channels, side, side), low-pass filtered; None: the box is empty.
+
+    The box is first clipped to the image. Where the square reaches beyond it, border pixels are repeated.
+    """
+    inner = clipped(box, image.size)
+    if inner is None:
+        return None
+    left, top, right, bottom = inner
+    half = (0.5 + margin) * max(right - left, bottom - top)
+    x, y = (left + right) / 2, (top + bottom) / 2
+    # whole pixels around the square, then those of them that exist, then the square within what was cut
+    first_x, first_y, last_x, last_y = (
+        math.floor(x - half),
+        math.floor(y - half),
+        math.ceil(x + half),
+        math.ceil(y + half),
+    )
+    inside = (max(0, first_x), max(0, first_y), min(image.width, last_x), min(image.height, last_y))
+    cut = image.crop(inside)
+    missing = ((inside[1] - first_y, last_y - inside[3]), (inside[0] - first_x, last_x - inside[2]))
+    if any(map(any, missing)):
+        pixels = np.asarray(cut)
+        cut = Image.fromarray(np.pad(pixels, (*missing, (0, 0))[: pixels.ndim], mode="edge"))
+    start_x, start_y = max(0.0, x - half - first_x), max(0.0, y - half - first_y)
+    window = (start_x, start_y, min(cut.width, start_x + 2 * half), min(cut.height, start_y + 2 * half))
+    result = np.asarray(cut.resize((side, side), Image.Resampling.BILINEAR, box=window))
+    return np.array(np.atleast_3d(result).transpose(2, 0, 1), order="C")
+
+
+def clipped(box: Box, size: tuple[int, int]) -> Box | None:
+    """The part of a box within an image of (width, height); None: there is none, or it is not finite."""
+    if not all(map(math.isfinite, box)):
+        return None
+    width, height = map(float, size)
+    left, top, right, bottom = max(0.0, box[0]), max(0.0, box[1]), min(width, box[2]), min(height, box[3])
+    return (left, top, right, bottom) if left < right and top < bottom else None
+
+
+class Crops(Dataset[dict[str, Tensor]]):
+    """Crops that are read when they are asked for, beside fields that are in memory.
+
+    Items raise a DataError where a file cannot be read.
+    """
+
+    def __init__(self, crops: Sequence[Crop], **fields: Tensor) -> None:
+        self.crops = crops
+        self.fields = Fields(**fields)
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        return {"input": self.crops[index].read(), **self.fields[index]}
+
+
+def load(
+    crops: Sequence[Crop], fields: Mapping[str, Tensor], what: str, *, in_memory: bool
+) -> tuple[Fields | Crops, list[DataError]]:
+    """A data set of the crops that can be read ("input", their `fields`, "index"), and the others' faults.
+
+    In memory everything is decoded now. Otherwise only the files' headers are read, and damage further on
+    shows when a crop is used. A progress bar says that `what` is read, on a terminal.
+    """
+    faults: dict[int, DataError] = {}
+    shape = (len(crops), crops[0].channels, crops[0].side, crops[0].side) if crops and in_memory else (0,)
+    pixels = torch.empty(shape, dtype=torch.uint8)
+
+    def visit(index: int) -> None:
+        try:
+            if in_memory:
+                pixels[index] = crops[index].read()
+            else:
+                crops[index].check()
+        except DataError as error:
+            faults[index] = error
+
+    with (
+        Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar,
+        ThreadPoolExecutor(READERS) as readers,
+    ):
+        for _ in bar.track(readers.map(visit, range(len(crops))), len(crops), description=f"Reading {what}"):
+            pass
+    good = [index for index in range(len(crops)) if index not in faults]
+    kept = {name: field[good] if faults else field for name, field in fields.items()}
+    kept["index"] = torch.arange(len(good))
+    reasons = [faults[index] for index in sorted(faults)]
+    if in_memory and good:
+        return Fields(input=pixels[good] if faults else pixels, **kept), reasons
+    return Crops([crops[index] for index in good], **kept), reasons
+
+
+def unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
+    """A user's own images, "input" and "index", in their order.
+
+    Raises:
+        DataError: there are none, or some cannot be read; names the first ten.
+    """
+    if not crops:
+        raise DataError("No image file was given; wanted at least one.")
+    in_memory = fit_in_memory(len(crops), crops[0].side, crops[0].channels)
+    table, faults = load(crops, {}, "images", in_memory=in_memory)
+    if faults:
+        raise DataError(fault_message(faults, len(crops), "Leave them out, or restore them."))
+    return table
+
+
+def fit_in_memory(crops: int, side: int, channels: int) -> bool:
+    return crops * channels * side**2 <= IN_MEMORY
+
+
+def fault_message(faults: Sequence[DataError], total: int, remedy: str) -> str:
+    """How many samples cannot be read, at most ten of the reasons, and what to do."""
+    return f"{len(faults)} of {total} samples cannot be read:{listed(faults)}\n{remedy}"
+
+
+def listed(items: Sequence[object]) -> str:
+    """At most ten of the items, each on a line of its own, and how many more there are."""
+    lines = [str(item) for item in items[:10]]
+    if len(items) > 10:
+        lines.append(f"and {len(items) - 10} more")
+    return "".join(f"\n  {line}" for line in lines)
+
+
+def augmented(
+    images: Shaped[Tensor, "batch channels height width"], mirrored: Bool[Tensor, "batch"], jitter: float
+) -> Float[Tensor, "batch channels height width"]:
+    """Images varied at random, values 0…1, on their device.
+
+    Those `mirrored` names are reflected left to right. Every image is shifted and scaled by up to `jitter` of
+    its side (linear interpolation, border pixels repeated), made brighter or darker by up to `jitter`, and
+    its contrast changed by up to twice that. Random numbers come from torch's global CPU generator.
+    """
+    batch, _, height, width = images.shape
+    amount = (2 * torch.rand(5, batch) - 1) * jitter
+    scale = amount[0].exp()
+    sign = 1 - 2 * mirrored.to("cpu", torch.float32)
+    rows = _positions(height, scale, amount[1] * height).to(images.device)
+    columns = _positions(width, sign * scale, amount[2] * width).to(images.device)
+    # Whole lines are copied fastest: columns are interpolated as rows of the transposed image.
+    image = _interpolated(images.transpose(2, 3), columns)
+    image = _interpolated(image.transpose(2, 3), rows)
+
+    full = 1.0 if images.is_floating_point() else 255.0
+    contrast, brightness = (2 * amount[3]).exp(), amount[4]
+    gain, offset = contrast / full, 0.5 - 0.5 * contrast + brightness
+    return image.mul_(gain.view(-1, 1, 1, 1).to(image)).add_(offset.view(-1, 1, 1, 1).to(image)).clamp_(0, 1)
+
+
+def _positions(length: int, scale: Tensor, shift: Tensor) -> Float[Tensor, "batch length"]:
+    """Where each of `length` pixels comes from: scaled about the middle, kept within the image."""
+    middle = (length - 1) / 2
+    offset = torch.arange(length, dtype=torch.float32) - middle
+    return (middle + shift[:, None] + scale[:, None] * offset).clamp(0, length - 1)
+
+
+def _interpolated(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor:
+    """Each image's lines at fractional `rows`, as float32."""
+    batch, channels, height, width = images.shape
+    lines = images.reshape(-1, width)
+    plane = height * torch.arange(batch * channels, device=images.device).view(batch, channels, 1)
+    first = rows.long()
+    second = (first + 1).clamp(max=height - 1)
+    above, below = (
+        lines.index_select(0, (plane + row[:, None]).view(-1)).view(images.shape).float()
+        for row in (first, second)
+    )
+    return above.lerp_(below, (rows - first)[:, None, :, None])
+
+
+def blurred(
+    images: Shaped[Tensor, "*batch height width"], deviation: float
+) -> Shaped[Tensor, "*batch height width"]:
+    """Images convolved with a Gaussian of standard deviation `deviation` pixels, 0 or more; 0: the images themselves.
+
+    The kernel ends at four deviations and sums to 1; beyond the border the image is mirrored about its edge
+    (d c b a | a b c d | d c b a). The result has the images' type; whole numbers are rounded.
+    """
+    if deviation == 0:
+        return images
+    exact = images if images.is_floating_point() else images.float()
+    height, width = images.shape[-2:]
+    down = _smoothing(height, deviation).to(exact)
+    across = _smoothing(width, deviation).to(exact)
+    smooth = down @ exact @ across.mT  # separable: G(x, y) = g(x) g(y)
+    return smooth if images.is_floating_point() else smooth.round_().to(images.dtype)
+
+
+def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
+    """The Gaussian filter of a line of `length` pixels as a matrix, float64."""
+    reach = int(4 * deviation + 0.5)
+    offsets = torch.arange(-reach, reach + 1)
+    weights = (-0.5 * (offsets.double() / deviation).square()).exp()
+    # Mirrored about its edges again and again, a line repeats after twice its length.
+    source = (torch.arange(length)[:, None] + offsets) % (2 * length)
+    source = torch.minimum(source, 2 * length - 1 - source)
+    matrix = torch.zeros(length, length, dtype=torch.float64)
+    return matrix.scatter_add_(1, source, (weights / weights.sum()).expand(length, -1))
+
+
+def picture(image: Tensor) -> NDArray[np.uint8]:
+    """One image (channels, height, width), uint8 or float in 0…1, as (height, width, 3) uint8."""
+    pixels = image.detach().cpu()
+    if pixels.is_floating_point():
+        pixels = (255 * pixels.clamp(0, 1)).round().to(torch.uint8)
+    return pixels.expand(3, -1, -1).permute(1, 2, 0).contiguous().numpy()

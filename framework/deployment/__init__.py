@@ -1,0 +1,1 @@
+"""Frozen models: one CPU core, no gradient, nothing that only training needs."""

@@ -1,0 +1,151 @@
+"""The deployable form of a trained model: one CPU core, no gradient, nothing that only training needs.
+
+What a model computes from features to raw numbers is read off its own graph (torch.export), so that no encoder has to
+say what it is made of. Where that is fully connected layers, batch norm is folded into the weights beside it, dropout
+is gone, and what runs is NumPy and one compiled function. Anything else is run by torch as it is, without gradient.
+"""
+
+import copy
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Categorical, Distribution
+
+from framework.deployment.frozen_network import Layer, Network, read, softmax
+from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.density import median
+from framework.model import Model, Preceded, Predictor
+from framework.runs.loading import load_with_description
+
+
+def freeze(run_or_checkpoint: str | Path, *, uri: str | None = None) -> "Frozen":
+    """The deployable form of a trained model.
+
+    Args:
+        run_or_checkpoint, uri: as of `framework.load`.
+
+    Raises:
+        CheckpointError: as `framework.load`.
+    """
+    predictor, described = load_with_description(run_or_checkpoint, uri=uri)
+    return frozen(predictor, tuple(described["input_shape"]))
+
+
+def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "Frozen":
+    """The deployable form of a predictor, a copy: training it further does not change what was frozen.
+
+    Args:
+        input_shape: of one sample. Needed by a predictor without fixed encoders in front; where it is not given, the
+            first call tells, and takes seconds.
+    """
+    return Frozen(predictor, input_shape)
+
+
+@final
+class Frozen:
+    """Inputs in, numbers out; the predictor's own to 1e-6, in the type of its parameters.
+
+    Attributes:
+        form: what computes them, in words.
+    """
+
+    def __init__(self, predictor: Predictor, input_shape: Sequence[int] | None = None) -> None:
+        self.predictor = copy.deepcopy(predictor).cpu().eval().requires_grad_(False)
+        self.preceded = self.predictor if isinstance(self.predictor, Preceded) else None
+        self.inner = self.predictor if self.preceded is None else self.preceded.predictor
+        floats = (tensor.dtype for tensor in self.predictor.parameters())
+        self.dtype = next(floats, torch.get_default_dtype())
+        self.network: Network | None = None
+        self.form = "not known before the first call"
+        if self.preceded is not None:
+            input_shape = list(self.preceded.encoders)[-1].output_shape  # pyright: ignore
+        self.shape = None if input_shape is None else tuple(input_shape)
+        if self.shape is not None:
+            self._read(self.shape)
+
+    def __call__(self, inputs: np.ndarray | Tensor) -> np.ndarray:
+        """Of a model of classes their probabilities, (batch, class); else the point prediction, (batch, number).
+
+        Args:
+            inputs: as the predictor's, with the batch dimension first, in NumPy or on the CPU in torch.
+
+        Raises:
+            ValueError: what is computed is not finite; names the first such batch row.
+        """
+        features, network = self._features(inputs)
+        if network is not None and network.classes:
+            probability = network(features)
+            softmax(probability)
+            if np.isnan(probability[:, 0]).any():
+                row = int(np.isnan(probability[:, 0]).argmax())
+                raise ValueError(f"raw numbers are not finite in batch row {row}.")
+            return probability
+        with torch.inference_mode():
+            density = self._density(features, network)
+            if density.has_enumerate_support and not density.event_shape:
+                return class_probabilities(density).to(self.dtype).numpy()
+            return median(density, 1000).numpy()
+
+    @torch.inference_mode()
+    def density(self, inputs: np.ndarray | Tensor) -> Distribution:
+        """The density over the target, with batch_shape (batch,); inputs as above."""
+        return self._density(*self._features(inputs))
+
+    def _features(self, inputs: np.ndarray | Tensor) -> tuple[Any, Network | None]:
+        """What the inner predictor reads, in the form that the network reads, if there is one for it."""
+        if self.preceded is not None:
+            with torch.inference_mode():
+                inputs = self.preceded.features(_tensor(inputs))
+        if self.shape is None:
+            self.shape = tuple(inputs.shape[1:])
+            self._read(self.shape)
+        network = self.network
+        if network is None or not _floating(inputs):
+            return _tensor(inputs), None
+        found = inputs.detach().numpy() if isinstance(inputs, Tensor) else inputs
+        if found.shape[1:] != self.shape:
+            raise ValueError(
+                f"inputs of shape {tuple(found.shape)}; wanted (batch, {', '.join(map(str, self.shape))})."
+            )
+        flat = found.reshape(len(found), math.prod(self.shape))
+        return np.ascontiguousarray(flat, dtype=network.dtype), network
+
+    def _density(self, features: Any, network: Network | None) -> Distribution:
+        if network is None:
+            return self.inner(features)
+        raw = torch.from_numpy(network(features))
+        if network.classes:
+            return Categorical(logits=raw, validate_args=False)
+        assert isinstance(self.inner, Model)
+        return self.inner.head(raw)
+
+    def _read(self, shape: tuple[int, ...]) -> None:
+        if not isinstance(self.inner, Model):
+            self.form = f"{type(self.inner).__name__} in torch, without gradient"
+            return
+        network = read(self.inner, shape)
+        if network is None:
+            self.form = "the model in torch, without gradient: it is not of fully connected layers alone"
+            return
+        self.network = network
+        layers = sum(isinstance(step, Layer) for step in network.steps)
+        after = "softmax" if network.classes else f"{type(self.inner.head).__name__} in torch"
+        self.form = f"{layers} fully connected layers with batch norm folded, compiled, then {after}"
+
+
+def _tensor(inputs: np.ndarray | Tensor) -> Tensor:
+    # torch wants memory that it might write to
+    return (
+        inputs
+        if isinstance(inputs, Tensor)
+        else torch.from_numpy(np.require(inputs, requirements=["C", "W"]))
+    )
+
+
+def _floating(inputs: np.ndarray | Tensor) -> bool:
+    return inputs.is_floating_point() if isinstance(inputs, Tensor) else inputs.dtype.kind == "f"

@@ -1,0 +1,1 @@
+"""Densities that no method owns, and everything that a density may be asked."""

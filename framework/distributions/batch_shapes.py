@@ -1,0 +1,146 @@
+"""Densities with another batch_shape: several side by side, or one batch folded; what wrappers mix is made of these."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.density import marginal, median, pick
+
+
+class Stacked(Distribution):
+    """K densities of one batch_shape side by side: batch_shape (*batch, K), the form in which a Mixture reads them.
+
+    Args:
+        densities: at least one; all of one batch_shape, event_shape and support.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    has_rsample = False
+
+    def __init__(self, densities: Sequence[Distribution]) -> None:
+        first = densities[0]
+        shapes = {(tuple(one.batch_shape), tuple(one.event_shape)) for one in densities}
+        if len(shapes) > 1:
+            raise ValueError(f"densities differ in (batch_shape, event_shape): {sorted(shapes)}; wanted one.")
+        self.densities = tuple(densities)
+        self.has_enumerate_support = first.has_enumerate_support
+        shape = torch.Size((*first.batch_shape, len(densities)))
+        super().__init__(shape, first.event_shape, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint | None:
+        return self.densities[0].support
+
+    def enumerate_support(self, expand: bool = True) -> Tensor:
+        """Every class, (class, *batch, K) or (class, *1) without `expand`."""
+        found = self.densities[0].enumerate_support(expand).unsqueeze(-1)
+        return found.expand(*found.shape[:-1], len(self.densities)) if expand else found
+
+    @property
+    def _axis(self) -> int:
+        """Of K, among the dimensions of a value."""
+        return -1 - len(self.event_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        count = len(self.densities)
+        wide = value.expand(*value.shape[: self._axis], count, *self.event_shape)
+        parts = zip(self.densities, wide.unbind(self._axis), strict=True)
+        return torch.stack([density.log_prob(part) for density, part in parts], -1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape)
+        return torch.stack([density.sample(shape) for density in self.densities], self._axis)
+
+    @property
+    def mode(self) -> Tensor:
+        return torch.stack([density.mode for density in self.densities], self._axis)
+
+    def entropy(self) -> Tensor:
+        return torch.stack([density.entropy() for density in self.densities], -1)
+
+
+class Reshaped(Distribution):
+    """One density whose batch is read in another shape of as many items, in the same order.
+
+    Args:
+        density: with any batch_shape.
+        batch_shape: of as many items.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    has_rsample = False
+
+    def __init__(self, density: Distribution, batch_shape: torch.Size | tuple[int, ...]) -> None:
+        shape = torch.Size(batch_shape)
+        if shape.numel() != density.batch_shape.numel():
+            raise ValueError(
+                f"a batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; wanted as many items."
+            )
+        self.density = density
+        self.has_enumerate_support = density.has_enumerate_support
+        super().__init__(shape, density.event_shape, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint | None:
+        return self.density.support
+
+    def enumerate_support(self, expand: bool = True) -> Tensor:
+        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        found = self.density.enumerate_support(expand=False).reshape(-1, *(1,) * len(self.batch_shape))
+        return found.expand(-1, *self.batch_shape) if expand else found
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        whole = torch.broadcast_shapes(value.shape, torch.Size((*self.batch_shape, *self.event_shape)))
+        lead = whole[: len(whole) - len(self.batch_shape) - len(self.event_shape)]
+        flat = value.expand(whole).reshape(*lead, *self.density.batch_shape, *self.event_shape)
+        return self.density.log_prob(flat).reshape(*lead, *self.batch_shape)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape)
+        return self.density.sample(shape).reshape(*shape, *self.batch_shape, *self.event_shape)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.density.mode.reshape(*self.batch_shape, *self.event_shape)
+
+    def entropy(self) -> Tensor:
+        return self.density.entropy().reshape(self.batch_shape)
+
+
+@marginal.register
+def _(density: Stacked, index: int) -> Stacked:
+    return Stacked([marginal(one, index) for one in density.densities])
+
+
+@marginal.register
+def _(density: Reshaped, index: int) -> Reshaped:
+    return Reshaped(marginal(density.density, index), density.batch_shape)
+
+
+@median.register
+def _(density: Stacked, samples: int) -> Tensor:
+    axis = -1 - len(density.event_shape)
+    return torch.stack([median(one, samples) for one in density.densities], axis)
+
+
+@median.register
+def _(density: Reshaped, samples: int) -> Tensor:
+    return median(density.density, samples).reshape(*density.batch_shape, *density.event_shape)
+
+
+@pick.register
+def _(density: Reshaped, index: Tensor) -> Distribution:
+    """The same items of the inner density, whose batch is one line of them then: nothing is drawn and thrown away."""
+    inner = density.density
+    if len(inner.batch_shape) != 1:
+        return pick.dispatch(Distribution)(density, index)
+    # items in the order of (*batch, K): the item of batch place b and component k is b·K + k
+    lead = index.shape[: index.dim() - len(density.batch_shape) + 1]
+    count = density.batch_shape[-1]
+    first = torch.arange(density.batch_shape[:-1].numel(), device=index.device) * count
+    items = first.reshape(density.batch_shape[:-1]) + index
+    # `pick` reads the last batch dimension as the components: one line of them has no other dimension
+    return Reshaped(pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))

@@ -1,0 +1,126 @@
+"""Trigonometric moments of a density of one angle, from a grid, and what follows from them."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Complex, Float
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.density import Circular, circular_grid
+
+POINTS = (720, 2880)
+"""Angles on the grid, and on the finer one that is tried where some density is too narrow for it."""
+MASS_GAP = 1e-4
+"""How far the mass on the grid may be from 1."""
+COARSE_ENOUGH = 1e-8
+"""How large the moments at the coarse grid's end may be for the fine one to be spared."""
+LAST_MOMENTS = 1e-4
+"""How large the moments at the fine grid's end may be: those beyond are taken for 0. A von Mises density with
+concentration 3,500 (σ = 1°) is spared the fine grid, and one with 100,000 (σ = 0.18°) is still resolved there."""
+
+
+class CircularMoments:
+    """m_n = E exp(i n X), n = 0 ... N/2, of densities of one angle X (Mardia & Jupp 2000, §3.4.1).
+
+    Args:
+        moments: m_0 is 1.
+        resolved: where the grid saw the density; elsewhere the moments say nothing, and draws have to. NaN of a
+            density that is NaN counts as seen.
+    """
+
+    def __init__(self, moments: Complex[Tensor, "harmonic *batch"], resolved: Bool[Tensor, "*batch"]) -> None:
+        self.moments = moments
+        self.resolved = resolved
+        order = torch.arange(1, len(moments), dtype=torch.float64, device=moments.device)
+        self.order = order.reshape(-1, *(1,) * resolved.dim())
+
+    @property
+    def direction(self) -> Float[Tensor, "*batch"]:
+        """Of the mean, radians in [-π, π]; 0 where the mean resultant is below 1e-6 and has none."""
+        first = self.moments[1]
+        return torch.where(first.abs() < 1e-6, 0.0, first.angle())
+
+    def arc(self, start: Tensor, end: Tensor) -> Tensor:
+        """Mass from `start` counter-clockwise to `end`, (*sample, *batch), both of that shape, radians.
+
+        The Fourier series of the density integrated term by term: as exact as the moments.
+        """
+        turn = torch.remainder(end - start, 2 * math.pi)
+        return self._series(turn, start).clamp(0, 1)
+
+    def _series(self, turn: Tensor, start: Tensor) -> Tensor:
+        if start.dim() > self.resolved.dim():
+            pairs = zip(turn, start.expand_as(turn), strict=True)
+            return torch.stack([self._series(*pair) for pair in pairs])
+        ends = torch.polar(torch.ones_like(self.order), -self.order * (start + turn))
+        starts = torch.polar(torch.ones_like(self.order), -self.order * start)
+        # ∫ Re(m_n e^{-inφ}) dφ = Re(i m_n e^{-inφ} / n) = -Im(m_n e^{-inφ}) / n
+        parts = -(self.moments[1:] * (ends - starts)).imag / self.order
+        return turn / (2 * math.pi) + parts.sum(0) / math.pi
+
+    def distance(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """E d(X, y), d the angular distance, radians: d(θ) = π/2 - 4/π Σ cos(nθ)/n² over odd n."""
+        turned = self.moments[1:] * torch.polar(torch.ones_like(self.order), -self.order * value)
+        return math.pi / 2 - 4 / math.pi * (turned.real / self.order.square())[::2].sum(0)
+
+    @property
+    def spread(self) -> Float[Tensor, "*batch"]:
+        """E d(X, X'), X' as X and independent of it, radians, by the same series."""
+        squares = self.moments[1:].abs().square()
+        return math.pi / 2 - 4 / math.pi * (squares / self.order.square())[::2].sum(0)
+
+    def density(self, finer: int, *, slope: bool = False) -> Float[Tensor, "points *batch"]:
+        """On equally spaced angles from -π, `finer` times as many as the moments are of: the series between them.
+
+        Args:
+            slope: its derivative instead, per radian.
+        """
+        count = 2 * (len(self.moments) - 1) * finer
+        sign = 1 - 2 * (torch.arange(len(self.moments), device=self.moments.device) % 2)
+        turned = self.moments.conj() * sign.reshape(-1, *(1,) * self.resolved.dim())
+        turned[-1] /= 2  # the highest is the mean of two, and stands for both
+        if slope:
+            turned[0] = 0
+            turned[1:] *= 1j * self.order
+        if turned.numel() == 0:
+            return turned.real.new_zeros(count, *self.resolved.shape)
+        return torch.fft.irfft(turned, n=count, dim=0) * (count / (2 * math.pi))
+
+
+@torch.no_grad()
+def circular_moments(density: Distribution) -> CircularMoments:
+    """From the trapezium rule on a grid (spectrally exact of smooth densities).
+
+    A density that the coarse grid does not resolve is evaluated on the finer one; the moments of those it does stay
+    those of the coarse one, so that they do not depend on what else is in the batch.
+
+    Raises:
+        ValueError: not a density of one angle.
+    """
+    moments, resolved = _on_grid(density, POINTS[0], COARSE_ENOUGH)
+    if bool(resolved.all()):
+        return CircularMoments(moments, resolved)
+    fine, found = _on_grid(density, POINTS[1], LAST_MOMENTS)
+    wide = torch.zeros_like(fine)
+    wide[: len(moments)] = moments
+    return CircularMoments(torch.where(resolved, wide, fine), resolved | found)
+
+
+def _on_grid(density: Distribution, points: int, largest: float) -> tuple[Tensor, Tensor]:
+    angles, log_density = circular_grid(density, points)
+    mass = log_density.double().exp() * (2 * math.pi / points)
+    support = density.support
+    if isinstance(support, Circular) and support.ranges is not None:
+        low, high = support.ranges[0]
+        inside = (angles >= low) & (angles <= high)
+        mass = mass * inside.reshape(-1, *(1,) * (mass.dim() - 1))
+    total = mass.sum(0)
+    if total.numel() == 0:  # the fast Fourier transform refuses nothing
+        nothing = torch.zeros(points // 2 + 1, *total.shape, dtype=torch.complex128, device=total.device)
+        return nothing, total > 0
+    moments = torch.fft.rfft(mass / total, dim=0).conj().resolve_conj()
+    moments[1::2] *= -1  # the grid begins at -π
+    last = moments[-max(2, points // 40) :].abs().amax(0)
+    seen = ((total - 1).abs() < MASS_GAP) & (last < largest)
+    return moments, seen | total.isnan()

@@ -1,0 +1,57 @@
+"""Class probabilities of any density over classes, and labels that fit them: what metrics of classes share."""
+
+from jaxtyping import Float64, Int
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.checks import refuse_nan
+from framework.errors import DataError, UserError
+
+LARGEST_DEFECT = 0.01
+"""How far from 1 the probabilities may sum up: float32 rounds logits of 1e4 to 1e-3."""
+
+
+def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]:
+    """p(y = k) of each sample, in [0, 1], each row with sum 1 to float64.
+
+    exp of log_prob at each class, in float64, over their sum: a float32 log_prob leaves sums of 1 ± 1e-7 (± 1e-3 where
+    logits reach 1e4), and a mixture's largest probability may exceed 1 by as much.
+
+    Args:
+        density: over classes, with batch_shape (batch,): `enumerate_support` lists them, class k the k-th.
+
+    Raises:
+        UserError: a density that does not list its values, a probability that is NaN, or a sum that is not 1 within
+            1 %.
+    """
+    if not density.has_enumerate_support or tuple(density.event_shape):
+        raise UserError(
+            f"Class probabilities were asked of a {type(density).__name__} with event_shape "
+            f"{tuple(density.event_shape)}, which does not list classes; wanted a density over classes, such as "
+            "density_head=categorical predicts. Leave out the metric that reads them, or choose such a head."
+        )
+    probability = density.log_prob(density.enumerate_support()).double().exp().T
+    total = refuse_nan(probability.sum(-1), "predicted distributions over classes")
+    wrong = ~((total - 1).abs() < LARGEST_DEFECT)
+    if wrong.any():
+        raise UserError(
+            f"{int(wrong.sum())} of {len(total)} predicted distributions over classes do not sum to 1: that of row "
+            f"{int(wrong.nonzero()[0])} sums to {total[wrong][0].item():.6g}. Mend log_prob of the density head or "
+            "wrapper that predicts them (`mode=check`)."
+        )
+    return probability / total.unsqueeze(-1)
+
+
+def require_labels(target: Int[Tensor, "batch"], classes: int) -> Int[Tensor, "batch"]:
+    """`target` itself, if every label is that of one of the classes.
+
+    Raises:
+        DataError: a label below 0 or above `classes` - 1; says which.
+    """
+    wrong = (target < 0) | (target >= classes)
+    if wrong.any():
+        raise DataError(
+            f"{int(wrong.sum())} of {len(target)} targets of this batch are no class: that of row "
+            f"{int(wrong.nonzero()[0])} is {int(target[wrong][0])}, wanted 0 to {classes - 1}. Mend the data's labels."
+        )
+    return target

@@ -1,0 +1,251 @@
+"""The density of one number on a line or circle: nodes that find it however narrow, its levels and their ends."""
+
+import math
+from dataclasses import dataclass
+from functools import singledispatch
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.circular import grid, wrap
+from framework.distributions.density import Circular, Mixture
+
+FOLD = 12
+"""Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
+NEAREST, FARTHEST = 1e-11, 1e11
+"""Distances from a peak that nodes cover, in the target's unit; of angles up to half a turn."""
+TURN = 720
+"""Further nodes all around a circle, for broad humps that are no peak's."""
+PEAKS, CANDIDATES = 8, 64
+"""Peaks that get nodes of their own, and among how many they are chosen."""
+BISECTIONS = 52
+"""Halvings of a cell: its ends are as exact as the number type."""
+
+
+@singledispatch
+def peaks(density: Distribution) -> Float[Tensor, "peak *batch_and_event"]:
+    """Where the density may be highest: its mode, of a mixture those of all components."""
+    return density.mode.unsqueeze(0)
+
+
+@peaks.register
+def _(density: Mixture) -> Tensor:
+    found = peaks(density.components).movedim(-1 - len(density.event_shape), 0)  # (K, peak, *batch, *event)
+    return found.flatten(0, 1)
+
+
+@peaks.register
+def _(density: Stacked) -> Tensor:
+    found = [peaks(one) for one in density.densities]
+    most = max(len(one) for one in found)
+    same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
+    return torch.stack(same, -1 - len(density.event_shape))
+
+
+@peaks.register
+def _(density: Reshaped) -> Tensor:
+    return peaks(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Where the parts of one number's range above a level begin and end.
+
+    Attributes:
+        length: of all parts of an item together, (item,), float64.
+        intervals: (low, high) of each item's parts, ascending.
+    """
+
+    length: Float[Tensor, "item"]
+    intervals: list[list[tuple[float, float]]]
+
+
+class Line:
+    """The density of one number at nodes about its peaks, whose distances run over all orders of magnitude.
+
+    They resolve a standard deviation of 1e-9 as well as one of 1e9. Between two nodes log p is taken as linear.
+
+    Args:
+        density: event_shape (1,), of any batch_shape, whose items are numbered in order.
+    """
+
+    def __init__(self, density: Distribution) -> None:
+        self.items = density.batch_shape.numel()
+        self.density = density if len(density.batch_shape) == 1 else Reshaped(density, (self.items,))
+        support = density.support
+        self.range: tuple[float, float] = (-math.inf, math.inf)
+        self.closed = False
+        if isinstance(support, Circular):
+            self.closed = support.ranges is None
+            self.range = (-math.pi, math.pi) if support.ranges is None else support.ranges[0]
+        like = density.sample(torch.Size((0,)))
+        self.dtype, self.device = like.dtype, like.device
+        empty = torch.zeros(2, 0, dtype=torch.float64, device=self.device)
+        self.nodes = self._nodes() if self.items else empty
+        self.heights = self.at(self.nodes) if self.items else empty
+        self._low, self._high, self._log_width = self._cells()
+        self._log_whole = self._log_less(torch.full_like(self.heights[0], math.inf))
+
+    def at(self, places: Float[Tensor, "place item"]) -> Float[Tensor, "place item"]:
+        """log p, nats, float64."""
+        return self.density.log_prob(places.to(self.dtype).unsqueeze(-1)).double()
+
+    def score_of(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
+        """-log of the mass of what is less dense than a log-density, nats, at least 0; falls as the level rises."""
+        return (self._log_whole - self._log_less(level)).clamp(min=0)
+
+    def level_of(self, score: Float[Tensor, ""]) -> Float[Tensor, "item"]:
+        """The log-density whose `score_of` is `score` to 1e-12, by regula falsi (Illinois)."""
+        high, reach = self.heights.amax(0), score.clamp(min=0) + 1
+        if score < 0:  # no score is
+            return torch.full_like(high, math.inf)
+        over_high = self.score_of(high) - score
+        low = high - reach
+        over_low = self.score_of(low) - score
+        while bool((over_low < 0).any()):  # ends: below every node the score is infinite
+            reach = 2 * reach
+            low = torch.where(over_low < 0, high - reach, low)
+            over_low = self.score_of(low) - score
+        last = torch.zeros_like(high)
+        for _ in range(200):
+            apart = over_low - over_high
+            middle = torch.where(
+                apart.isfinite() & (apart > 0), (low * -over_high + high * over_low) / apart, (low + high) / 2
+            )
+            middle = middle.clamp(low, high)
+            over = self.score_of(middle) - score
+            if not ((over.abs() > 1e-12 * (1 + score)) & (high - low > 1e-14 * (1 + high.abs()))).any():
+                return middle
+            above = over > 0
+            # an end that stays twice counts half, so that the other comes nearer
+            over_high = torch.where(above & (last > 0), over_high / 2, over_high)
+            over_low = torch.where(~above & (last < 0), over_low / 2, over_low)
+            low, over_low = torch.where(above, middle, low), torch.where(above, over, over_low)
+            high, over_high = torch.where(above, high, middle), torch.where(above, over_high, over)
+            last = torch.where(above, 1.0, -1.0)
+        return high
+
+    def ends(self, level: Float[Tensor, "item"]) -> Ends:
+        """Where log p ≥ level; NaN lengths and no intervals where log p is NaN."""
+        inside = self.heights >= level
+        start, stop = self.nodes, self.nodes.roll(-1, 0)
+        following = inside.roll(-1, 0)
+        if self.closed:
+            stop = torch.cat([stop[:-1], stop[-1:] + 2 * math.pi])
+        else:
+            start, stop, before, following = start[:-1], stop[:-1], inside[:-1], following[:-1]
+        before = inside if self.closed else inside[:-1]
+        change = before != following
+        places = self._crossings(change, start, stop, before, level)
+        broken = self.heights.isnan().any(0).tolist()
+        found = [
+            [] if wrong else self._joined(*crossing, bool(first), bool(last))
+            for crossing, first, last, wrong in zip(places, inside[0], inside[-1], broken, strict=True)
+        ]
+        lengths = [
+            math.nan if wrong else sum(high - low for low, high in parts)
+            for parts, wrong in zip(found, broken, strict=True)
+        ]
+        return Ends(torch.tensor(lengths, dtype=torch.float64, device=self.device), found)
+
+    def _crossings(
+        self, change: Bool[Tensor, "cell item"], start: Tensor, stop: Tensor, before: Tensor, level: Tensor
+    ) -> list[tuple[list[float], list[bool]]]:
+        """Of each item where log p crosses the level, ascending, and whether it rises there."""
+        most = int(change.sum(0).amax()) if change.numel() else 0
+        # the changed cells of each item first, in order
+        order = change.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
+        low, high, leaves = (each.gather(0, order) for each in (start, stop, before))
+        for _ in range(BISECTIONS if most else 0):  # torch's Independent refuses to be asked nothing
+            middle = (low + high) / 2
+            same = (self.at(middle) >= level) == leaves
+            low, high = torch.where(same, middle, low), torch.where(same, high, middle)
+        counts = change.sum(0).tolist()
+        middles, rising = ((low + high) / 2).T.tolist(), (~leaves).T.tolist()
+        return [(places[:n], up[:n]) for places, up, n in zip(middles, rising, counts, strict=True)]
+
+    def _joined(
+        self, places: list[float], rising: list[bool], first: bool, last: bool
+    ) -> list[tuple[float, float]]:
+        """Crossings as intervals."""
+        if not places:
+            return [self.range] if first else []
+        lows = [place for place, up in zip(places, rising, strict=True) if up]
+        highs = [place for place, up in zip(places, rising, strict=True) if not up]
+        if not self.closed:
+            lows = [self.range[0], *lows] if first else lows
+            highs = [*highs, self.range[1]] if last else highs
+            return list(zip(lows, highs, strict=True))
+        turn = 2 * math.pi
+        if highs[0] < lows[0]:  # an arc across the cut
+            highs = [*highs[1:], highs[0] + turn]
+        found = [
+            (low - turn, high - turn) if low >= math.pi else (low, high)
+            for low, high in zip(lows, highs, strict=True)
+        ]
+        return sorted(found)
+
+    def _nodes(self) -> Float[Tensor, "node item"]:
+        places = self._peaks()  # (peak, item)
+        farthest = math.pi if math.isfinite(self.range[1]) else FARTHEST
+        count = math.ceil(FOLD * math.log(farthest / NEAREST))
+        steps = torch.logspace(
+            math.log10(NEAREST), math.log10(farthest), count, dtype=torch.float64, device=self.device
+        )
+        steps = torch.cat([-steps.flip(0), steps.new_zeros(1), steps])
+        found = (places + steps.reshape(-1, 1, 1)).flatten(0, 1)
+        if math.isfinite(self.range[1]):
+            low, high = self.range
+            turn = grid(TURN, dtype=torch.float64, device=self.device) / (2 * math.pi)
+            around = (low + high) / 2 + turn * (high - low)
+            ends = around.new_tensor([low, high])[: 1 if self.closed else 2]
+            around = torch.cat([around, ends])
+            found = torch.cat([found, around.unsqueeze(-1).expand(-1, self.items)])
+            found = wrap(found) if self.closed else found.clamp(low, high)
+        # as the density will read them; a closed circle has no second end
+        return found.to(self.dtype).double().sort(0).values
+
+    def _peaks(self) -> Float[Tensor, "peak item"]:
+        """The highest humps, at most PEAKS; a candidate without a valley on the way to a chosen one is its hump's."""
+        places = peaks(self.density).squeeze(-1).double()  # (candidate, item)
+        heights = self.at(places).nan_to_num(nan=-math.inf)
+        keep = heights.topk(min(CANDIDATES, len(heights)), dim=0)
+        places, heights = places.gather(0, keep.indices), keep.values
+        chosen: list[Tensor] = []
+        left = torch.ones_like(heights, dtype=torch.bool)
+        while len(chosen) < PEAKS and bool(left.any()):
+            best = heights.where(left, -math.inf).argmax(0, keepdim=True)
+            place = places.gather(0, best)
+            chosen.append(place)
+            away = places - place
+            away = wrap(away) if self.closed else away
+            valley = self.at(place + away / 2)
+            left &= ~(valley >= heights - 0.1)
+            left.scatter_(0, best, False)
+        return torch.cat(chosen)
+
+    def _cells(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The lower and the higher log p at each cell's ends, and the log of its width."""
+        ahead, heights = self.nodes.roll(-1, 0), self.heights.roll(-1, 0)
+        width = ahead - self.nodes
+        if self.closed:
+            width = torch.cat([width[:-1], width[-1:] + 2 * math.pi])
+        else:
+            width, heights = width[:-1], heights[:-1]
+        here = self.heights[: len(heights)]
+        high = torch.maximum(here, heights)
+        low = torch.minimum(here, heights).nan_to_num(nan=math.nan, neginf=-1e300)
+        return low, high, width.log()
+
+    def _log_less(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
+        """Log of the mass below a level: of each cell ∫ exp(a + b x) dx over the part below it, which is its width
+        times (exp(c) - exp(low)) / (high - low) with c = min(level, high)."""
+        top = torch.minimum(level, self._high)
+        rise, fall = top - self._low, self._high - self._low
+        sloped = self._log_width + top + (-torch.expm1(-rise)).log() - fall.log()
+        level_cell = torch.where(level > self._high, self._log_width + self._high, -math.inf)
+        mass = torch.where(fall > 0, sloped.where(rise > 0, -math.inf), level_cell)
+        return mass.where(~self._high.isnan(), math.nan).logsumexp(0)

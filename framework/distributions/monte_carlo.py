@@ -1,0 +1,323 @@
+"""Estimates of log E w(z) over a standard normal z: quasi-random points, standard error, S chosen by a target error."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, singledispatch
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.density import CHUNK, Mixture
+from framework.errors import ConfigError
+
+REPLICATES = 8
+"""Independent estimates that a standard error is taken from, at most."""
+MOST = 2**18
+"""Samples after which an item that has not reached its tolerance is given up."""
+GENERATOR = 1267
+"""Of the lattice; chosen by measured variance (benchmarks/latent.md)."""
+LARGEST_KEPT = 2**22
+"""Numbers of normal points that a density holds (16 MiB in float32); more are computed anew for every value."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """log E w of each item as S samples tell it; all shaped alike, nats where not said otherwise.
+
+    Attributes:
+        log_mean: log of the mean weight; in expectation below the truth by about standard_error²/2 (Jensen).
+        debiased: log_mean + standard_error²/2.
+        standard_error: of log_mean; 0 of an exact number, NaN where one replicate says nothing of it, infinite where
+            all weights were 0.
+        samples: S, int64; 0 of an exact number.
+        unresolved: bool, true where a tolerance was asked for and not reached.
+    """
+
+    log_mean: Float[Tensor, "*items"]
+    debiased: Float[Tensor, "*items"]
+    standard_error: Float[Tensor, "*items"]
+    samples: Int[Tensor, "*items"]
+    unresolved: Bool[Tensor, "*items"]
+
+    def reshape(self, shape: tuple[int, ...]) -> "Estimate":
+        """The same numbers in another shape."""
+        return Estimate(
+            self.log_mean.reshape(shape),
+            self.debiased.reshape(shape),
+            self.standard_error.reshape(shape),
+            self.samples.reshape(shape),
+            self.unresolved.reshape(shape),
+        )
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How many samples an estimate takes.
+
+    Args:
+        samples: S; with a tolerance, of the first round, rounded up to 8 × a power of two.
+        tolerance: nats. Samples are doubled until an item's estimated error is below, or MOST are drawn; None: S it is.
+
+    Raises:
+        ConfigError: no sample, or a tolerance that is not above zero.
+    """
+
+    samples: int
+    tolerance: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise ConfigError(f"samples = {self.samples}; wanted 1 or more.")
+        if self.tolerance is not None and not 0 < self.tolerance < math.inf:
+            raise ConfigError(
+                f"tolerance = {self.tolerance} nats; wanted a number above 0, such as 0.01, or null for a fixed number "
+                "of samples."
+            )
+
+    @property
+    def replicates(self) -> int:
+        """R independent parts of the samples: 8, or the largest number below that divides a fixed S."""
+        if self.tolerance is not None:
+            return REPLICATES
+        return next(number for number in range(REPLICATES, 0, -1) if self.samples % number == 0)
+
+    @property
+    def first(self) -> int:
+        """Samples of each replicate in the first round."""
+        if self.tolerance is None:
+            return self.samples // self.replicates
+        return 1 << (math.ceil(self.samples / REPLICATES) - 1).bit_length()
+
+
+@singledispatch
+def estimate(density: Distribution, value: Tensor) -> Estimate:
+    """The log-density at `value` with its Monte Carlo error; one whose log_prob is sampled registers its own.
+
+    The default takes log_prob for exact: error 0 of 0 samples.
+    """
+    log_prob = density.log_prob(value)
+    nothing = torch.zeros_like(log_prob)
+    samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
+    return Estimate(log_prob, log_prob, nothing, samples, samples > 0)
+
+
+class SampledMixture(Mixture):
+    """A mixture whose components stand for all of p(φ|x,z): one at each point z, with equal weights.
+
+    Args:
+        log_weights: (*batch, S), all equal.
+        components: batch_shape (*batch, S), the samples of one replicate beside each other.
+        replicates: R, which divides S.
+    """
+
+    def __init__(self, log_weights: Tensor, components: Distribution, replicates: int) -> None:
+        super().__init__(log_weights, components)
+        self.replicates = replicates
+
+
+@estimate.register
+def _(density: SampledMixture, value: Tensor) -> Estimate:
+    extra = value.dim() - len(density.batch_shape) - len(density.event_shape)
+    rows = max(1, CHUNK // max(1, density.log_weights.numel()))
+    if extra > 0 and value.shape[0] > rows and not torch.is_grad_enabled():
+        return _joined([estimate(density, part) for part in value.split(rows)])
+    log_weights = density.components.log_prob(value.unsqueeze(-1 - len(density.event_shape)))
+    log_weights = log_weights.unflatten(-1, (density.replicates, -1))
+    return estimated(torch.logsumexp(log_weights, -1).movedim(-1, 0), log_weights.shape[-1])
+
+
+def estimated(log_sums: Float[Tensor, "replicate *items"], count: int) -> Estimate:
+    """The estimate that independent replicates give, each the log of a sum of `count` weights.
+
+    With m_r the mean weight of replicate r over that of all, the squared standard error of the mean weight, relative
+    to it, is s² = Σ (m_r - 1)² / (R (R - 1)), and s is also that of its logarithm (delta method); the logarithm's
+    expectation is low by s²/2. A jackknife over replicates removes the same term, but is infinite where one replicate
+    has all the weight; s² is at most 1, and the correction 1/2.
+    """
+    replicates = len(log_sums)
+    log_mean = torch.logsumexp(log_sums, 0) - math.log(replicates * count)
+    with torch.no_grad():
+        ratio = replicates * torch.softmax(log_sums, 0)
+        variance = (ratio - 1).square().sum(0) / (
+            replicates * (replicates - 1) if replicates > 1 else math.nan
+        )
+        nothing = log_mean == -math.inf
+        standard_error = torch.where(nothing, math.inf, variance.sqrt())
+        samples = torch.full(log_mean.shape, replicates * count, dtype=torch.int64, device=log_mean.device)
+    correction = torch.where(nothing, 0.0, variance / 2)
+    return Estimate(log_mean, log_mean + correction, standard_error, samples, torch.zeros_like(nothing))
+
+
+def estimated_error(found: Estimate) -> Float[Tensor, "*items"]:
+    """Root mean square error of log_mean, nats: spread and bias together."""
+    return torch.hypot(found.standard_error, found.standard_error.square() / 2)
+
+
+def estimate_log_mean(
+    log_weights: Callable[[Tensor, int, int], Tensor],
+    items: int,
+    effort: Effort,
+    *,
+    at_once: int,
+    device: torch.device,
+) -> Estimate:
+    """log E w of each of `items`, (items,), in rounds that double the samples of those not yet below the tolerance.
+
+    Only a sum for each replicate and the chunk at hand are held. Differentiable where log_weights is; then everything
+    drawn is held, and nothing is chunked.
+
+    Args:
+        log_weights: (items (n,) int64, start, count) → (replicate, count, n), nats: of these items, at the points
+            `start` to `start + count` of each replicate. -inf is a weight of zero.
+        at_once: weights asked for together, at most (but one for each replicate).
+    """
+    if torch.is_grad_enabled():
+        at_once = max(at_once, items * effort.replicates * MOST)
+    rows = torch.arange(items, device=device)
+    log_sums = _log_sums(log_weights, rows, 0, effort.first, effort.replicates, at_once)
+    done = effort.first
+    finished: list[tuple[Tensor, Estimate]] = []
+    while True:
+        found = estimated(log_sums, done)
+        if effort.tolerance is None:
+            return found
+        # a weight that is not a number stays one, whatever is added
+        wanting = ~(estimated_error(found) <= effort.tolerance)
+        more = wanting & ~found.log_mean.isnan()
+        if effort.replicates * done * 2 > MOST:
+            more = torch.zeros_like(more)
+        finished.append((rows[~more], _picked(found, ~more, unresolved=wanting[~more])))
+        if not more.any():
+            break
+        rows = rows[more]
+        further = _log_sums(log_weights, rows, done, done, effort.replicates, at_once)
+        log_sums = torch.logaddexp(log_sums[:, more], further)
+        done *= 2
+    order = torch.cat([rows for rows, _ in finished]).argsort()
+    return _picked(_joined([part for _, part in finished]), order)
+
+
+def _log_sums(
+    log_weights: Callable[[Tensor, int, int], Tensor],
+    rows: Tensor,
+    start: int,
+    count: int,
+    replicates: int,
+    at_once: int,
+) -> Float[Tensor, "replicate rows"]:
+    """Log of the sum of `count` weights of each replicate, chunk by chunk."""
+    step = max(1, min(count, at_once // replicates))
+    parts = []
+    for some in rows.split(max(1, at_once // (replicates * step))):
+        total = None
+        for begin in range(start, start + count, step):
+            number = min(step, start + count - begin)
+            part = torch.logsumexp(log_weights(some, begin, number), 1)
+            total = part if total is None else torch.logaddexp(total, part)
+        parts.append(total)
+    return torch.cat(parts, -1)
+
+
+def _joined(parts: list[Estimate]) -> Estimate:
+    """Of several batches one, along the first dimension."""
+    return Estimate(
+        torch.cat([part.log_mean for part in parts]),
+        torch.cat([part.debiased for part in parts]),
+        torch.cat([part.standard_error for part in parts]),
+        torch.cat([part.samples for part in parts]),
+        torch.cat([part.unresolved for part in parts]),
+    )
+
+
+def _picked(found: Estimate, index: Tensor, unresolved: Tensor | None = None) -> Estimate:
+    """Those at `index`."""
+    return Estimate(
+        found.log_mean[index],
+        found.debiased[index],
+        found.standard_error[index],
+        found.samples[index],
+        found.unresolved[index] if unresolved is None else unresolved,
+    )
+
+
+def rows_of(
+    value: Tensor, batch_shape: torch.Size, event_shape: torch.Size
+) -> tuple[Tensor, Tensor, torch.Size]:
+    """Values (*sample, *batch, *event) one below the other: (rows, *event), the item of the flattened batch that each
+    row asks about, (rows,) int64, and the shape (*sample, *batch) of the answer."""
+    lead = value.shape[: value.dim() - len(event_shape)]
+    shape = torch.Size(torch.broadcast_shapes(lead, batch_shape))
+    items = torch.arange(batch_shape.numel(), device=value.device).reshape(batch_shape).expand(shape)
+    return value.expand(shape + event_shape).reshape(-1, *event_shape), items.reshape(-1), shape
+
+
+class NormalPoints:
+    """Standard normal points z, a sequence for each item and replicate that can be continued at will.
+
+    All are one extensible lattice (`lattice`), each shifted by a random vector modulo 1 (Cranley & Patterson 1976), so
+    that a replicate's mean is unbiased and replicates are independent, and mapped by the normal quantile. Drawn from
+    torch's global generator in float64, so that float32 and float64 see the same points.
+
+    Args:
+        items: of a flattened batch.
+        replicates: R.
+        dimensions: of z.
+        dtype, device: of the points.
+        kept: so many first points of each replicate are held from first use, where many values are asked about at the
+            same; not if they are too many.
+    """
+
+    def __init__(
+        self,
+        items: int,
+        replicates: int,
+        dimensions: int,
+        *,
+        dtype: torch.dtype,
+        device: torch.device,
+        kept: int = 0,
+    ) -> None:
+        self.shift = torch.rand(replicates, 1, items, dimensions, dtype=torch.float64, device=device)
+        self.dtype = dtype
+        self.kept = kept if self.shift.numel() * kept <= LARGEST_KEPT else 0
+
+    def __call__(
+        self, items: Int[Tensor, "rows"], start: int, count: int
+    ) -> Float[Tensor, "replicate count rows dimension"]:
+        """Points `start` to `start + count` of some items' sequences."""
+        if start + count <= self.kept:
+            return self._first[:, start : start + count, items]
+        return self._points(self.shift[:, :, items], start, count)
+
+    @cached_property
+    def _first(self) -> Tensor:
+        return self._points(self.shift, 0, self.kept)
+
+    def _points(self, shift: Tensor, start: int, count: int) -> Tensor:
+        places = lattice(start, count, shift.shape[-1], shift.device)
+        return normal_quantile(torch.remainder(places[:, None] + shift, 1.0)).to(self.dtype)
+
+
+def lattice(
+    start: int, count: int, dimensions: int, device: torch.device | None = None
+) -> Float[Tensor, "count dimension"]:
+    """Points `start` to `start + count` of an extensible Korobov sequence in [0, 1), float64 and exact.
+
+    Point i is r(i) (1, a, a², …) mod 1 with r the radical inverse: i's binary digits mirrored at the point. The first
+    2^m points, for any m, are a whole lattice (Hickernell, Hong, L'Ecuyer & Lemieux 2000, §2).
+    """
+    number = torch.arange(start, start + count, device=device)
+    inverse = torch.zeros(count, dtype=torch.float64, device=device)
+    for bit in range((start + count - 1).bit_length()):
+        inverse += ((number >> bit) & 1) * 2.0 ** -(bit + 1)
+    # below 2^20, so that products with up to 32 digits are exact
+    vector = [pow(GENERATOR, power, 2**20) for power in range(dimensions)]
+    return torch.remainder(inverse[:, None] * torch.tensor(vector, dtype=torch.float64, device=device), 1.0)
+
+
+def normal_quantile(place: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """z with Φ(z) = place; places of [0, 1) closer to an end than float64 tells apart become ±8.2, never infinite."""
+    return torch.special.ndtri(place.clamp(2.0**-54, 1 - 2.0**-53))

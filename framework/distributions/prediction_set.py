@@ -1,0 +1,241 @@
+"""Densities that come with a set in which the target is said to lie: labels, arcs, intervals."""
+
+import math
+from functools import cached_property
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.batch_shapes import Reshaped
+from framework.distributions.density import Circular, Mixture, marginal, median
+from framework.distributions.highest_density import Ends, Line
+from framework.distributions.monte_carlo import Estimate, estimate
+from framework.errors import UserError
+
+Score = Literal["density", "mass"]
+FEW = 8
+"""Values of each item for which their masses cost less than the level of one mass."""
+DRAWS = 1000
+"""Of each density over several numbers, whose sets have no ends to find."""
+
+
+class PredictionSet(Mixture):
+    """A density, to the last bit, and the set of values whose score is at most a threshold.
+
+    Scores grow as a value is less expected:
+
+    - "density": -log p(y), nats: the set is where the density is above one level, the same for every item
+      (of classes Sadinle, Lei & Wasserman 2019);
+    - "mass": -log of the mass of all that is less dense than y, nats: the set is each item's own smallest region of
+      one and the same mass (of classes Romano, Sesia & Candès 2020, of numbers a highest-density region). Of classes
+      p(y) itself counts with a share u(x) in (0, 1) that looks random and is a function of the density: without it
+      all wrong labels of two classes, and most right ones, would have equal scores.
+
+    Either is a function of the density and the value alone, which is all that split conformal prediction asks for: on
+    exchangeable data the set covers as promised whatever the density (Vovk, Gammerman & Shafer 2005, §4.1). Masses
+    over several numbers are shares of random draws, taken once.
+
+    Args:
+        density: any.
+        threshold: the largest score in the set, a scalar; infinite for everything.
+        score: which.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, density: Distribution, threshold: Float[Tensor, ""], score: Score) -> None:
+        self.density = density
+        self.threshold = threshold
+        self.score: Score = score
+        # the number type of log_prob: of classes that of one label's, otherwise that of a sample of nothing
+        if density.has_enumerate_support:
+            like = density.log_prob(density.enumerate_support()[0])
+        else:
+            like = density.sample(torch.Size((0,)))
+        shape = (*density.batch_shape, 1)
+        super().__init__(torch.zeros(shape, dtype=like.dtype, device=like.device), Reshaped(density, shape))
+
+    @torch.no_grad()
+    def scores(self, value: Tensor) -> Float[Tensor, "*shape"]:
+        """How unexpected each value (*sample, *batch, *event) is, nats, float64."""
+        log_prob = self.density.log_prob(value).double()
+        if self.score == "density":
+            return -log_prob
+        if self._classes:
+            return _of_labels(log_prob, self._log_labels)
+        if log_prob.numel() == 0:
+            return log_prob
+        if self._one:
+            flat = log_prob.reshape(-1, self._line.items)
+            return torch.stack([self._line.score_of(level) for level in flat]).reshape(log_prob.shape)
+        return _among(log_prob, self._log_draws)
+
+    @torch.no_grad()
+    def contains(self, value: Tensor) -> Bool[Tensor, "*shape"]:
+        """Whether each value (*sample, *batch, *event) is in its item's set; of a density that is NaN nothing is."""
+        if self._everything:
+            return ~self.density.log_prob(value).isnan()
+        several = value.numel() > FEW * self.batch_shape.numel()
+        if self._one and self.score == "mass" and several:
+            return self.density.log_prob(value).double() >= self._level.reshape(self.batch_shape)
+        return self.scores(value) <= self.threshold
+
+    @torch.no_grad()
+    def size(self) -> Float[Tensor, "*batch"]:
+        """Of classes the number of labels; of one angle the length of the arcs, radians; of one real the length.
+
+        Of several numbers the volume, as the mean over draws of 1/p within the set; it alone has a sampling error.
+        float64; infinite where the set is unbounded, NaN where the density is.
+        """
+        if self._classes:
+            return self.labels().sum(-1).double()
+        if self._one:
+            return self._ends.length.reshape(self.batch_shape)
+        if self._everything:
+            return self._log_draws[0].new_full(self.batch_shape, self._whole)
+        inside = torch.where(
+            self.contains(self._draws), -self.density.log_prob(self._draws).double(), -math.inf
+        )
+        return inside.exp().mean(0)
+
+    def empty(self) -> Bool[Tensor, "*batch"]:
+        """Whether nothing is in the set."""
+        if self._classes:
+            return ~self.labels().any(-1)
+        if self._one:
+            return self.size() == 0
+        return ~(self.contains(self._draws).any(0) | self.contains(self.density.mode))
+
+    def labels(self) -> Bool[Tensor, "*batch label"]:
+        """Which classes are in the set.
+
+        Raises:
+            UserError: the density is not over classes.
+        """
+        if not self._classes:
+            raise UserError(
+                "labels() are of classes; this set is of numbers: use intervals() or contains(value)."
+            )
+        return self.contains(self.density.enumerate_support()).movedim(0, -1)
+
+    def intervals(self) -> list[list[tuple[float, float]]]:
+        """The set of every item of the flattened batch as (low, high), ascending.
+
+        Of a real they may be infinite. Of an angle they are radians, from low in [-π, π) counter-clockwise to high,
+        which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). Their ends are as exact as the
+        density's number type. A hump of the density is found if one of its components has its mode there.
+
+        Raises:
+            UserError: the density is not of one number.
+        """
+        if not self._one:
+            raise UserError(
+                "intervals() are of one angle or one real; use labels() of classes, and of several numbers "
+                "contains(value), or a set of the marginal() of each."
+            )
+        return self._ends.intervals
+
+    @property
+    def _classes(self) -> bool:
+        return self.density.has_enumerate_support
+
+    @property
+    def _one(self) -> bool:
+        return tuple(self.event_shape) == (1,)
+
+    @property
+    def _everything(self) -> bool:
+        return float(self.threshold) == math.inf
+
+    @property
+    def _whole(self) -> float:
+        """The volume of everything."""
+        support = self.support
+        if not isinstance(support, Circular):
+            return math.inf
+        ranges = support.ranges or ((-math.pi, math.pi),) * self.event_shape[0]
+        return math.prod(high - low for low, high in ranges)
+
+    @cached_property
+    @torch.no_grad()
+    def _log_labels(self) -> Float[Tensor, "label *batch"]:
+        return self.density.log_prob(self.density.enumerate_support()).double()
+
+    @cached_property
+    @torch.no_grad()
+    def _draws(self) -> Tensor:
+        return self.density.sample(torch.Size((DRAWS,)))
+
+    @cached_property
+    @torch.no_grad()
+    def _log_draws(self) -> Float[Tensor, "draw *batch"]:
+        return self.density.log_prob(self._draws).double().sort(0).values
+
+    @cached_property
+    @torch.no_grad()
+    def _line(self) -> Line:
+        return Line(self.density)
+
+    @cached_property
+    @torch.no_grad()
+    def _level(self) -> Float[Tensor, "item"]:
+        """The least log-density in the set, nats, of one number."""
+        threshold = self.threshold.double().to(self._line.heights.device)
+        if self.score == "mass" and not self._everything:
+            return self._line.level_of(threshold)
+        return (-threshold).expand(self._line.items)
+
+    @cached_property
+    @torch.no_grad()
+    def _ends(self) -> Ends:
+        return self._line.ends(self._level)
+
+
+def _of_labels(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Tensor:
+    """-log(Σ_j p_j of the less probable labels + (1 - u) p(y)): the complement of the sum from the top that Romano,
+    Sesia & Candès 2020 (eq. 5) take, which rounds to 1 where it matters."""
+    top = every.topk(min(2, len(every)), dim=0).values
+    margin = top[0] - top[-1]
+    # digits of the margin that mean nothing: distinct for distinct inputs, the same for the same
+    share = torch.frac(997 * margin.where(margin.isfinite(), 0.0)).clamp(1e-6, 1 - 1e-6)
+    less = torch.where(_beside(every, log_prob) < log_prob, _beside(every, log_prob), -math.inf).logsumexp(0)
+    return -torch.logaddexp(less, log_prob + torch.log1p(-share))
+
+
+def _beside(every: Tensor, values: Tensor) -> Tensor:
+    """(label, *batch) as (label, *1, *batch), against values (*sample, *batch)."""
+    return every.reshape(len(every), *(1,) * (values.dim() - every.dim() + 1), *every.shape[1:])
+
+
+def _among(log_prob: Tensor, drawn: Float[Tensor, "draw *batch"]) -> Tensor:
+    """-log of the share of draws, ascending, that are less dense; linear between draws, and below the last of them in
+    log p, so that equal scores are rare."""
+    edges = drawn.movedim(0, -1).contiguous()
+    lead = log_prob.shape[: log_prob.dim() - edges.dim() + 1]
+    flat = log_prob.reshape(lead.numel(), *edges.shape[:-1]).movedim(0, -1).contiguous()
+    above = torch.searchsorted(edges, flat)
+    low, high = edges.gather(-1, (above - 1).clamp(min=0)), edges.gather(-1, above.clamp(max=len(drawn) - 1))
+    part = torch.where(high > low, (flat - low) / (high - low), 0.0).clamp(0, 1)
+    rank = above + part.where((above > 0) & (above < len(drawn)), 0.0)
+    beyond = (edges[..., :1] - flat).clamp(min=0)
+    found = math.log(len(drawn) + 1) - (rank + 1).log() + beyond
+    return found.movedim(-1, 0).reshape(log_prob.shape)
+
+
+@estimate.register
+def _(density: PredictionSet, value: Tensor) -> Estimate:
+    return estimate(density.density, value)
+
+
+@median.register
+def _(density: PredictionSet, samples: int) -> Tensor:
+    return median(density.density, samples)
+
+
+@marginal.register
+def _(density: PredictionSet, index: int) -> Distribution:
+    """Without a set: what was promised of all numbers together is not so of one."""
+    return density if tuple(density.event_shape) == (1,) and index == 0 else marginal(density.density, index)

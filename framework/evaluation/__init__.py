@@ -1,0 +1,1 @@
+"""Metrics over splits, what a prediction costs, and error against run time."""

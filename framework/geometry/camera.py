@@ -1,0 +1,63 @@
+"""Pinhole cameras; pixel centres lie at integer coordinates, x right, y down, z forward."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.geometry.rotation import viewpoint_rotation
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion.
+
+    A world point X is seen at pixel (fx x/z + cx, fy y/z + cy), where (x, y, z) = rotation @ X + translation.
+
+    Attributes:
+        rotation: world to camera, determinant +1.
+        translation: metres.
+        focal: (fx, fy), pixels, > 0.
+        principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2).
+        height, width: image size, pixels.
+        near: nothing nearer than this is seen, metres, > 0.
+    """
+
+    rotation: Float[Tensor, "3 3"]
+    translation: Float[Tensor, "3"]
+    focal: tuple[float, float]
+    principal: tuple[float, float]
+    height: int
+    width: int
+    near: float = 1e-3
+
+
+def look_from(
+    azimuth: float,
+    elevation: float,
+    tilt: float,
+    distance: float,
+    field_of_view: float,
+    size: tuple[int, int],
+) -> Camera:
+    """A camera at `distance` (metres) from the origin that looks at it, z up, angles in radians.
+
+    Azimuth turns about the vertical (0 looks at the object's front, from -y), elevation lifts the camera, tilt
+    rolls it in the plane: the convention of PASCAL3D+ annotations. `field_of_view` is vertical; `size` is
+    (height, width).
+    """
+    height, width = size
+    rotation = viewpoint_rotation(torch.tensor([azimuth, elevation, tilt], dtype=torch.float64))
+    # PASCAL3D+ camera frames have y up and look along -z; images have y down and look along +z.
+    flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64).diag()
+    focal = 0.5 * height / math.tan(0.5 * field_of_view)
+    return Camera(
+        rotation=(flip @ rotation).float(),
+        translation=torch.tensor([0.0, 0.0, distance]),
+        focal=(focal, focal),
+        principal=((width - 1) / 2, (height - 1) / 2),
+        height=height,
+        width=width,
+    )

@@ -1,0 +1,263 @@
+"""Batches of point clouds: how many points each has, padding, normalisation and the way back (thesis eq. 6.1-6.2).
+
+A batch is a float tensor (batch, points, columns): x, y, z, then attributes of each point (colours, normals, anything).
+Clouds of fewer points are padded at their end with rows that are NaN in every column. Messages count clouds and points
+from 0.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from framework.errors import ConfigError, DataError
+
+Normalisation = Literal["unit_ball", "robust", "none"]
+REACH = 3.0
+"""Of "robust": points further from the middle than this many median distances count neither for centre nor scale."""
+LOOSE, TIGHT = 2.0, 0.01
+"""A cloud whose largest norm, in units of what it is compared with, is outside of these was not normalised."""
+
+
+class Normalised(NamedTuple):
+    """Clouds about the origin; centre and scale lead back (`denormalised`).
+
+    Attributes:
+        clouds: of the dtype that came; attributes and padding as they came.
+        centre, scale: of each cloud, in its own units, float64, so that the way back loses no digits of clouds that
+            are far from the origin. The scale of a cloud whose points are all in one place is 1.
+    """
+
+    clouds: Float[Tensor, "batch points columns"]
+    centre: Float[Tensor, "batch 3"]
+    scale: Float[Tensor, "batch"]
+
+
+def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
+    """Refuse inputs that are no clouds, (points, columns).
+
+    Raises:
+        ConfigError: says what `by` wants.
+    """
+    if len(input_shape) != 2 or input_shape[1] < 3:
+        raise ConfigError(
+            f"{by} got inputs of shape {input_shape}; wanted clouds, (points, columns) with x, y, z in the first three "
+            "columns. Choose data of point clouds, or another encoder."
+        )
+
+
+def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
+    """How many points each cloud of (batch, points, columns) has, without the padding.
+
+    Raises:
+        DataError: no batch of clouds; a cloud without points; a number that is NaN or infinite. Names the cloud, and
+            its first bad point.
+    """
+    if clouds.dim() != 3 or clouds.shape[2] < 3 or clouds.dtype not in (torch.float32, torch.float64):
+        raise DataError(
+            f"A batch of clouds of shape {tuple(clouds.shape)} and type {clouds.dtype}; wanted (batch, points, columns)"
+            " of float32 or float64 with x, y, z in the first three columns. Check what `data` yields."
+        )
+    count, points, _ = clouds.shape
+    # a finite sum has no summand that is not, so that one pass suffices for clouds without padding
+    if points and math.isfinite(float(clouds.detach().sum())):
+        return torch.full((count,), points, device=clouds.device)
+    number = torch.arange(1, points + 1, device=clouds.device)
+    padding = clouds.isnan().all(-1)
+    counts = number.new_zeros(count) if points == 0 else number.where(~padding, 0).amax(1)
+    empty = (counts == 0).nonzero()
+    if len(empty):
+        raise DataError(
+            f"Cloud {int(empty[0])} of the batch has no point (rows of NaN are padding); wanted one at least. "
+            "Leave out what was read from an empty file."
+        )
+    bad = ~clouds.isfinite().all(-1) & (number <= counts[:, None])
+    if bad.any():
+        cloud, point = bad.nonzero()[0].tolist()
+        column = int((~clouds[cloud, point].isfinite()).nonzero()[0])
+        raise DataError(
+            f"Cloud {cloud} of the batch holds {clouds[cloud, point, column].item()} in column {column} of its point "
+            f"{point}; wanted finite numbers, and rows of NaN as padding at the end alone. Mend the file, or drop such "
+            "points (framework.geometry.clouds.without_bad_points)."
+        )
+    return counts
+
+
+def without_bad_points(
+    clouds: Float[Tensor, "batch points columns"],
+) -> tuple[Float[Tensor, "batch fewer columns"], Int[Tensor, "batch"]]:
+    """The clouds without points that hold a NaN or infinite number, and how many each has lost; padding is no loss.
+
+    Raises:
+        DataError: nothing is left of a cloud; names it.
+    """
+    padding = clouds.isnan().all(-1).flip(1).cumprod(1).flip(1).bool()  # NaN from here to the end
+    good = clouds.isfinite().all(-1)
+    dropped = (~good & ~padding).sum(1)
+    empty = (~good.any(1)).nonzero()
+    if len(empty):
+        cloud = int(empty[0])
+        raise DataError(
+            f"Cloud {cloud} of the batch has no finite point, {int(dropped[cloud])} that are not; wanted one at least. "
+            "Leave this cloud out."
+        )
+    return pad([cloud[kept] for cloud, kept in zip(clouds, good, strict=True)]), dropped
+
+
+def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
+    """Clouds (points, columns) of different sizes as one batch: rows of NaN at the end of those that are not largest.
+
+    Raises:
+        DataError: no cloud, or clouds that differ in their columns.
+    """
+    shapes = {tuple(cloud.shape[1:]) for cloud in clouds}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        found = ", ".join(str(tuple(cloud.shape)) for cloud in clouds[:4]) or "none"
+        raise DataError(
+            f"Clouds of shapes {found} do not make a batch; wanted one cloud at least, each (points, columns) with as "
+            "many columns as the others. Give every cloud the same attributes."
+        )
+    return pad_sequence(list(clouds), batch_first=True, padding_value=math.nan)
+
+
+def normalised(
+    clouds: Float[Tensor, "batch points columns"], how: Normalisation, counts: Tensor | None = None
+) -> Normalised:
+    """Clouds about the origin, within the unit ball; differentiable in the clouds.
+
+    "unit_ball": the mean of the points is subtracted, then all is divided by the largest norm (eq. 6.2). "robust": the
+    same, but mean and largest norm are those of the points within `REACH` median distances of the coordinates' medians,
+    so that far outliers, up to some 30 % of the points, do not shift them at all; they end outside of the ball. Where
+    half of the points or more are in one place, all count. "none": as they came, about 0 and of scale 1.
+
+    Args:
+        counts: what `sizes` says of them, where that is known.
+
+    Raises:
+        DataError: as `sizes`; or squared distances within a cloud exceed float64.
+    """
+    if counts is None:
+        counts = sizes(clouds)
+    count = len(clouds)
+    if how == "none" or count == 0:
+        origin = torch.zeros(count, 3, dtype=torch.float64, device=clouds.device)
+        return Normalised(clouds, origin, torch.ones_like(origin[:, 0]))
+    if how == "unit_ball" and clouds.device.type == "cpu":
+        found = _compiled(clouds.detach(), counts)
+        if clouds.requires_grad and torch.is_grad_enabled():  # the same bits, and a gradient
+            traced = _composed(clouds, how, counts)
+            pairs = zip(found, traced, strict=True)
+            found = Normalised(*(value + (other - other.detach()) for value, other in pairs))
+    else:
+        found = _composed(clouds, how, counts)
+    if clouds.dtype == torch.float64 and not bool(found.scale.isfinite().all()):
+        cloud = int((~found.scale.isfinite()).nonzero()[0])
+        raise DataError(
+            f"Cloud {cloud} of the batch is so large that squared distances exceed float64; wanted coordinates below "
+            "1e150. Choose other units."
+        )
+    return found
+
+
+def _compiled(clouds: Tensor, counts: Tensor) -> Normalised:
+    """ "unit_ball" on the processor: a third of the time that tensor operations take, one cloud at a time."""
+    from framework.geometry.clouds_compiled import unit_ball
+
+    clouds = clouds.contiguous()  # compiled for that alone
+    made = torch.empty_like(clouds)
+    centre = torch.empty(len(clouds), 3, dtype=torch.float64)
+    scale = torch.empty(len(clouds), dtype=torch.float64)
+    unit_ball(clouds.numpy(), counts.numpy(), made.numpy(), centre.numpy(), scale.numpy())
+    return Normalised(made, centre, scale)
+
+
+def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
+    """By operations on tensors, on any device, differentiable."""
+    _, points, columns = clouds.shape
+    real = None  # a mask of the points, where there is padding
+    if not bool((counts == points).all()):
+        real = (torch.arange(points, device=clouds.device) < counts[:, None])[..., None]
+    coordinates = clouds[..., :3].double()
+    first = coordinates[:, :1]
+    # about the first point: what is far from the origin keeps its digits, equal points are exactly equal
+    offset = coordinates - first
+    if real is not None:
+        offset = offset.where(real, 0)  # before anything is multiplied: NaN × 0 is no gradient
+    kept = real if how == "unit_ball" else near_middle(offset, real)
+    if kept is None:
+        mean = offset.mean(1, keepdim=True)
+    else:
+        mean = offset.where(kept, 0).sum(1, keepdim=True) / kept.sum(1, keepdim=True)
+    local = offset - mean  # the numerator of eq. 6.2
+    norm = torch.linalg.vector_norm(local, dim=-1)
+    largest = (norm if kept is None else norm.where(kept[..., 0], 0)).amax(1)  # its denominator
+    scale = largest.where(largest > 0, 1)
+    local = (local / scale[:, None, None]).to(clouds.dtype)
+    if real is not None:
+        local = local.where(real, math.nan)
+    if columns > 3:
+        local = torch.cat([local, clouds[..., 3:]], -1)
+    return Normalised(local, (first + mean)[:, 0], scale)
+
+
+@torch.no_grad()
+def near_middle(
+    offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
+) -> Bool[Tensor, "batch points 1"]:
+    """Which points are within `REACH` median distances of the coordinates' medians; which are not far outliers."""
+    known = offset if real is None else offset.where(real, math.nan)
+    distance = torch.linalg.vector_norm(known - known.nanmedian(1, keepdim=True).values, dim=-1, keepdim=True)
+    typical = distance.nanmedian(1, keepdim=True).values
+    near = distance <= REACH * typical  # not where NaN
+    return near.where(typical > 0, ~distance.isnan())
+
+
+def denormalised(
+    points: Float[Tensor, "batch points columns"],
+    centre: Float[Tensor, "batch 3"],
+    scale: Float[Tensor, "batch"],
+) -> Float[Tensor, "batch points columns"]:
+    """Normalised points back in their cloud's own units, of the dtype that came; further columns as they came."""
+    back = points[..., :3] * scale[:, None, None] + centre[:, None]
+    return torch.cat([back.to(points.dtype), points[..., 3:]], -1)
+
+
+def require_normalised(
+    coordinates: Float[Tensor, "batch points 3"], reach: float, counts: Tensor, by: str
+) -> None:
+    """Refuse clouds that were plainly not normalised, of which a basis or a grid about the origin says nothing.
+
+    Args:
+        coordinates: of clouds that were not normalised by "unit_ball" or "robust".
+        reach: how far basis or grid reach along an axis.
+        counts: sizes of the clouds.
+        by: who refuses.
+
+    Raises:
+        DataError: half of a cloud's points are further than 2 reaches from the origin (fewer may be outliers that a
+            robust normalisation left there), or all are within 0.01 (but not all on it).
+    """
+    real = torch.arange(coordinates.shape[1], device=coordinates.device) < counts[:, None]
+    norm = torch.linalg.vector_norm(coordinates.detach().double(), dim=-1)
+    largest = norm.where(real, 0).amax(1) if norm.shape[1] else norm.sum(1)
+    far = largest > LOOSE * reach
+    if far.any():
+        far = norm.where(real, torch.nan).nanmedian(1).values > LOOSE * reach
+    bad = far | ((largest < TIGHT * reach) & (largest > 0))
+    if bad.any():
+        cloud = int(bad.nonzero()[0])
+        raise DataError(
+            f"Cloud {cloud} of the batch reaches {largest[cloud]:.3g} from the origin; {by} with normalise=none wants "
+            f"clouds about the origin that reach between {TIGHT * reach:g} and {LOOSE * reach:g}, some outliers apart, "
+            "since it says nothing of others. Choose normalise=unit_ball."
+        )
+
+
+def cell_centres(side: int) -> Float[Tensor, "cells 3"]:
+    """Of the side³ cells of the cube [-1, 1]³, x slowest, float64."""
+    axis = (torch.arange(side, dtype=torch.float64) * 2 + 1 - side) / side  # exactly symmetric about 0
+    return torch.cartesian_prod(axis, axis, axis)

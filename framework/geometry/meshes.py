@@ -1,0 +1,204 @@
+"""Meshes and point clouds: reading their files, and points drawn from a surface, uniformly by area."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from framework.errors import DataError, did_you_mean
+from framework.geometry import mesh_files
+from framework.geometry.mesh_files import COLOURS, Parsed
+from framework.geometry.ply import ply
+
+READERS: dict[str, Callable[[bytes], Parsed]] = {
+    ".off": mesh_files.off,
+    ".ply": ply,
+    ".stl": mesh_files.stl,
+    ".obj": mesh_files.obj,
+    ".npy": mesh_files.npy,
+    ".npz": mesh_files.npz,
+    ".xyz": mesh_files.xyz,
+}
+"""What can be read, by the end of the file's name."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh, or a point cloud: a mesh without faces.
+
+    Attributes:
+        source: where it comes from, for messages.
+        vertices: coordinates in the file's unit, finite.
+        faces: rows of `vertices`, corners counter-clockwise seen from outside.
+        columns: names of the attributes, "red", "green", "blue" (0…1), "normal_x" and so on, or the file's own.
+        attributes: a number for each vertex and column, as the file has it: it may be NaN.
+        dropped: how many vertices were left out because a coordinate was not finite (only when asked).
+    """
+
+    source: str
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    columns: tuple[str, ...] = ()
+    attributes: Float[np.ndarray, "vertices columns"] | None = None
+    dropped: int = 0
+
+    def attribute(self, names: Sequence[str]) -> Float[np.ndarray, "vertices names"]:
+        """The attributes asked for.
+
+        Raises:
+            DataError: there is none of this name, one is not finite, or a colour lies outside 0…1.
+        """
+        missing = [name for name in names if name not in self.columns]
+        if missing:
+            raise DataError(
+                f"{self.source} has no column {missing[0]!r}.{did_you_mean(missing[0], self.columns)} Its columns "
+                f"beside x, y, z: {', '.join(self.columns) or 'none'}. Leave it out, or add it to the file."
+            )
+        if not names or self.attributes is None:
+            return np.empty((len(self.vertices), 0))
+        found = self.attributes[:, [self.columns.index(name) for name in names]]
+        wrong = ~np.isfinite(found)
+        if wrong.any():
+            row, column = (int(numbers[0]) for numbers in np.nonzero(wrong))
+            raise DataError(
+                f"{self.source}: point {row} (from 0) has {names[column]} = {found[row, column]}; wanted finite "
+                "numbers. Mend the file, or leave that column out."
+            )
+        bounded = [number for number, name in enumerate(names) if name in COLOURS]
+        colours = found[:, bounded]
+        if colours.size and not (colours.min() >= 0 and colours.max() <= 1):
+            raise DataError(
+                f"{self.source}: its colours go from {colours.min():g} to {colours.max():g}; wanted 0 to 1. Divide "
+                "them by 255, say."
+            )
+        return found
+
+
+def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
+    """Read a mesh or cloud file; which format it is its name says, in capitals or not.
+
+    Args:
+        drop_non_finite: leave out vertices with a NaN or infinite coordinate, and faces that use them, and count
+            them in `dropped`, instead of refusing.
+
+    Raises:
+        DataError: no such file or format, damage, no vertices, a face that names a vertex that is not there, a
+            coordinate that is not finite. Nothing is mended silently.
+    """
+    parse = READERS.get(file.suffix.lower())
+    if parse is None:
+        raise DataError(f"{file}: cannot be read; wanted a file whose name ends in {', '.join(READERS)}.")
+    try:
+        found = parse(file.read_bytes())
+    except FileNotFoundError:
+        raise DataError(f"{file}: no such file; wanted a mesh or point cloud. Mend the path.") from None
+    except Exception as error:  # NumPy's archives raise whatever damage leads them to
+        kind = file.suffix[1:].upper()
+        raise DataError(f"{file}: cannot be read as {kind}: {error}. Restore it from its source.") from error
+    if not len(found.vertices):
+        raise DataError(f"{file}: it has no vertices; wanted at least one. Leave it out, or restore it.")
+    _check_faces(file, found)
+    mesh = Mesh(str(file), found.vertices, found.faces, found.columns, found.attributes)
+    return _finite(mesh, drop_non_finite)
+
+
+def _check_faces(file: Path, found: Parsed) -> None:
+    wrong = (found.faces < 0) | (found.faces >= len(found.vertices))
+    if wrong.any():
+        row = int(np.flatnonzero(wrong.any(1))[0])
+        raise DataError(
+            f"{file}: triangle {row} (from 0) has the corners {found.faces[row].tolist()}, but there are only vertices "
+            f"0 to {len(found.vertices) - 1}. Restore it from its source."
+        )
+
+
+def _finite(mesh: Mesh, drop: bool) -> Mesh:
+    good = np.asarray(np.isfinite(mesh.vertices).all(1))
+    if good.all():
+        return mesh
+    first = int(np.flatnonzero(~good)[0])
+    if not drop or not good.any():
+        raise DataError(
+            f"{mesh.source}: {int((~good).sum())} of {len(good)} points have a coordinate that is not finite, first "
+            f"point {first} (from 0): {mesh.vertices[first].tolist()}. Mend the file, or leave it out."
+        )
+    place = np.cumsum(good) - 1
+    faces = mesh.faces[good[mesh.faces].all(1)]
+    return replace(
+        mesh,
+        vertices=mesh.vertices[good],
+        faces=place[faces],
+        attributes=None if mesh.attributes is None else mesh.attributes[good],
+        dropped=int((~good).sum()),
+    )
+
+
+class Sampled(NamedTuple):
+    """Points of a surface, in the mesh's unit; `weights` of the three corners of the `face` each lies in."""
+
+    points: Float[np.ndarray, "points 3"]
+    face: Int[np.ndarray, "points"]
+    weights: Float[np.ndarray, "points 3"]
+
+
+def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
+    """Independent points, uniform by area: faces with probability proportional to their area, which may be zero.
+
+    Raises:
+        DataError: the mesh has no faces, or none with an area.
+    """
+    cross = _cross(mesh)
+    areas = np.sqrt((cross * cross).sum(0))  # twice the area, in units² of the longest side
+    total = areas.sum()
+    if not total > 0:
+        raise DataError(
+            f"{mesh.source}: its {len(areas)} faces have no area; wanted a surface to draw points from. Leave it out, "
+            "or give points instead of a mesh."
+        )
+    cumulative = np.cumsum(areas)
+    drawn = random.random((3, count))
+    # `right`: a face without area has no interval; the last one with area also gets what rounding leaves over
+    face = np.searchsorted(cumulative, drawn[0] * cumulative[-1], side="right")
+    face = np.minimum(face, np.flatnonzero(areas)[-1])
+    root = np.sqrt(drawn[1])  # P = (1 - √r₁) A + √r₁ (1 - r₂) B + √r₁ r₂ C (Osada et al. 2002, eq. 1)
+    weights = np.stack([1 - root, root * (1 - drawn[2]), root * drawn[2]], 1)
+    a, b, c = mesh.vertices[mesh.faces[face].T]
+    return Sampled(a + weights[:, 1:2] * (b - a) + weights[:, 2:] * (c - a), face, weights)
+
+
+def normals(mesh: Mesh) -> Float[np.ndarray, "faces 3"]:
+    """Unit normals of the faces, outwards; 0 where a face has no area."""
+    cross = _cross(mesh)
+    length = np.sqrt((cross * cross).sum(0))
+    return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0).T
+
+
+def _cross(mesh: Mesh) -> Float[np.ndarray, "3 faces"]:
+    """Cross products of two sides of every face, in units² of the longest side: none over- or underflows."""
+    if not len(mesh.faces):
+        raise DataError(
+            f"{mesh.source}: it has no faces; wanted a surface to draw points from. Use it as the point cloud it is, "
+            "or restore its faces."
+        )
+    a, b, c = (mesh.vertices.T.take(mesh.faces[:, corner], 1) for corner in range(3))
+    with np.errstate(over="ignore"):
+        first, second = b - a, c - a
+    unit = float(max(abs(first.min()), first.max(), abs(second.min()), second.max()))
+    if not np.isfinite(unit):
+        raise DataError(
+            f"{mesh.source}: its sides are longer than any number; wanted below 1e300. Choose other units."
+        )
+    if unit > 0:
+        first, second = first / unit, second / unit
+    (x, y, z), (u, v, w) = first, second
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """The random numbers of a file, whatever was read before it; `name` is the file's own, without folders."""
+    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+    return np.random.default_rng([seed, int.from_bytes(digest, "little")])

@@ -1,0 +1,245 @@
+"""Exact nearest neighbours of query points in point clouds, and the Chamfer distance (thesis eq. 6.4-6.6).
+
+On the processor by compiled kernels (`nearest_numba`, imported when first needed), elsewhere in torch.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from framework.errors import DataError
+
+OFTEN = 2**16
+"""Queries up to which packing them well takes less than a second."""
+
+
+class Nearest(NamedTuple):
+    """The nearest point of each query.
+
+    Attributes:
+        distance: Euclidean, in the unit of the coordinates, of their dtype; NaN for queries beyond `query_sizes`.
+        index: row of the cloud, int64; 0 for queries beyond `query_sizes`. Of points at the same distance, rounded as
+            the dtype rounds its square, the lowest.
+    """
+
+    distance: Float[Tensor, "batch query"]
+    index: Int[Tensor, "batch query"]
+
+
+@dataclass(frozen=True, eq=False)
+class Queries:
+    """Queries that are the same for every cloud, with what is computed from them once (`prepare`).
+
+    Attributes:
+        points: finite.
+        once: whether they are asked of one batch alone, so that it does not pay to pack them well.
+    """
+
+    points: Float[Tensor, "query 3"]
+    once: bool = False
+
+    @cached_property
+    def largest(self) -> float:
+        """The largest coordinate."""
+        return float(self.points.abs().max())
+
+    @cached_property
+    def packed(self) -> Any:
+        from framework.geometry.nearest.processor import packed_once, packed_well
+
+        points = self.points.numpy()
+        return packed_once(points) if self.once or len(points) > OFTEN else packed_well(points)
+
+
+def prepare(queries: Tensor, once: bool = False) -> Queries:
+    """Queries (query, 3) to be asked of many clouds: `nearest` takes them in place of the tensor, and is faster.
+
+    Raises:
+        DataError: there is none, or a coordinate is NaN or infinite.
+    """
+    queries = queries.detach().contiguous()
+    checked(queries[None], "queries")
+    refuse_bad(queries[None], None, "queries")
+    return Queries(queries, once)
+
+
+def nearest(
+    clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None = None, query_sizes: Tensor | None = None
+) -> Nearest:
+    """The nearest point of each cloud to each query: exact in the dtype of the coordinates, float32 or float64.
+
+    Squares of differences are added in that dtype, so that the distance, and that of the point that is found, are the
+    least to 2.5e-7 of the largest coordinate or distance in float32, 1e-15 in float64. Uses as many threads
+    as torch does. No gradient flows through it: gather points by `index` where one is needed.
+
+    Args:
+        clouds: (batch, points, 3), on the device of the queries. Rows from `sizes` on are not read.
+        queries: (query, 3), the same for all clouds, or (batch, query, 3), of each cloud its own.
+        sizes: (batch,) how many points each cloud has; all, where None. Likewise `query_sizes`, of queries (batch, …).
+
+    Raises:
+        DataError: an empty cloud, a number that is not finite, a distance that the dtype cannot hold; names the cloud.
+    """
+    clouds = clouds.detach()
+    own = isinstance(queries, Tensor) and queries.dim() == 3
+    if isinstance(queries, Tensor) and not own:
+        queries = prepare(queries, once=True)
+    points = queries.points if isinstance(queries, Queries) else queries.detach()
+    checked(clouds, "clouds")
+    checked(points if own else points[None], "queries")
+    if points.dtype != clouds.dtype or points.device != clouds.device or (own and len(points) != len(clouds)):
+        raise DataError(
+            f"Queries of shape {tuple(points.shape)}, {points.dtype} on {points.device} do not go with clouds of shape "
+            f"{tuple(clouds.shape)}, {clouds.dtype} on {clouds.device}. Give both the same type and device, "
+            "and as many sets of queries as clouds, or one."
+        )
+    if query_sizes is not None and not own:
+        raise DataError(
+            "query_sizes came with queries that all clouds share; they say how many queries each cloud has. "
+            "Leave them out, or give queries (batch, query, 3)."
+        )
+    sizes = counted(clouds, sizes, "clouds")
+    query_sizes = counted(points, query_sizes, "queries") if own else None
+    if len(clouds) == 0:
+        return Nearest(clouds.new_empty(0, points.shape[-2]), clouds.new_empty(0, points.shape[-2]).long())
+    if clouds.device.type == "cpu":
+        return on_processor(clouds, queries, sizes, query_sizes)
+    return on_device(clouds, points, sizes, query_sizes)
+
+
+def checked(points: Tensor, name: str) -> None:
+    """Raises DataError unless (batch, points ≥ 1, 3) of float32 or float64."""
+    if points.dim() != 3 or points.shape[2] != 3 or points.dtype not in (torch.float32, torch.float64):
+        raise DataError(
+            f"{name} of shape {tuple(points.shape)} and type {points.dtype} came where coordinates x, y, z of "
+            "float32 or float64 are wanted. Take the first three columns and call .float()."
+        )
+    if points.shape[1] == 0:
+        raise DataError(f"{name} of shape {tuple(points.shape)} hold no point; wanted one at least.")
+
+
+def counted(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
+    """The sizes as int64 on the processor; DataError where one is not in 1…points."""
+    if sizes is None:
+        return None
+    sizes = sizes.to("cpu", torch.int64)
+    wrong = ((sizes < 1) | (sizes > points.shape[1])).nonzero()
+    if len(sizes) != len(points) or len(wrong):
+        told = (
+            f"number {int(wrong[0])} has {int(sizes[wrong[0]])}"
+            if len(wrong)
+            else f"there are {len(sizes)} sizes"
+        )
+        raise DataError(
+            f"Of {len(points)} {name} of up to {points.shape[1]} points, {told}; wanted 1 to {points.shape[1]} for "
+            "each. Leave out what is empty."
+        )
+    return sizes
+
+
+def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
+    """Raises DataError that names the first number that is not finite, where there is one."""
+    bad = ~points.isfinite().all(-1)
+    if sizes is not None:
+        bad &= torch.arange(points.shape[1], device=bad.device) < sizes.to(bad.device)[:, None]
+    if bad.any():
+        cloud, point = bad.nonzero()[0].tolist()
+        raise DataError(
+            f"{name}: point {point} of number {cloud} of the batch is {points[cloud, point].tolist()}; wanted finite "
+            "coordinates. Mend the file, drop such points, or give `sizes` so that padding is not read."
+        )
+
+
+def on_processor(
+    clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None, query_sizes: Tensor | None
+) -> Nearest:
+    from framework.geometry.nearest import processor as nearest_numba
+
+    shared = isinstance(queries, Queries)
+    points = queries.points if isinstance(queries, Queries) else queries.detach().contiguous()
+    clouds = clouds.contiguous()
+    answered = nearest_numba.answers(
+        clouds.numpy(),
+        None if sizes is None else sizes.numpy(),
+        queries.packed if isinstance(queries, Queries) else points.numpy(),
+        None if query_sizes is None else query_sizes.numpy(),
+        queries.largest if isinstance(queries, Queries) else 0.0,
+    )
+    distance, index = torch.from_numpy(answered.distance), torch.from_numpy(answered.index)
+    for i, outcome in enumerate(answered.outcome.tolist() if answered.outcome.any() else ()):
+        if outcome == nearest_numba.BAD_CLOUD:
+            refuse_bad(clouds, sizes, "clouds")
+        elif outcome == nearest_numba.BAD_QUERIES:
+            refuse_bad(points, query_sizes, "queries")
+        elif outcome == nearest_numba.IMMODERATE:
+            some = points if shared else points[i]
+            some = some if query_sizes is None else some[: int(query_sizes[i])]
+            cloud = clouds[i] if sizes is None else clouds[i, : int(sizes[i])]
+            scale = scaling(cloud, some)
+            found = nearest(cloud[None] * scale, some * scale)
+            distance[i, : len(some)], index[i, : len(some)] = (
+                unscaled(found.distance[0], scale, i),
+                found.index[0],
+            )
+    return Nearest(distance, index)
+
+
+def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes: Tensor | None) -> Nearest:
+    from framework.geometry.nearest.device import nearest_of
+
+    refuse_bad(clouds, sizes, "clouds")
+    if query_sizes is not None:
+        refuse_bad(points, query_sizes, "queries")
+    distance, index = nearest_of(clouds, points, sizes, query_sizes)
+    for i in distance.isinf().any(1).nonzero().flatten().tolist():
+        unscaled(distance[i], 1.0, i)
+    return Nearest(distance, index)
+
+
+def scaling(cloud: Tensor, queries: Tensor) -> float:
+    """A power of two, by which multiplying is exact, that takes the largest coordinate to 1, or nearer where the dtype
+    cannot hold such a power: `nearest` then scales once more."""
+    largest = max(float(cloud.abs().max()), float(queries.abs().max()))
+    most = 126 if cloud.dtype == torch.float32 else 1000
+    return 2.0 ** max(-most, min(most, -math.frexp(largest)[1]))
+
+
+def unscaled(distance: Tensor, scale: float, cloud: int) -> Tensor:
+    distance = distance / scale
+    if not distance.isfinite().all():
+        raise DataError(
+            f"Cloud {cloud} of the batch is so far from its queries that {distance.dtype} cannot hold the distance. "
+            "Use float64 or a larger unit."
+        )
+    return distance
+
+
+def chamfer(
+    a: Float[Tensor, "batch points_a 3"],
+    b: Float[Tensor, "batch points_b 3"],
+    sizes_a: Int[Tensor, "batch"] | None = None,
+    sizes_b: Int[Tensor, "batch"] | None = None,
+) -> Float[Tensor, "batch"]:
+    """Mean squared distance to the nearest point of the other cloud, both ways added (eq. 6.6); differentiable.
+
+    Raises:
+        DataError: as `nearest`.
+    """
+    return one_way(a, b, sizes_a, sizes_b) + one_way(b, a, sizes_b, sizes_a)
+
+
+def one_way(queries: Tensor, clouds: Tensor, query_sizes: Tensor | None, sizes: Tensor | None) -> Tensor:
+    index = nearest(clouds, queries, sizes, query_sizes).index
+    if query_sizes is not None:
+        query_sizes = query_sizes.to(queries.device)
+        real = torch.arange(queries.shape[1], device=queries.device) < query_sizes[:, None]
+        queries = queries.where(real[..., None], 0)  # before anything is multiplied: NaN × 0 is no gradient
+    square = (queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))).square().sum(-1)
+    if query_sizes is None:
+        return square.mean(1)
+    return square.where(real, 0).sum(1) / query_sizes

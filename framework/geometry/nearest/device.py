@@ -1,0 +1,66 @@
+"""Nearest neighbours in torch, for devices other than the processor: all pairs, in pieces of bounded memory."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+PAIRS = 2**24
+"""Squared distances held at a time: three arrays of this size, 192 MiB in float32."""
+
+
+def nearest_of(
+    clouds: Float[Tensor, "batch points 3"],
+    queries: Float[Tensor, "query 3"] | Float[Tensor, "batch query 3"],
+    sizes: Int[Tensor, "batch"] | None,
+    query_sizes: Int[Tensor, "batch"] | None,
+    pairs: int = PAIRS,
+) -> tuple[Float[Tensor, "batch query"], Int[Tensor, "batch query"]]:
+    """Distance and index as `framework.geometry.nearest.Nearest` has them, of finite coordinates.
+
+    Differences are taken before they are squared: |p|² - 2 p·q + |q|² would lose the digits of what is near.
+    """
+    batch, points, _ = clouds.shape
+    asked = queries.shape[-2]
+    if queries.dim() == 2:
+        queries = queries.expand(batch, -1, -1)
+    # divided by a power of two, which is exact, so that no square overflows or vanishes
+    real = torch.arange(points, device=clouds.device) < limits(sizes, batch, points, clouds.device)
+    asking = torch.arange(asked, device=clouds.device) < limits(query_sizes, batch, asked, clouds.device)
+    clouds, queries = clouds.where(real[..., None], 0), queries.where(asking[..., None], 0)
+    largest = torch.maximum(clouds.abs().amax((1, 2)), queries.abs().amax((1, 2)))
+    most = 126 if clouds.dtype == torch.float32 else 1000  # further powers of two are infinite
+    exponent = torch.frexp(largest).exponent.clamp(-most, most)
+    clouds = torch.ldexp(clouds, -exponent[:, None, None])
+    queries = torch.ldexp(queries, -exponent[:, None, None])
+
+    distance = clouds.new_empty(batch, asked)
+    index = torch.empty(batch, asked, dtype=torch.int64, device=clouds.device)
+    # the dimension that is cut last is cut finest
+    cut_points = min(points, pairs)
+    cut_queries = max(1, min(asked, pairs // cut_points))
+    cut_batch = max(1, min(batch, pairs // (cut_points * cut_queries)))
+    for b in range(0, batch, cut_batch):
+        for q in range(0, asked, cut_queries):
+            some = queries[b : b + cut_batch, q : q + cut_queries]
+            best = some.new_full(some.shape[:2], torch.inf)
+            which = torch.zeros_like(best, dtype=torch.int64)
+            for p in range(0, points, cut_points):
+                piece = clouds[b : b + cut_batch, p : p + cut_points]
+                square = (some[:, :, None, 0] - piece[:, None, :, 0]).square_()
+                square += (some[:, :, None, 1] - piece[:, None, :, 1]).square_()
+                square += (some[:, :, None, 2] - piece[:, None, :, 2]).square_()
+                square.masked_fill_(~real[b : b + cut_batch, None, p : p + cut_points], torch.inf)
+                least = square.argmin(2)  # the first of equal ones
+                square = square.gather(2, least[..., None])[..., 0]
+                nearer = square < best
+                best, which = square.where(nearer, best), (least + p).where(nearer, which)
+            distance[b : b + cut_batch, q : q + cut_queries] = best.sqrt()
+            index[b : b + cut_batch, q : q + cut_queries] = which
+    distance = torch.ldexp(distance, exponent[:, None])
+    return distance.where(asking, torch.nan), index.where(asking, 0)
+
+
+def limits(sizes: Tensor | None, batch: int, most: int, device: torch.device) -> Int[Tensor, "batch 1"]:
+    if sizes is None:
+        return torch.full((batch, 1), most, device=device)
+    return sizes.to(device)[:, None]

@@ -1,0 +1,389 @@
+"""Nearest neighbours on the processor: which kernel for which cloud, and in how many threads."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from threading import local
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from framework.geometry.nearest.compiled import compiled, taken_from
+from framework.geometry.nearest.lanes import LANES
+from framework.geometry.nearest.pack import (
+    BITS,
+    MODERATE,
+    Bench,
+    Packed,
+    bench,
+    box_leaves,
+    box_nodes,
+    cell_bits,
+    curve,
+    extent,
+    histogram,
+    pack,
+    places,
+    room,
+    scatter,
+    sort_crowded,
+)
+from framework.geometry.nearest.search import search, search_all
+
+Array = NDArray[np.floating]
+FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
+"""What became of a cloud: answered; a number is not finite, in it or in its queries; to be scaled first."""
+ASKED = 17
+"""Where packed queries keep their number, among the levels."""
+LARGE = 2**15
+"""Points or queries from which one cloud is worth several threads."""
+TURNS = 16
+"""Parts of each thread's share of the work: so little is left to one while the others have ended."""
+AT_ONCE = 2**24
+"""Points and queries of one call, some tenths of a second: signals are heard between calls."""
+
+
+class Problem(NamedTuple):
+    """A batch of clouds and their queries, as the kernels read it.
+
+    Attributes:
+        clouds: (batch, 3 points); sizes (batch,).
+        queries: (batch, 3 queries), query_sizes (batch,); of no batch where all clouds share `packets`.
+        moderate: see `MODERATE`; largest: of the coordinates of shared queries.
+        distance, index, outcome: what is written; the last is one of the four above.
+    """
+
+    clouds: Array
+    sizes: NDArray[np.int64]
+    queries: Array
+    query_sizes: NDArray[np.int64]
+    packets: Packed
+    moderate: tuple[float, float]
+    largest: float
+    distance: Array
+    index: NDArray[np.int64]
+    outcome: NDArray[np.int64]
+
+
+@compiled
+@no_type_check
+def worth_packing(size, packets):
+    """Measured: packing a cloud costs as much as comparing it with three packets, a search as some hundred points."""
+    return packets > 3 and size * packets > 8192
+
+
+@compiled
+@no_type_check
+def largest_of(box):
+    largest = abs(box[0])
+    for i in range(1, 6):
+        largest = max(largest, abs(box[i]))
+    return largest
+
+
+@compiled
+@no_type_check
+def answer(problem, begin, end, cells, work, packed, own):
+    """Clouds begin…end of a batch, one after the other."""
+    shared = problem.query_sizes.shape[0] == 0
+    box = np.empty(6, problem.clouds.dtype)
+    for i in range(begin, end):
+        cloud, size = problem.clouds[i], problem.sizes[i]
+        if not extent(cloud, size, box):
+            problem.outcome[i] = BAD_CLOUD
+            continue
+        largest = np.float64(largest_of(box))
+        packets, number = problem.packets, problem.packets.levels[8]
+        if shared:
+            largest = max(largest, problem.largest)
+        else:
+            query_size = problem.query_sizes[i]
+            query_box = np.empty(6, problem.clouds.dtype)
+            if not extent(problem.queries[i], query_size, query_box):
+                problem.outcome[i] = BAD_QUERIES
+                continue
+            largest = max(largest, np.float64(largest_of(query_box)))
+        if largest != 0 and not problem.moderate[0] <= largest <= problem.moderate[1]:
+            problem.outcome[i] = IMMODERATE
+            continue
+        if not shared:
+            pack(problem.queries[i], query_size, query_box, cells, work, own)
+            packets, number = own, own.levels[8]
+        if worth_packing(size, number):
+            pack(cloud, size, box, cells, work, packed)
+            search(packed, packets, 0, number, problem.distance[i], problem.index[i])
+        else:
+            search_all(cloud, size, packets, 0, number, problem.distance[i], problem.index[i])
+        problem.outcome[i] = FINE
+
+
+@compiled
+@no_type_check
+def answer_share(problem, taken, step, limit, cells, work, packed, own):
+    """What one thread answers of a batch: the next `step` clouds in turn, until it has answered `limit` or all are."""
+    batch = problem.sizes.shape[0]
+    answered = 0
+    while answered < limit:
+        begin = taken_from(taken, step)
+        if begin >= batch:
+            return
+        answer(problem, begin, min(batch, begin + step), cells, work, packed, own)
+        answered += step
+
+
+@compiled
+@no_type_check
+def search_share(packed, packets, taken, step, distance, index):
+    """What one thread searches for: the next `step` packets in turn, until there are none."""
+    number = packets.levels[8]
+    while True:
+        begin = taken_from(taken, step)
+        if begin >= number:
+            return
+        search(packed, packets, begin, min(number, begin + step), distance, index)
+
+
+@compiled
+@no_type_check
+def search_all_share(cloud, size, packets, taken, step, distance, index):
+    """As above, of a cloud that was not packed."""
+    number = packets.levels[8]
+    while True:
+        begin = taken_from(taken, step)
+        if begin >= number:
+            return
+        search_all(cloud, size, packets, begin, min(number, begin + step), distance, index)
+
+
+@lru_cache(maxsize=BITS)
+def curves(bits: int) -> NDArray[np.int32]:
+    return curve(bits)
+
+
+def packed_once(points: Array) -> Packed:
+    """Queries in packets of sixteen neighbours as `pack` makes them: fast, for queries that are asked once."""
+    size, box = len(points), np.empty(6, points.dtype)
+    low, high = MODERATE[points.itemsize]
+    flat = points.reshape(-1)
+    if not extent(flat, size, box) or not low <= float(largest_of(box)) <= high:
+        return packed_well(points)
+    packed = room(size, points.dtype)
+    pack(flat, size, box, curves(cell_bits(size)), bench(size), packed)
+    packed.levels[ASKED] = size
+    return packed
+
+
+def packed_well(points: Array) -> Packed:
+    """Queries in packets of sixteen neighbours, by halving at medians: tighter, for queries that are asked often."""
+    packets: list[NDArray[np.int64]] = []
+    waiting = [np.arange(len(points))]
+    while waiting:
+        these = waiting.pop()
+        if len(these) <= LANES:
+            packets.append(np.concatenate([these, np.repeat(these[-1:], LANES - len(these))]))
+            continue
+        with np.errstate(over="ignore"):
+            axis = int(np.ptp(points[these], axis=0).argmax())
+        these = these[np.argsort(points[these, axis], kind="stable")]
+        half = max(LANES, (len(these) // 2 + LANES // 2) // LANES * LANES)  # whole packets
+        waiting += [these[half:], these[:half]]
+    order = np.stack(packets)
+    packed = room(order.size, points.dtype)
+    blocks = packed.points.reshape(len(order), 4, LANES)
+    blocks[:, :3] = points[order].swapaxes(1, 2)
+    packed.ids.reshape(blocks.shape)[:, 3] = order
+    box = packed.box.reshape(6, -1)
+    box[:3, : len(order)] = blocks[:, :3].min(2).T
+    box[3:, : len(order)] = blocks[:, :3].max(2).T
+    packed.levels[8], packed.levels[ASKED] = len(order), len(points)
+    return packed
+
+
+UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.dtype(np.float64))}
+
+
+class Desks(local):
+    """Memory of each thread; that of small clouds is kept for the next call, since finding it takes as long as they."""
+
+    def __init__(self) -> None:
+        self.kept: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}
+
+    def of(self, points: int, queries: int, dtype: np.dtype) -> tuple[Bench, Packed, Packed]:
+        """For clouds of up to so many points, with up to so many queries of their own."""
+        key = points, queries, dtype
+        if key in self.kept:
+            return self.kept[key]
+        own = room(queries, dtype) if queries else UNUSED[dtype.itemsize]
+        made = bench(max(points, queries)), room(points, dtype), own
+        if max(points, queries) < LARGE:
+            self.kept = {key: made}  # no more than one
+        return made
+
+
+DESKS = Desks()
+
+
+class Pool:
+    """Threads that are started when first needed, and anew in a child process: threads do not survive a fork."""
+
+    def __init__(self) -> None:
+        self.threads: ThreadPoolExecutor | None = None
+        self.size = 0
+        os.register_at_fork(after_in_child=self.forget)
+
+    def forget(self) -> None:
+        self.threads = None
+
+    def run(self, work: Callable[[int], object], threads: int) -> None:
+        """work(0) … work(threads - 1) at the same time, the first in this thread."""
+        if threads == 1:
+            work(0)
+            return
+        if self.threads is None or self.size < threads - 1:
+            self.size = threads - 1
+            self.threads = ThreadPoolExecutor(self.size, "nearest")
+        waiting = [self.threads.submit(work, i) for i in range(1, threads)]
+        work(0)
+        for one in waiting:
+            one.result()
+
+
+POOL = Pool()
+
+
+class Answers(NamedTuple):
+    """distance and index (batch, queries), NaN and 0 where nothing was asked; outcome (batch,), one of the four."""
+
+    distance: Array
+    index: NDArray[np.int64]
+    outcome: NDArray[np.int64]
+
+
+def answers(
+    clouds: Array,
+    sizes: NDArray[np.int64] | None,
+    queries: Array | Packed,
+    query_sizes: NDArray[np.int64] | None,
+    largest: float,
+) -> Answers:
+    """Nearest points of clouds (batch, points, 3) to packed queries, or to queries (batch, queries, 3); contiguous.
+
+    `largest` is of the coordinates of packed queries.
+    """
+    batch, points, _ = clouds.shape
+    shared = isinstance(queries, Packed)
+    asked = int(queries.levels[ASKED]) if isinstance(queries, Packed) else queries.shape[1]
+    distance = np.empty((batch, asked), clouds.dtype)
+    index = np.empty((batch, asked), np.int64)
+    if query_sizes is not None:
+        distance.fill(np.nan)
+        index.fill(0)
+    found = Answers(distance, index, np.zeros(batch, np.int64))
+    all_points, all_queries = np.empty(batch, np.int64), np.empty(0 if shared else batch, np.int64)
+    all_points.fill(points)
+    all_queries.fill(asked)
+    nothing = np.empty((0, 0), clouds.dtype)
+    problem = Problem(
+        clouds=clouds.reshape(batch, 3 * points),
+        sizes=all_points if sizes is None else sizes,
+        queries=nothing if isinstance(queries, Packed) else queries.reshape(batch, 3 * asked),
+        query_sizes=all_queries if query_sizes is None else query_sizes,
+        packets=queries if isinstance(queries, Packed) else UNUSED[clouds.itemsize],
+        moderate=MODERATE[clouds.itemsize],
+        largest=largest,
+        distance=found.distance,
+        index=found.index,
+        outcome=found.outcome,
+    )
+    threads = torch.get_num_threads()
+    widest = max(points, 1 if shared else asked)
+    cells = curves(cell_bits(widest))
+    if batch < threads and max(points, asked) >= LARGE and shared:
+        for i in range(batch):
+            solve_one(problem, i, cells, threads)
+        return found
+    threads = 1 if points * asked * batch < 2**20 else min(threads, batch)  # a thread's start takes as long
+    limit = max(1, AT_ONCE // (points + asked))
+    step = min(limit, max(1, batch // (TURNS * threads)))
+    taken = np.zeros(1, np.int64)
+
+    def share(_: int) -> None:
+        mine = DESKS.of(points, 0 if shared else asked, clouds.dtype)
+        while taken[0] < batch:
+            answer_share(problem, taken, step, limit, cells, *mine)
+
+    try:
+        POOL.run(share, threads)
+    finally:
+        taken[0] = batch  # where this thread was interrupted, the others stop too
+    return found
+
+
+def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
+    """One large cloud, or one with many queries, in several threads; to the bit what one thread finds."""
+    cloud, size = problem.clouds[i], int(problem.sizes[i])
+    box = extent_together(cloud, size, threads)
+    if box is None:
+        problem.outcome[i] = BAD_CLOUD
+        return
+    largest = max(float(largest_of(box)), problem.largest)
+    if largest != 0 and not problem.moderate[0] <= largest <= problem.moderate[1]:
+        problem.outcome[i] = IMMODERATE
+        return
+    number = int(problem.packets.levels[8])
+    packing = worth_packing(size, number)
+    packed = room(size, cloud.dtype) if packing else None
+    if packed is not None:
+        pack_together(cloud, size, box, cells, packed, threads)
+    step = max(1, number // (TURNS * threads))
+    taken = np.zeros(1, np.int64)
+
+    def share(_: int) -> None:
+        if packed is None:
+            search_all_share(cloud, size, problem.packets, taken, step, problem.distance[i], problem.index[i])
+        else:
+            search_share(packed, problem.packets, taken, step, problem.distance[i], problem.index[i])
+
+    POOL.run(share, threads)
+    problem.outcome[i] = FINE
+
+
+def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
+    """`extent` in several threads: the box; None where a number is not finite."""
+    threads = max(1, min(threads, size // LARGE))
+    cuts = [size * thread // threads for thread in range(threads + 1)]
+    boxes, finite = np.empty((threads, 6), cloud.dtype), [False] * threads
+
+    def look(thread: int) -> None:
+        begin, end = cuts[thread], cuts[thread + 1]
+        finite[thread] = extent(cloud[3 * begin : 3 * end], end - begin, boxes[thread])
+
+    POOL.run(look, threads)
+    return np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)]) if all(finite) else None
+
+
+def pack_together(
+    cloud: Array, size: int, box: Array, cells: NDArray[np.int32], packed: Packed, threads: int
+) -> None:
+    """`pack` in several threads: each counts, then scatters, its share of the points."""
+    threads = max(1, min(threads, size // LARGE))
+    bits, work = cell_bits(size), bench(size, threads)
+    leaves = -(-size // LANES)
+    cuts = [leaves * thread // threads for thread in range(threads + 1)]
+
+    def shares(thread: int) -> tuple[int, int]:
+        return LANES * cuts[thread], min(size, LANES * cuts[thread + 1])
+
+    POOL.run(lambda t: histogram(cloud, box, bits, *shares(t), work.key, work.count[t]), threads)
+    found = places(work.count, bits, cells, work.crowded)
+    POOL.run(
+        lambda t: scatter(cloud, size, *shares(t), work.key, work.count[t], packed.points, packed.ids),
+        threads,
+    )
+    if found > 0:
+        sort_crowded(packed.points, work.crowded, found, cells)
+    POOL.run(lambda t: box_leaves(packed, size, cuts[t], cuts[t + 1]), threads)
+    box_nodes(packed, size)

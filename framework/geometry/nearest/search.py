@@ -1,0 +1,359 @@
+"""Finds for each of many queries the nearest point of a packed cloud, exactly.
+
+Sixteen neighbouring queries, a leaf of the packed queries, walk through the cloud's tree together. A node is opened if
+its box is nearer to the box of the sixteen than the worst of their best distances so far; then the boxes of its
+children are compared with each query. Where few of the sixteen have business with a child they go on alone, each
+against sixteen boxes or points at a time. The sixteen before leave their nearest points as first guesses.
+
+No slack is needed: a box's squared distance is computed by the same operations as a point's, each of which rounds
+monotonically, so that rounded it is no more than that of any point within.
+
+Ties go to the lowest id: a query that met its best squared distance a second time, in a point or a box, looks through
+all that is as near (`lowest_id`).
+"""
+
+from typing import no_type_check
+
+import numpy as np
+
+from framework.geometry.nearest.compiled import compiled, inlined
+from framework.geometry.nearest.lanes import (
+    LANES,
+    bits,
+    first,
+    fma,
+    highest,
+    how_many,
+    lane,
+    least,
+    load,
+    load_triples,
+    lowest,
+    mask,
+    most,
+    splat,
+    store,
+    take,
+    where,
+)
+
+ALONE = 3
+"""Up to so many of sixteen queries go on alone into a node; measured, as the next."""
+ALONE_IN_LEAF = 8
+
+
+@inlined
+@no_type_check
+def squared(x, y, z):
+    return fma(z, z, fma(y, y, x * x))
+
+
+@inlined
+@no_type_check
+def beside(low, high, query_low, query_high, zero):
+    """How far two intervals are apart, 0 where they meet."""
+    return most(zero, most(low - query_high, query_low - high))
+
+
+@inlined
+@no_type_check
+def to_boxes(box, nodes, start, low, high, zero):
+    """Squared distances of the boxes of 16 nodes from one box."""
+    return squared(
+        beside(load(box, start), load(box, 3 * nodes + start), low[0], high[0], zero),
+        beside(load(box, nodes + start), load(box, 4 * nodes + start), low[1], high[1], zero),
+        beside(load(box, 2 * nodes + start), load(box, 5 * nodes + start), low[2], high[2], zero),
+    )
+
+
+@inlined
+@no_type_check
+def to_box(box, nodes, node, query, zero):
+    """Squared distances of one node's box from 16 queries."""
+    return squared(
+        beside(splat(take(box, node)), splat(take(box, 3 * nodes + node)), query[0], query[0], zero),
+        beside(splat(take(box, nodes + node)), splat(take(box, 4 * nodes + node)), query[1], query[1], zero),
+        beside(
+            splat(take(box, 2 * nodes + node)), splat(take(box, 5 * nodes + node)), query[2], query[2], zero
+        ),
+    )
+
+
+@inlined
+@no_type_check
+def to_point(points, at, query):
+    """Squared distances of 16 queries from the point whose x stands at `at`."""
+    return squared(
+        splat(take(points, at)) - query[0],
+        splat(take(points, at + 16)) - query[1],
+        splat(take(points, at + 32)) - query[2],
+    )
+
+
+@inlined
+@no_type_check
+def to_leaf(points, leaf, x, y, z):
+    """Squared distances of a leaf's 16 points from one query."""
+    at = 64 * leaf
+    return squared(load(points, at) - x, load(points, at + 16) - y, load(points, at + 32) - z)
+
+
+@inlined
+@no_type_check
+def children(level, node, levels):
+    """First child of a node of the level above, and a bit for each child."""
+    return levels[level] + 16 * node, (1 << min(16, levels[8 + level] - 16 * node)) - 1
+
+
+@inlined
+@no_type_check
+def nearest_bit(open_, gaps, at):
+    """Which of the open children is nearest, and how near; `gaps` of the 16 from `at` on."""
+    gap = where(mask(open_), load(gaps, at), splat(gaps.dtype.type(np.inf)))
+    nearest = lowest(gap)
+    return first(bits(gap == splat(nearest)) & open_), nearest
+
+
+@compiled
+@no_type_check
+def alone(packed, level, node, query, best, leaf, opened, gaps):
+    """One query below a node of the level above; best squared distance, its leaf, whether it may be met twice."""
+    points, _, box, _, levels = packed
+    nodes = box.shape[0] // 6
+    zero = splat(box.dtype.type(0))
+    x, y, z = splat(query[0]), splat(query[1]), splat(query[2])
+    top = level
+    tie = False
+    while True:
+        if level < 0:
+            distance = to_leaf(points, node, x, y, z)
+            if bits(distance < splat(best)) != 0:
+                best, leaf, tie = lowest(distance), node, False
+            elif bits(distance == splat(best)) != 0 and leaf != node:
+                tie = True
+            level = 0
+        else:
+            start, valid = children(level, node, levels)
+            gap = to_boxes(box, nodes, start, (x, y, z), (x, y, z), zero)
+            store(gaps, 16 * level, gap)
+            opened[2 * level] = bits(gap <= splat(best)) & valid
+            opened[2 * level + 1] = 16 * node
+        while True:
+            if opened[2 * level] == 0:
+                level += 1
+                if level > top:
+                    return best, leaf, tie
+                continue
+            child, gap = nearest_bit(opened[2 * level], gaps, 16 * level)
+            if gap < best:
+                opened[2 * level] &= ~(1 << child)
+                node = opened[2 * level + 1] + child
+                level -= 1
+                break
+            tie = tie or gap == best
+            opened[2 * level] = 0
+
+
+@compiled
+@no_type_check
+def lowest_id(packed, x, y, z, best, number):
+    """The lowest id, `number` or below, of the points at squared distance `best`, the least."""
+    points, ids, box, low, levels = packed
+    nodes = box.shape[0] // 6
+    zero = splat(box.dtype.type(0))
+    qx, qy, qz = splat(x), splat(y), splat(z)
+    stack = np.empty((8 * LANES, 2), np.int64)  # a level pushes 16 at most, and pops one
+    stack[0, 0], stack[0, 1] = levels[16], 0
+    height = 1
+    while height > 0:
+        height -= 1
+        level, node = stack[height, 0], stack[height, 1]
+        if level < 0:
+            found = bits(to_leaf(points, node, qx, qy, qz) == splat(best))
+            while found != 0:
+                number = min(number, np.int64(take(ids, 64 * node + 48 + first(found))))
+                found &= found - 1
+            continue
+        start, valid = children(level, node, levels)
+        found = bits(to_boxes(box, nodes, start, (qx, qy, qz), (qx, qy, qz), zero) <= splat(best)) & valid
+        while found != 0:
+            child = first(found)
+            found &= found - 1
+            if low[start + child] < number:
+                stack[height, 0], stack[height, 1] = level - 1, 16 * node + child
+                height += 1
+    return number
+
+
+@inlined
+@no_type_check
+def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at):
+    """Compares children with each query and keeps the squared distances; a bit for each child that may hold a best."""
+    zero = splat(box.dtype.type(0))
+    close = bits(to_boxes(box, nodes, start, low, high, zero) <= splat(worst)) & valid
+    kept = 0
+    while close != 0:
+        child = first(close)
+        close &= close - 1
+        gap = to_box(box, nodes, start + child, query, zero)
+        store(near, at + 16 * child, gap)
+        kept |= np.int64(bits(gap <= best) != 0) << child
+    return kept
+
+
+@compiled
+@no_type_check
+def search(packed, packets, begin, end, distance, index):
+    """Distance and index of the nearest point for the queries of packets begin…end, at the places of their ids."""
+    points, ids, box, _, levels = packed
+    real = box.dtype.type
+    nodes = box.shape[0] // 6
+    queries = packets.points
+    sides = packets.box.shape[0] // 6
+    zero, infinite, nothing = splat(real(0)), splat(real(np.inf)), splat(np.int32(0))
+    bests, leaves = np.empty(16, box.dtype), np.empty(16, np.int32)
+    near = np.empty(8 * 256, box.dtype)  # of a node's 16 children from 16 queries, at each level
+    opened, opened_alone = np.empty(16, np.int64), np.empty(16, np.int64)
+    gaps = np.empty(8 * LANES, box.dtype)
+    guess = np.zeros(16, np.int64)  # places of points, from the packet before
+    for packet in range(begin, end):
+        here = 64 * packet
+        query = (load(queries, here), load(queries, here + 16), load(queries, here + 32))
+        low = (
+            splat(take(packets.box, packet)),
+            splat(take(packets.box, sides + packet)),
+            splat(take(packets.box, 2 * sides + packet)),
+        )
+        high = (
+            splat(take(packets.box, 3 * sides + packet)),
+            splat(take(packets.box, 4 * sides + packet)),
+            splat(take(packets.box, 5 * sides + packet)),
+        )
+        best, leaf = infinite, nothing
+        for i in range(16):
+            gap = to_point(points, (guess[i] >> 4) * 64 + (guess[i] & 15), query)
+            leaf = where(gap < best, splat(np.int32(guess[i] >> 4)), leaf)
+            best = least(gap, best)
+        tie = best < zero  # nobody
+        ties = 0
+        worst = highest(best)
+        level = top = levels[16]
+        start, valid = children(level, 0, levels)
+        opened[2 * level] = open_node(
+            box, nodes, start, valid, low, high, query, best, worst, near, 256 * level
+        )
+        opened[2 * level + 1] = 0
+        while True:
+            if opened[2 * level] == 0:
+                level += 1
+                if level > top:
+                    break
+                continue
+            child = first(opened[2 * level])
+            opened[2 * level] &= opened[2 * level] - 1
+            node = opened[2 * level + 1] + child
+            gap = load(near, 256 * level + 16 * child)
+            busy = bits(gap < best)
+            tie = tie | (gap == best)
+            if busy == 0:
+                continue
+            if level > 0:
+                if how_many(busy) > ALONE:
+                    level -= 1
+                    start, valid = children(level, node, levels)
+                    opened[2 * level] = open_node(
+                        box, nodes, start, valid, low, high, query, best, worst, near, 256 * level
+                    )
+                    opened[2 * level + 1] = 16 * node
+                    continue
+                store(bests, 0, best)
+                store(leaves, 0, leaf)
+                while busy != 0:
+                    i = first(busy)
+                    busy &= busy - 1
+                    one = (
+                        take(queries, here + i),
+                        take(queries, here + i + 16),
+                        take(queries, here + i + 32),
+                    )
+                    bests[i], leaves[i], again = alone(
+                        packed, level - 1, node, one, bests[i], np.int64(leaves[i]), opened_alone, gaps
+                    )
+                    ties |= np.int64(again) << i
+                best, leaf = load(bests, 0), load(leaves, 0)
+            else:
+                if how_many(busy) > ALONE_IN_LEAF:
+                    gap = to_point(points, 64 * node, query)
+                    for i in range(1, 16):
+                        gap = least(to_point(points, 64 * node + i, query), gap)
+                else:
+                    gap = infinite
+                    while busy != 0:
+                        i = first(busy)
+                        busy &= busy - 1
+                        x, y, z = (
+                            take(queries, here + i),
+                            take(queries, here + i + 16),
+                            take(queries, here + i + 32),
+                        )
+                        one = lowest(to_leaf(points, node, splat(x), splat(y), splat(z)))
+                        gap = where(mask(np.int64(1) << i), splat(one), gap)
+                this = splat(np.int32(node))
+                tie = tie | ((gap == best) & (leaf != this))
+                leaf = where(gap < best, this, leaf)  # no branch: whether it is nearer cannot be foreseen
+                best = least(gap, best)
+            worst = highest(best)
+        ties |= bits(tie)
+        store(bests, 0, best)
+        store(leaves, 0, leaf)
+        for i in range(16):
+            node = np.int64(leaves[i])
+            x, y, z = take(queries, here + i), take(queries, here + i + 16), take(queries, here + i + 32)
+            found = bits(to_leaf(points, node, splat(x), splat(y), splat(z)) == splat(bests[i]))
+            guess[i] = 16 * node + first(found)
+            number = np.int64(take(ids, 64 * node + 48 + first(found)))
+            if found & (found - 1) != 0 or (ties >> i) & 1 != 0:
+                number = lowest_id(packed, x, y, z, bests[i], number)
+            place = take(packets.ids, here + 48 + i)
+            distance[place] = np.sqrt(bests[i])
+            index[place] = number
+
+
+@compiled
+@no_type_check
+def search_all(cloud, size, packets, begin, end, distance, index):
+    """As `search`, comparing every query with every point of a cloud as it came: for small clouds or few queries."""
+    queries = packets.points
+    blocks = (size + 15) // 16
+    tail = np.empty(48, cloud.dtype)  # the last block, filled with its last point
+    for i in range(16):
+        for axis in range(3):
+            tail[3 * i + axis] = cloud[3 * min(16 * (blocks - 1) + i, size - 1) + axis]
+    for packet in range(begin, end):
+        here = 64 * packet
+        x, y, z = load(queries, here), load(queries, here + 16), load(queries, here + 32)
+        best, leaf = splat(cloud.dtype.type(np.inf)), splat(np.int32(0))
+        for block in range(blocks):
+            from_, at = (cloud, 48 * block) if block < blocks - 1 else (tail, 0)
+            gap = best
+            for i in range(16):
+                gap = least(
+                    squared(
+                        splat(take(from_, at + 3 * i)) - x,
+                        splat(take(from_, at + 3 * i + 1)) - y,
+                        splat(take(from_, at + 3 * i + 2)) - z,
+                    ),
+                    gap,
+                )
+            leaf = where(gap < best, splat(np.int32(block)), leaf)
+            best = gap
+        for i in range(16):
+            block = np.int64(lane(leaf, i))
+            from_, at = (cloud, 48 * block) if block < blocks - 1 else (tail, 0)
+            a, b, c = load_triples(from_, at)
+            qx, qy, qz = take(queries, here + i), take(queries, here + i + 16), take(queries, here + i + 32)
+            gap = squared(a - splat(qx), b - splat(qy), c - splat(qz))
+            nearest = lowest(gap)
+            place = take(packets.ids, here + 48 + i)
+            distance[place] = np.sqrt(nearest)
+            index[place] = min(16 * block + first(bits(gap == splat(nearest))), size - 1)

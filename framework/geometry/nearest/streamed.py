@@ -1,0 +1,145 @@
+"""Nearest neighbours in clouds that do not fit into memory: points come in chunks of any size, one after the other.
+
+    middle = Middle()                       # first reading
+    for chunk in chunks(): middle.add(chunk)
+    reach = Reach(middle.mean)              # second
+    for chunk in chunks(): reach.add(chunk)
+    stream = Stream(queries)                # third
+    for chunk in chunks(): stream.add(normal(chunk, middle.mean, reach.norm))
+
+A chunk is a cloud (points, columns): x, y, z, then attributes. Memory holds one chunk and what was found so far.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from framework.errors import DataError
+from framework.geometry.nearest import Queries, nearest, prepare
+
+
+class Streamed(NamedTuple):
+    """The nearest point of each query.
+
+    Attributes:
+        distance, index: as `framework.geometry.nearest.Nearest` has them; the index counts over all chunks.
+        point: that point, with all its columns.
+    """
+
+    distance: Float[Tensor, "query"]
+    index: Int[Tensor, "query"]
+    point: Float[Tensor, "query columns"]
+
+
+class Stream:
+    """The nearest points among all chunks so far: on one device to the bit what `nearest` finds in all at once."""
+
+    def __init__(self, queries: Float[Tensor, "query 3"] | Queries) -> None:
+        self.queries = queries if isinstance(queries, Queries) else prepare(queries)
+        self.count = 0
+        self.best: Streamed | None = None
+
+    def add(self, chunk: Float[Tensor, "points columns"]) -> None:
+        """DataError as `nearest`, or where the columns are not those of the chunk before; nothing changes then."""
+        chunk = chunk.detach()
+        if len(chunk) == 0:
+            return
+        if self.best is not None and chunk.shape[1] != self.best.point.shape[1]:
+            raise DataError(
+                f"A chunk of {chunk.shape[1]} columns follows chunks of {self.best.point.shape[1]}; wanted as many. "
+                "Read the same columns from every part of the cloud."
+            )
+        found = nearest(chunk[None, :, :3], self.queries)
+        distance, index = found.distance[0], found.index[0]
+        if self.best is None:
+            self.best = Streamed(distance, index, chunk[index])
+        else:
+            nearer = self.nearer(distance, chunk[index, :3]).nonzero().flatten()
+            self.best.distance[nearer] = distance[nearer]
+            self.best.index[nearer] = index[nearer] + self.count
+            self.best.point[nearer] = chunk[index[nearer]]
+        self.count += len(chunk)
+
+    def nearer(
+        self, distance: Float[Tensor, "query"], points: Float[Tensor, "query 3"]
+    ) -> Bool[Tensor, "query"]:
+        """Which points are nearer than the best so far; at a tie none, so that the lower index stays."""
+        assert self.best is not None
+        nearer = distance < self.best.distance
+        # squared distances that differ may have the same root, and it is by them that `nearest` decides
+        same = (distance == self.best.distance).nonzero().flatten()
+        if len(same):
+            both = torch.stack([self.best.point[same, :3], points[same]], 1)
+            nearer[same] = nearest(both, self.queries.points[same, None]).index[:, 0] == 1
+        return nearer
+
+    def result(self) -> Streamed:
+        """Of the chunks so far; DataError where none had a point."""
+        if self.best is None:
+            raise DataError("A stream of chunks held no point; wanted one at least. Leave out what is empty.")
+        return Streamed(*(tensor.clone() for tensor in self.best))
+
+
+class Middle:
+    """The mean of all points so far, in float64."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first = self.sum = torch.zeros(3, dtype=torch.float64)
+
+    def add(self, chunk: Float[Tensor, "points columns"]) -> None:
+        points = finite(chunk)
+        if len(points) == 0:
+            return
+        if self.count == 0:
+            self.first = points[0]
+            self.sum = torch.zeros_like(self.first)
+        self.sum = self.sum + (points - self.first).sum(
+            0
+        )  # about the first: keeps the digits of what is far from 0
+        self.count += len(points)
+
+    @property
+    def mean(self) -> Float[Tensor, "3"]:
+        return self.first + self.sum / max(1, self.count)
+
+
+class Reach:
+    """The largest distance from a centre of all points so far, in float64; 1 where all points are at the centre."""
+
+    def __init__(self, centre: Float[Tensor, "3"]) -> None:
+        self.centre = centre.double()
+        self.largest = 0.0
+
+    def add(self, chunk: Float[Tensor, "points columns"]) -> None:
+        points = finite(chunk)
+        if len(points):
+            self.largest = max(
+                self.largest, float(torch.linalg.vector_norm(points - self.centre, dim=1).max())
+            )
+
+    @property
+    def norm(self) -> float:
+        return self.largest or 1.0
+
+
+def finite(chunk: Tensor) -> Float[Tensor, "points 3"]:
+    """Coordinates in float64; DataError where one is NaN or infinite."""
+    points = chunk.detach()[:, :3].double()
+    bad = (~points.isfinite().all(1)).nonzero()
+    if len(bad):
+        raise DataError(
+            f"Point {int(bad[0])} of a chunk of {len(points)} is {points[bad[0, 0]].tolist()}; wanted finite "
+            "coordinates. Mend the file or drop such points."
+        )
+    return points
+
+
+def normal(
+    chunk: Float[Tensor, "points columns"], centre: Tensor, scale: float
+) -> Float[Tensor, "points columns"]:
+    """The chunk less the centre, then divided by the scale (eq. 6.2); in its dtype, attributes as they are."""
+    points = (chunk[:, :3].double() - centre) / scale
+    return torch.cat([points.to(chunk.dtype), chunk[:, 3:]], 1)

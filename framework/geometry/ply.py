@@ -1,0 +1,225 @@
+"""PLY files, text or binary, as arrays: vertices with all their properties, and faces."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+from numpy.typing import NDArray
+
+from framework.geometry.mesh_files import COLOURS, MOST, XYZ, Parsed, column_names, fans, polygons, rows
+
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+CORNERS = ("vertex_indices", "vertex_index")
+
+
+@dataclass(frozen=True)
+class Property:
+    """A value of each item; `length`: NumPy's type of the number before a list, None: no list."""
+
+    name: str
+    kind: str
+    length: str | None
+
+
+@dataclass(frozen=True)
+class Element:
+    """Items of a kind (vertices, faces), in the file's order."""
+
+    name: str
+    count: int
+    properties: tuple[Property, ...]
+
+
+def ply(content: bytes) -> Parsed:
+    """PLY 1.0: x, y, z of the vertices, their other properties as attributes (whole-number colours as 0…1), faces.
+
+    Raises:
+        ValueError: no PLY, a type nobody knows, fewer or more data than the header announces, faces as strips.
+    """
+    end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", content)
+    if not content.startswith(b"ply") or end is None:
+        raise ValueError("wanted ply in its first line and a line end_header")
+    order, elements = _header(content[: end.start()].decode("latin-1"))
+    names = {element.name for element in elements}
+    if "tristrips" in names:
+        raise ValueError("its faces are strips of triangles; save it with single faces")
+    if "vertex" not in names:
+        raise ValueError(f"wanted an element vertex, got {', '.join(sorted(names)) or 'none'}")
+    body = content[end.end() :]
+    vertices, faces = _text(body, elements) if order == "" else _binary(body, elements, order)
+    return _parsed(next(element for element in elements if element.name == "vertex"), vertices, faces)
+
+
+def _header(text: str) -> tuple[str, list[Element]]:
+    order: str | None = None
+    elements: list[Element] = []
+    for line in text.splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        try:
+            if words[0] == "format":
+                order = FORMATS[words[1]]
+            elif words[0] == "element":
+                elements.append(Element(words[1], int(words[2]), ()))
+                if not 0 <= elements[-1].count <= MOST:
+                    raise ValueError
+            elif words[0] == "property":
+                last = elements[-1]
+                if words[1] == "list":
+                    found = Property(words[4], TYPES[words[3]], TYPES[words[2]])
+                    if found.length is None or found.length.startswith("f"):
+                        raise ValueError
+                else:
+                    found = Property(words[2], TYPES[words[1]], None)
+                elements[-1] = Element(last.name, last.count, (*last.properties, found))
+            else:
+                raise ValueError
+        except (KeyError, IndexError, ValueError):
+            raise ValueError(f"its header has the line {line.strip()!r}, which is not PLY's") from None
+    if order is None:
+        raise ValueError("its header has no line format")
+    return order, elements
+
+
+def _text(body: bytes, elements: list[Element]) -> tuple[NDArray, NDArray]:
+    """Properties of the vertices, one column each, and triangles, from a body of one line an item."""
+    lines = [line for line in body.replace(b"\r", b"\n").split(b"\n") if line and not line.isspace()]
+    promised = sum(element.count for element in elements if element.properties)
+    if len(lines) != promised:
+        raise ValueError(f"its header announces {promised} lines of data, but {len(lines)} follow")
+    vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
+    for element in elements:
+        own, lines = lines[: element.count], lines[element.count :]
+        if element.name == "vertex":
+            _no_list(element)
+            vertices = rows(own, "vertex", len(element.properties)) if own else vertices
+        elif element.name == "face" and own:
+            if not _corners(element) == element.properties[0]:
+                raise ValueError("a text file's faces must begin with their corners; save it as binary")
+            faces = polygons(own)
+    return vertices, faces
+
+
+def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, NDArray]:
+    vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
+    start = 0
+    for element in elements:
+        if element.name == "vertex":
+            _no_list(element)
+            kind = np.dtype([(f"{i}", order + entry.kind) for i, entry in enumerate(element.properties)])
+            _require(body, start + element.count * kind.itemsize)
+            table = np.frombuffer(body, kind, element.count, start)
+            columns = [table[name].astype(np.float64) for name in table.dtype.names or ()]
+            vertices = np.stack(columns, 1) if columns else vertices
+            start += element.count * kind.itemsize
+        else:
+            found, start = _lists(body, start, element, order)
+            faces = found if element.name == "face" else faces
+    if start != len(body):
+        raise ValueError(f"{len(body) - start} bytes follow what its header announces")
+    return vertices, faces
+
+
+def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[np.ndarray, "faces 3"], int]:
+    """Triangles of an element whose properties may be lists, and where its data end."""
+    empty = np.empty((0, 3), np.int64)
+    if element.count == 0 or not element.properties:
+        return empty, start
+    wanted = _corners(element) if element.name == "face" else None
+    kind = _uniform(body, start, element, order)  # all items as the first: nearly always so
+    if start + element.count * kind.itemsize <= len(body):
+        table = np.frombuffer(body, kind, element.count, start)
+        lengths = [name for name in table.dtype.names or () if name.startswith("length")]
+        if all((table[name] == table[name][0]).all() for name in lengths):
+            end = start + element.count * kind.itemsize
+            if wanted is None:
+                return empty, end
+            corners = table[f"value{element.properties.index(wanted)}"]
+            return fans(np.full(len(corners), corners.shape[1]), corners.astype(np.int64).ravel()), end
+    counts, corners = [], []
+    for _ in range(element.count):
+        for entry in element.properties:
+            length = 1
+            if entry.length is not None:
+                length = int(_values(body, start, 1, order + entry.length)[0])
+                start += int(entry.length[1])
+                if length < 0:
+                    raise ValueError(f"a list {entry.name} has {length} values")
+            if entry == wanted:
+                counts.append(length)
+                corners.append(_values(body, start, length, order + entry.kind))
+            start += length * int(entry.kind[1])
+    _require(body, start)
+    if wanted is None:
+        return empty, start
+    return fans(np.array(counts), np.concatenate(corners).astype(np.int64)), start
+
+
+def _uniform(body: bytes, start: int, element: Element, order: str) -> np.dtype:
+    """The record of the element's first item."""
+    fields = []
+    for number, entry in enumerate(element.properties):
+        if entry.length is None:
+            fields.append((f"value{number}", order + entry.kind, (1,)))
+        else:
+            length = int(_values(body, start, 1, order + entry.length)[0])
+            fields.append((f"length{number}", order + entry.length))
+            fields.append((f"value{number}", order + entry.kind, (max(length, 0),)))
+        start += np.dtype(fields[-1:]).itemsize + (int(entry.length[1]) if entry.length else 0)
+    return np.dtype(fields)
+
+
+def _values(body: bytes, start: int, count: int, kind: str) -> NDArray:
+    _require(body, start + count * int(kind[-1]))
+    return np.frombuffer(body, kind, count, start)
+
+
+def _require(body: bytes, end: int) -> None:
+    if len(body) < end:
+        raise ValueError(
+            f"its header announces at least {end} bytes of data, but {len(body)} follow; it is cut short"
+        )
+
+
+def _corners(element: Element) -> Property:
+    for entry in element.properties:
+        if entry.name in CORNERS and entry.length is not None:
+            return entry
+    raise ValueError(f"its faces have no list {' or '.join(CORNERS)}")
+
+
+def _no_list(element: Element) -> None:
+    lists = [entry.name for entry in element.properties if entry.length is not None]
+    if lists:
+        raise ValueError(f"its vertices have lists ({', '.join(lists)}); wanted single numbers")
+
+
+def _parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
+    names = column_names([entry.name for entry in vertex.properties])
+    missing = [name for name in XYZ if name not in names]
+    if missing:
+        raise ValueError(f"its vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
+    if not len(values):
+        values = np.empty((0, len(names)))
+    for number, entry in enumerate(vertex.properties):
+        if names[number] in (*COLOURS, "alpha") and entry.kind.startswith("u"):
+            values[:, number] /= np.iinfo(entry.kind).max
+    more = [number for number, name in enumerate(names) if name not in XYZ]
+    return Parsed(
+        np.ascontiguousarray(values[:, [names.index(name) for name in XYZ]]),
+        faces,
+        tuple(names[number] for number in more),
+        values[:, more] if more else None,
+    )

@@ -1,0 +1,1 @@
+"""What density heads of several families share."""

@@ -1,0 +1,108 @@
+"""Classified samples as a contact sheet: certain, ambiguous and failed ones, each with its likeliest classes."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from framework.reports.pictures import BLUE, GREEN, GREY, RED, titled_figure
+
+LISTED = 3
+"""Classes named below each sample."""
+LONGEST = 18
+"""Letters of a class's name that fit."""
+
+
+def choose_classified(
+    probability: Float[np.ndarray, "samples classes"], label: Int[np.ndarray, "samples"], count: int = 6
+) -> dict[str, list[int]]:
+    """Up to `count` samples for each row; the same arguments give the same samples, and none stands twice.
+
+    "failed": wrong, the surest first. "ambiguous": right or wrong, with the least between the two likeliest classes.
+    "certain": right, the surest of each class before a second one of any.
+    """
+    if len(probability) == 0:
+        return {"certain": [], "ambiguous": [], "failed": []}
+    guess = probability.argmax(1)
+    ordered = np.sort(probability, 1)
+    sure = ordered[:, -1]
+    between = sure - (ordered[:, -2] if probability.shape[1] > 1 else 0)
+    free = np.ones(len(probability), bool)
+
+    def first(order: np.ndarray) -> list[int]:
+        taken = order[free[order]][:count]
+        free[taken] = False
+        return taken.tolist()
+
+    failed = first(np.flatnonzero(guess != label)[np.argsort(-sure[guess != label], kind="stable")])
+    right = np.flatnonzero(guess == label)
+    right = right[np.argsort(-sure[right], kind="stable")]
+    turn = np.array([int((guess[right[:place]] == guess[one]).sum()) for place, one in enumerate(right)], int)
+    certain = first(right[np.argsort(turn, kind="stable")])
+    return {
+        "certain": certain,
+        "ambiguous": first(np.argsort(between, kind="stable")),
+        "failed": failed,
+    }
+
+
+def classified(
+    images: Sequence[np.ndarray],
+    probability: Float[np.ndarray, "samples classes"],
+    label: Int[np.ndarray, "samples"],
+    names: Sequence[str],
+    *,
+    rows: Mapping[str, int],
+    title: str,
+    synthetic: bool,
+) -> Figure:
+    """Each sample's picture, and bars for its likeliest classes and the true one.
+
+    Args:
+        images: of the samples, as `Data.picture` gives them.
+        names: of the classes.
+        rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
+    """
+    across = max(4, *rows.values())
+    tall = [size for count in rows.values() for size in ((2.0, 0.8) if count else (0.3, 0.05))]
+    figure = titled_figure((1.75 * across + 0.4, 0.62 * sum(tall) + 1.2), title, synthetic)
+    panels = figure.subplots(2 * len(rows), across, squeeze=False, height_ratios=tall)
+    for axes in panels.flat:
+        axes.set(xticks=[], yticks=[], frame_on=False)
+    sample = 0
+    for line, (heading, count) in enumerate(rows.items()):
+        above, below = panels[2 * line], panels[2 * line + 1]
+        above[0].set_ylabel(heading, fontsize=11, weight="bold")
+        if count == 0:
+            above[0].text(0.5, 0.5, "no such sample", ha="center", va="center", color=GREY)
+        for top, bottom in zip(above[:count], below[:count], strict=True):
+            top.imshow(images[sample])
+            _bars(bottom, probability[sample], int(label[sample]), names)
+            sample += 1
+    handles = [
+        Patch(color=GREEN, alpha=0.5, label="true class"),
+        Patch(color=RED, alpha=0.5, label="wrong, and the likeliest"),
+        Patch(color=BLUE, alpha=0.3, label="other"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]) -> None:
+    """The likeliest classes, the true one in place of the last where it is not among them."""
+    shown: list[int] = np.argsort(-probability, kind="stable")[:LISTED].tolist()
+    if label not in shown:
+        shown[-1] = label
+    axes.set(xlim=(0, 1), ylim=(LISTED - 0.5, -0.5))
+    for place, number in enumerate(shown):
+        wrong = place == 0 and number != label
+        color, alpha = (GREEN, 0.5) if number == label else (RED, 0.5) if wrong else (BLUE, 0.3)
+        axes.barh(place, 1.0, height=0.9, color="0.95")
+        axes.barh(place, probability[number], height=0.9, color=color, alpha=alpha)
+        name = names[number] if len(names[number]) <= LONGEST else names[number][: LONGEST - 1] + "…"
+        style = {"fontsize": 7, "va": "center", "parse_math": False}
+        axes.text(0.02, place, name, ha="left", **style)
+        axes.text(0.98, place, f"{probability[number]:.2f}", ha="right", **style)

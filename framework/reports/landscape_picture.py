@@ -1,0 +1,101 @@
+"""The probability landscape of classifiers over a plane of two inputs, a panel a model (thesis Figure 2.3)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from framework.model import Predictor
+from framework.reports.pictures import BLUE, ORANGE, titled_figure
+
+POINTS = 61
+"""Along each side of the plane."""
+SHOWN = 300
+"""Points of each kind drawn over a landscape, at most."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """What is drawn over the landscapes.
+
+    Attributes:
+        points, labels: of the two inputs, and their classes.
+        outliers: inputs of no class, (count, 2); none where there are none.
+        names: of the classes.
+        half_width: the square shown reaches from minus to plus this around 0.
+    """
+
+    points: Float[np.ndarray, "count 2"]
+    labels: Int[np.ndarray, "count"]
+    outliers: Float[np.ndarray, "others 2"]
+    names: tuple[str, ...]
+    half_width: float
+
+
+def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
+    """Such that the square holds every point, and a tenth more."""
+    return 1.1 * max((float(np.abs(some).max()) for some in points if len(some)), default=1.0)
+
+
+@torch.no_grad()
+def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4096) -> np.ndarray:
+    """Of two classes p(y = 1), of more the entropy over its largest, log K: (POINTS, POINTS), rows from below."""
+    axis = torch.linspace(-half_width, half_width, POINTS)
+    plane = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).reshape(-1, 2)
+    found = []
+    for part in plane.split(rows_at_once):
+        density = predictor(part)
+        log_prob = density.log_prob(density.enumerate_support()).double()
+        if len(log_prob) == 2:
+            found.append(log_prob[1].exp())
+        else:
+            found.append(-(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) / np.log(len(log_prob)))
+    return torch.cat(found).reshape(POINTS, POINTS).numpy()
+
+
+def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, synthetic: bool) -> Figure:
+    """One panel for each model, in rows of three; all to one scale of colours.
+
+    Args:
+        panels: caption → what `probabilities` found.
+    """
+    across = min(3, len(panels))
+    down = -(-len(panels) // across)
+    figure = titled_figure((3.6 * across + 1.0, 3.7 * down + 0.9), title, synthetic)
+    axes = figure.subplots(down, across, squeeze=False)
+    edge, two = plane.half_width, len(plane.names) == 2
+    extent = (-edge, edge, -edge, edge)
+    # blue and orange are the classes; white is where neither is likelier
+    colours = LinearSegmentedColormap.from_list("classes", [BLUE, "white", ORANGE]) if two else "viridis"
+    image = None
+    for place, (caption, found) in zip(axes.flat, panels.items(), strict=False):
+        image = place.imshow(found, origin="lower", extent=extent, interpolation="bilinear", cmap=colours)
+        image.set_clim(0.0, 1.0)
+        if two:
+            lines = np.linspace(-edge, edge, POINTS)
+            place.contour(lines, lines, found, levels=[0.5], colors="black", linewidths=0.8)
+        _points(place, plane)
+        place.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
+        place.set_title(caption, fontsize=10, parse_math=False)
+    for place in axes.flat[len(panels) :]:
+        place.set_visible(False)
+    assert image is not None
+    label = f"p(y = {plane.names[1]} | x)" if two else "entropy / log K"
+    figure.colorbar(image, ax=axes, shrink=0.8, label=label)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def _points(place: Axes, plane: Plane) -> None:
+    for label, name in enumerate(plane.names):
+        some = plane.points[plane.labels == label][:SHOWN]
+        colour = (BLUE, ORANGE)[label] if len(plane.names) == 2 else None
+        place.scatter(*some.T, s=9, color=colour, edgecolor="black", linewidth=0.35, label=name)
+    if len(plane.outliers):
+        place.scatter(*plane.outliers[:SHOWN].T, s=12, marker="^", color="black", label="outliers")

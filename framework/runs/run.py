@@ -1,0 +1,153 @@
+"""One run: its folder, its tracking, its signals; closed FINISHED, FAILED or KILLED whatever happens."""
+
+import os
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from framework.configuration.settings import Settings, store_experiment
+from framework.errors import UserError
+from framework.runs.provenance import flatten, git_commit, package_versions
+from framework.sweeps.jobs import PARENT, SYNCED_WITHIN
+from framework.tracking.journal import write_atomically
+from framework.tracking.signals import Stopped, Stopper
+from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker, read_run_info
+
+
+@dataclass
+class Run:
+    """What a mode needs to know of the run it is in."""
+
+    folder: Path
+    values: dict[str, Any]
+    settings: Settings
+    tracker: Tracker
+    stopper: Stopper
+    resumed: bool
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.folder / "checkpoints"
+
+
+def stored_config(folder: Path) -> dict[str, Any] | None:
+    """The config a run folder was made with; None where there is none yet."""
+    path = folder / "config.yaml"
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def stored_overrides(folder: Path) -> list[str]:
+    """The overrides a run folder was made with."""
+    path = folder / "overrides.yaml"
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else []
+
+
+@contextmanager
+def opened(folder: Path, values: dict[str, Any], settings: Settings, overrides: list[str]) -> Iterator[Run]:
+    """Open the run before anything is built; on the way out close it with the right status.
+
+    Continues the run in `folder` when its config is the same, it did not finish and `resume` allows it.
+    """
+    earlier = read_run_info(folder)
+    resumed = (
+        earlier is not None
+        and earlier.status != "FINISHED"
+        and settings.resume != "never"
+        and _same(stored_config(folder), values)
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "checkpoints").mkdir(exist_ok=True)
+    if not resumed:
+        write_atomically(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
+        write_atomically(folder / "overrides.yaml", yaml.safe_dump(overrides).encode())
+    tracker = _tracker(
+        folder, settings, values, overrides, earlier.run_id if resumed and earlier else None, resumed
+    )
+    stopper = Stopper()
+    with stopper.installed():
+        tracker.open()
+        run = Run(folder, values, settings, tracker, stopper, resumed)
+        try:
+            _describe(run, overrides)
+            yield run
+        except BaseException as error:
+            _record(run, error)
+            killed = isinstance(error, KeyboardInterrupt | Stopped)
+            tracker.close("KILLED" if killed else "FAILED")
+            if killed:
+                sys.stderr.write(f"stopped; go on with: python -m framework resume={folder}\n")
+            raise
+        tracker.close("FINISHED")
+
+
+def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
+    if stored is None:
+        return False
+    return {**stored, "resume": None} == {**values, "resume": None}
+
+
+def _tracker(
+    folder: Path,
+    settings: Settings,
+    values: Mapping[str, Any],
+    overrides: list[str],
+    run_id: str | None,
+    resumed: bool,
+) -> Tracker:
+    if settings.logger.name == "none":
+        return NoTracker(folder, resumed=resumed)
+    return MlflowTracker(
+        folder,
+        uri=settings.logger.uri,
+        experiment=store_experiment(values),
+        run_name=run_name(settings, values["mode"]["name"], overrides),
+        parent=os.environ.get(PARENT),
+        wait=SYNCED_WITHIN if PARENT in os.environ else 0.0,
+        run_id=run_id,
+        resumed=resumed,
+    )
+
+
+def run_name(settings: Settings, mode: str, overrides: list[str]) -> str:
+    """What tells a run from its neighbours: the method, then what was changed on the command line, then the seed."""
+    parts = [(settings.experiment_name or mode).rpartition("/")[2]]
+    for override in overrides:
+        key, _, value = override.lstrip("+~").partition("=")
+        if key.partition(".")[0] not in (
+            "experiment",
+            "seed",
+            "threads",
+            "logger",
+            "mode",
+            "hydra",
+            "workers",
+        ):
+            parts.append(f"{key.rpartition('.')[2]}={value}")
+    return ", ".join([*parts, f"seed={settings.seed}"])[:200]
+
+
+def _describe(run: Run, overrides: list[str]) -> None:
+    tags = {f"git.{key}": str(value) for key, value in git_commit(Path.cwd()).items()}
+    tags |= {f"version.{key}": value for key, value in package_versions().items()}
+    tags |= {"mode": run.values["mode"]["name"], "overrides": " ".join(overrides), "folder": str(run.folder)}
+    run.tracker.set_tags(tags)
+    run.tracker.log_params(flatten(run.values))
+    run.tracker.log_artifact(run.folder / "config.yaml")
+    run.tracker.log_artifact(run.folder / "overrides.yaml")
+
+
+def _record(run: Run, error: BaseException) -> None:
+    """Leave the traceback and the sentence with the run."""
+    path = run.folder / "traceback.txt"
+    path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
+    run.tracker.log_artifact(path)
+    sentence = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, Stopped):
+        sentence = f"stopped by {error.signal}"
+    run.tracker.set_tags({"error": sentence[:5000]})

@@ -1,0 +1,1 @@
+"""Files on this machine: the cache, and what is written whole or not at all."""

@@ -1,0 +1,279 @@
+"""A sweep as one thing: a parent run, and the table and picture that compare its jobs."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+
+from framework.configuration.settings import store_experiment
+from framework.errors import ConfigError, did_you_mean
+from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
+from framework.sweeps.jobs import RECORD
+from framework.tracking.tracker import MlflowTracker, mark_dead
+
+_DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
+RETURNED = "best validation loss (nats)"
+"""What a training returns to its sweep."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A job of a search; `value` is what it returned, None where it returned nothing."""
+
+    folder: Path
+    overrides: list[str]
+    value: float | None
+    completed: bool
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The best trial of a search, None where no trial has a finite value, and a line that says what it reached."""
+
+    best: Trial | None
+    said: str
+
+
+def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
+    """Open the parent run of a sweep; its id, or None without a tracking store."""
+    logger = config.get("logger") or {}
+    if logger.get("name") != "mlflow":
+        return None
+    earlier = folder / "parent.json"  # of the sweep that is being resumed
+    known = json.loads(earlier.read_text(encoding="utf-8"))["run_id"] if earlier.is_file() else None
+    logger = {**logger, "experiment": store_experiment(config)}
+    tracker = _parent(folder, logger, known)
+    tracker.open()
+    tracker.set_tags({"mode": "sweep", "folder": str(folder)})
+    run_id = tracker.run_id
+    (folder / "parent.json").write_text(json.dumps({"run_id": run_id, "logger": logger}), encoding="utf-8")
+    tracker.leave_open()
+    return run_id
+
+
+def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
+    """Compare the finished jobs in `folder`: print the table, write comparison.csv and .png, log them to the parent."""
+    console = _console()
+    for path in folder.glob("*/run.json"):
+        if _status(path.parent) == "died":
+            mark_dead(path.parent)  # a killed process could not close its run
+    rows = [row for row in (_row(path) for path in _in_order(folder.glob("*/results.json"))) if row]
+    files: list[Path] = []
+    compared: list[dict[str, object]] = []
+    if rows:
+        # also those of another command's jobs in this folder: what tells rows apart must be told
+        keys = _varied([*overrides, *(row["overrides"] for row in rows)])
+        rows = [{**dict.fromkeys(keys), **row} for row in rows]
+        by = ["method", "data", *(key for key in keys if key not in ("seed", "experiment", "data.category"))]
+        columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
+        # a column that no job has a number for says nothing (what only some classes have, say)
+        columns = {
+            key: heading for key, heading in columns.items() if any(row.get(key) is not None for row in rows)
+        }
+        compared = aggregate(rows, by=by, over="seed")
+        better = rows[0]["better"]
+        console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
+        csv(compared, columns, folder / "comparison.csv")
+        files.append(folder / "comparison.csv")
+        files.extend(_picture(compared, by, folder))
+        console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
+    _close_parent(folder, files, compared)
+
+
+def rank(
+    folder: Path,
+    trials: Sequence[Trial],
+    keys: Sequence[str],
+    metric: str | None = None,
+    direction: str | None = None,
+) -> Ranking:
+    """Print the trials of a search, the best first and those without a finite value last; write ranking.csv.
+
+    Args:
+        keys: the overridden keys to show, each a column.
+        metric: a key of results.json; None is the value the trials returned.
+        direction: "minimize" or "maximize"; None is what the metric itself says.
+
+    Raises:
+        ConfigError: no trial has the metric, or nothing says which way it is better.
+    """
+    results = {trial.folder: _results(trial) for trial in trials}
+    known = [one for one in results.values() if one]
+    heading, better = RETURNED, _DIRECTIONS[direction or "minimize"]
+    if metric is not None:
+        heading = next((one["columns"][metric] for one in known if metric in one["columns"]), metric)
+        better = _better(metric, known, direction, folder) if known else better
+    rows = [_trial_row(trial, results[trial.folder], keys, metric) for trial in trials]
+    synthetic = any(row["synthetic"] for row in rows)
+    sign = 1 if better == "lower" else -1
+    ranks = [sign * row["value"] if math.isfinite(row["value"]) else math.inf for row in rows]
+    order = sorted(range(len(rows)), key=ranks.__getitem__)  # stable: of equals the one drawn first
+    # of a trial that failed nothing is known: it is labelled as soon as any is
+    shown = [
+        {**row, "synthetic": synthetic if row["synthetic"] is None else row["synthetic"]} for row in rows
+    ]
+    shown = [shown[index] for index in order]
+    columns = {
+        "trial": "trial",
+        "value": heading,
+        **{key: key.lstrip("+").rpartition(".")[2] for key in keys},
+    }
+    columns |= {key: head for key, head in COST_COLUMNS.items() if any(row[key] is not None for row in rows)}
+    console = _console()
+    title = f"{len(trials)} trials in {folder}, best first"
+    console.print(results_table(shown, columns, title=title, better={"value": better}))
+    csv(shown, columns, folder / "ranking.csv")
+    last = [
+        f"#{row['trial']} "
+        + (f"(its value is {row['value']:g})" if trial.completed else "(did not complete)")
+        for trial, row, rank in zip(trials, rows, ranks, strict=True)
+        if rank == math.inf
+    ]
+    if last:
+        console.print(f"last, for want of a finite value: {', '.join(last)}", soft_wrap=True)
+    if metric is not None:
+        console.print(
+            f"{metric} is of the test split, which now has chosen: its best value is no estimate on new data.",
+            soft_wrap=True,
+        )
+    if len(last) == len(trials):
+        return Ranking(None, "")
+    best = rows[order[0]]
+    said = f"{heading}: {best['value']:.6g}" + (" (synthetic data)" if best["synthetic"] else "")
+    return Ranking(trials[order[0]], said)
+
+
+def close_ranking(folder: Path) -> None:
+    """Log to the parent run what a search found."""
+    paths = (folder / name for name in ("ranking.csv", "best.yaml"))
+    _close_parent(folder, [path for path in paths if path.is_file()], [])
+
+
+def _results(trial: Trial) -> dict[str, Any]:
+    path = trial.folder / "results.json"
+    return json.loads(path.read_text(encoding="utf-8")) if trial.completed and path.is_file() else {}
+
+
+def _trial_row(
+    trial: Trial, results: Mapping[str, Any], keys: Sequence[str], metric: str | None
+) -> dict[str, Any]:
+    """A trial's line: NaN where it has no value, "synthetic" None where that is not known."""
+    found = trial.value if metric is None else results.get(metric)
+    given = {key: value for key, _, value in (override.partition("=") for override in trial.overrides)}
+    return {
+        "trial": trial.folder.name,
+        "value": float(found) if isinstance(found, int | float) and trial.completed else math.nan,
+        **{key: given.get(key) for key in keys},
+        **{key: results.get(key) for key in COST_COLUMNS},
+        "synthetic": results.get("synthetic"),
+    }
+
+
+def _better(
+    metric: str, results: Sequence[Mapping[str, Any]], direction: str | None, folder: Path
+) -> Literal["higher", "lower"]:
+    again = f"The same command with hydra.sweep.dir={folder} ranks again and runs nothing twice."
+    numbers = {
+        key: None
+        for one in results
+        for key, value in one.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    if metric not in numbers:
+        raise ConfigError(
+            f"hydra.sweeper.metric = {metric!r}: no trial has it.{did_you_mean(metric, numbers)} They have: "
+            f"{', '.join(numbers)}; null is the {RETURNED}. {again}"
+        )
+    ways: Better = {**COST_BETTER, **next((one["better"] for one in results if metric in one["better"]), {})}
+    if metric not in ways and direction is None:
+        raise ConfigError(
+            f"hydra.sweeper.metric = {metric!r} does not say which way it is better. Set "
+            f"hydra.sweeper.direction to minimize or maximize. {again}"
+        )
+    return _DIRECTIONS[direction] if direction is not None else ways[metric]
+
+
+def _console() -> Console:
+    console = Console()
+    return console if console.is_terminal else Console(width=160)  # a log file has no edge to wrap at
+
+
+def _in_order(paths: Iterable[Path]) -> list[Path]:
+    """By job number: 2 before 10."""
+    return sorted(paths, key=lambda path: (len(path.parent.name), path.parent.name))
+
+
+def _status(folder: Path) -> str:
+    return json.loads((folder / RECORD).read_text(encoding="utf-8")).get("status", "")
+
+
+def _row(path: Path) -> dict[str, Any] | None:
+    if _status(path.parent) != "completed":
+        return None
+    results = json.loads(path.read_text(encoding="utf-8"))
+    record = json.loads((path.parent / RECORD).read_text(encoding="utf-8"))
+    swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
+    return {**swept, **results, "overrides": record["overrides"]}
+
+
+def _varied(overrides: Sequence[Sequence[str]]) -> list[str]:
+    """The keys that differ between jobs, in the order given."""
+    seen: dict[str, set[str]] = {}
+    for job in overrides:
+        for override in job:
+            key, _, value = override.lstrip("+~").partition("=")
+            seen.setdefault(key, set()).add(value)
+    return [key for key, values in seen.items() if len(values) > 1]
+
+
+def _picture(rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path) -> list[Path]:
+    from framework.reports.pictures import comparison
+
+    if not all("log_likelihood" in row for row in rows):
+        return []
+    figure = comparison(
+        rows,
+        "log_likelihood",
+        "milliseconds_per_sample",
+        title="Log-likelihood against run time",
+        synthetic=any(row.get("synthetic") for row in rows),
+        x_label="run time (ms per sample)",
+        y_label="log-likelihood (nats)",
+        group=by[1] if len(by) > 1 else None,
+        better="higher",
+    )
+    path = folder / "comparison.png"
+    figure.savefig(path, dpi=110)
+    return [path]
+
+
+def _parent(folder: Path, logger: Mapping[str, Any], run_id: str | None) -> MlflowTracker:
+    return MlflowTracker(
+        folder,
+        uri=logger.get("uri"),
+        experiment=logger["experiment"],
+        run_name=f"sweep {folder.name}",
+        parent=None,
+        run_id=run_id,
+    )
+
+
+def _close_parent(folder: Path, files: Sequence[Path], rows: Sequence[Mapping[str, Any]]) -> None:
+    path = folder / "parent.json"
+    if not path.is_file():
+        return
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    tracker = _parent(folder, stored["logger"], stored["run_id"])
+    tracker.open()
+    for row in rows:
+        numbers = {key: float(value) for key, value in row.items() if isinstance(value, int | float)}
+        name = f"{str(row['method']).replace(' + ', ' ')}/{row['data']}"  # MLflow's names hold no plus
+        tracker.log_metrics({f"{name}/{key}": value for key, value in numbers.items()}, 0, 0)
+    for file in files:
+        tracker.log_artifact(file)
+    failed = [record for record in folder.glob(f"*/{RECORD}") if _status(record.parent) != "completed"]
+    tracker.close("FAILED" if failed else "FINISHED")

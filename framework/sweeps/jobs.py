@@ -1,0 +1,350 @@
+"""A sweep on one machine: a process for each job, so many at once, a record of each; it can be resumed."""
+
+import ctypes
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from framework.errors import ConfigError, UserError
+from framework.tracking.signals import Stopped
+
+PARENT = "FRAMEWORK_SWEEP_PARENT"
+"""Environment variable that tells a job the tracking run its sweep is recorded under."""
+COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
+"""What runs one job; its overrides follow. No config can set it, since it would then run code."""
+SYNCED_WITHIN = 60.0
+"""Seconds: what a shorter job has to tell the tracking store, the sweep sends when it has ended."""
+RECORD = "job.json"
+CONSOLE = "console.log"
+VALUE = "value.json"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Job:
+    """One job of a sweep.
+
+    Its record, job.json, holds number, overrides, key and config as here, command, pid, tries, started and
+    ended (seconds since 1970), error and status: "queued", "running", "completed", "failed" (it exited with
+    an error) or "died" (it was killed, or stopped by a signal).
+
+    Attributes:
+        key: hash of the overrides: which job of the sweep it is.
+        config: hash of the whole composed config: whether a completed job still stands.
+        attempts: how often it was started by this process.
+        waits: whether a process of another sweep was seen in its folder.
+    """
+
+    number: int
+    overrides: list[str]
+    arguments: list[str]
+    folder: Path
+    key: str
+    config: str
+    attempts: int = 0
+    waits: bool = False
+    record: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def completed(self) -> bool:
+        """With the config it would have now."""
+        return self.record.get("status") == "completed" and self.record.get("config") == self.config
+
+    def update(self, **values: Any) -> None:
+        """Change the record, in memory and on the disk."""
+        self.record |= values
+        write_whole(self.folder / RECORD, self.record)
+
+    def value(self) -> float | None:
+        """What the job left for the sweeper to minimise (`leave_value`)."""
+        path = self.folder / VALUE
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def leave_value(folder: Path, value: float) -> None:
+    """Called in a job: the number a sweeper that optimises is to get."""
+    write_whole(folder / VALUE, value)
+
+
+def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
+    """The id of the tracking run that the jobs are to be recorded under, if any."""
+    return import_module("framework.sweeps.comparison").begin(folder, config)
+
+
+def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
+    """Compare the jobs that completed."""
+    import_module("framework.sweeps.comparison").summarise(folder, overrides)
+
+
+def hashed(*parts: str) -> str:
+    """A short name for texts that tells them apart."""
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+
+
+def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
+    """Folder and record of every job an earlier sweep in `folder` knew, by key (overrides may repeat)."""
+    found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
+    for path in sorted(folder.rglob(RECORD)):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        found.setdefault(record["key"], []).append((path.parent, record))
+    return found
+
+
+def free_number(subfolder: Callable[[int], Path], number: int, taken: set[Path]) -> int:
+    """The first number from `number` on whose folder no other job has.
+
+    Raises:
+        ConfigError: `hydra.sweep.subdir` gives two jobs one folder.
+    """
+    for candidate in range(number, number + len(taken) + 1):
+        if subfolder(candidate) not in taken:
+            return candidate
+    raise ConfigError(
+        f"hydra.sweep.subdir gives two jobs the folder {subfolder(number)}: wanted one for each. "
+        "Use the default, ${hydra.job.num}."
+    )
+
+
+def cores() -> int:
+    """The CPU cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run(
+    jobs: Sequence[Job],
+    *,
+    at_once: int,
+    retries: int = 0,
+    devices: Sequence[str] = (),
+    parent: str | None = None,
+) -> None:
+    """Run every job that has not completed; returns when all have ended, however they ended.
+
+    SIGINT and SIGTERM are passed on to the jobs, which close their runs; a second signal makes them hurry, a
+    third kills them.
+
+    Args:
+        at_once: how many run at a time; each gets an equal part of the cores.
+        retries: how often a job that died is started again.
+        devices: CUDA devices to hand out, one to each running job; none leaves all visible to all.
+        parent: tracking run the jobs are recorded under.
+
+    Raises:
+        Stopped: a signal came.
+    """
+    queue = deque(job for job in jobs if not job.completed)
+    for job in queue:
+        job.folder.mkdir(parents=True, exist_ok=True)
+        lock = _lock(job)
+        if lock is not None:
+            job.update(key=job.key, number=job.number, overrides=job.overrides, status="queued", error=None)
+            os.close(lock)
+    log.info(
+        f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them completed earlier; {at_once} at once with "
+        f"{max(1, cores() // at_once)} cores each"
+    )
+    running: list[_Running] = []
+    passed_on = 0
+    with _signals() as received, ThreadPoolExecutor(1, "sync") as sending:
+        while running or (queue and not received):
+            for number in received[passed_on:]:
+                _pass_on(number, passed_on, running)
+                passed_on += 1
+            for _ in range(len(queue)):
+                if received or len(running) == at_once:
+                    break
+                job = queue.popleft()
+                lock = _lock(job)
+                if lock is None:
+                    queue.append(job)
+                    continue
+                job.record = json.loads((job.folder / RECORD).read_text(encoding="utf-8"))
+                if job.completed:  # by another sweep, while this one waited for the folder
+                    os.close(lock)
+                else:
+                    slot = min(set(range(at_once)) - {one.slot for one in running})
+                    running.append(_start(job, slot, lock, _environment(at_once, slot, devices, parent)))
+            for one in [one for one in running if one.process.poll() is not None]:
+                running.remove(one)
+                _end(one)
+                if parent is not None:
+                    sending.submit(_sync, one.job.folder)
+                if one.job.record["status"] == "died" and one.job.attempts <= retries and not received:
+                    queue.append(one.job)
+            time.sleep(0.05)
+    if received:
+        raise Stopped(received[0])
+
+
+def _sync(folder: Path) -> None:
+    """Send what a job left unsent; one that died is closed and sent by `summarise`."""
+    try:
+        import_module("framework.tracking.tracker").sync(folder)
+    except UserError as error:
+        log.warning(f"{folder}: {error}")
+
+
+def failure(jobs: Sequence[Job]) -> UserError | None:
+    """What to tell of the jobs that did not complete; None where all did."""
+    bad = [job for job in jobs if job.record.get("status") != "completed"]
+    if not bad:
+        return None
+    lines = [
+        f"  #{job.number} {job.record.get('status')}: {job.record.get('error')}  ({job.folder / CONSOLE})"
+        for job in bad
+    ]
+    return UserError(
+        f"{len(bad)} of {len(jobs)} jobs did not complete:\n" + "\n".join(lines) + "\n"
+        "The same command with hydra.sweep.dir=<folder of this sweep> runs these alone."
+    )
+
+
+def write_whole(path: Path, content: Any) -> None:
+    """JSON that is there whole or not at all, whatever happens meanwhile."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with partial.open("w", encoding="utf-8") as file:
+        json.dump(content, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+@dataclass
+class _Running:
+    job: Job
+    process: subprocess.Popen[bytes]
+    slot: int
+    lock: int
+
+
+def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | None) -> dict[str, str]:
+    # The cores are divided by `at_once` and not by the jobs there are: another number of threads may sum in
+    # another order, and a resumed job must give the bits of an uninterrupted one.
+    environment = {"OMP_NUM_THREADS": str(max(1, cores() // at_once)), **os.environ}
+    # What was printed must be there even if the process is killed.
+    environment |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+    if devices:
+        environment["CUDA_VISIBLE_DEVICES"] = devices[slot % len(devices)]
+    if parent is not None:
+        environment[PARENT] = parent
+    return environment
+
+
+def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str]) -> _Running:
+    job.attempts += 1
+    (job.folder / VALUE).unlink(missing_ok=True)
+    job.update(
+        status="running",
+        tries=job.record.get("tries", 0) + 1,
+        config=job.config,
+        command=[*COMMAND, *job.arguments],
+        started=time.time(),
+        ended=None,
+        error=None,
+        pid=None,
+    )
+    with (job.folder / CONSOLE).open("ab") as console:
+        process = subprocess.Popen(
+            job.record["command"],
+            stdin=subprocess.DEVNULL,
+            stdout=console,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            pass_fds=(lock,),  # held until the last process of the job has ended, even if this one is killed
+            start_new_session=True,  # Ctrl-C comes here alone, and from here once to each job
+            preexec_fn=_end_with_parent,
+        )
+    job.update(pid=process.pid)
+    log.info(f"#{job.number} started: {' '.join(job.overrides)}")
+    return _Running(job, process, slot, lock)
+
+
+def _end(one: _Running) -> None:
+    code = one.process.returncode
+    job = one.job
+    with suppress(ProcessLookupError):  # what a killed job left behind: data loaders, the other ranks
+        os.killpg(one.process.pid, signal.SIGKILL)
+    if code == 0:
+        status, error = "completed", None
+    elif code < 0:
+        status, error = "died", f"killed by {signal.Signals(-code).name}"
+        if code == -signal.SIGKILL:
+            error += ", as the system does when memory runs out"
+    elif code - 128 in (signal.SIGINT, signal.SIGTERM):
+        status, error = "died", f"stopped by {signal.Signals(code - 128).name}"
+    else:
+        status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
+    job.update(status=status, error=error, ended=time.time())
+    os.close(one.lock)
+    seconds = job.record["ended"] - job.record["started"]
+    log.info(
+        f"#{job.number} {status} after {seconds:.1f} s"
+        + (f": {error} ({job.folder / CONSOLE})" if error else "")
+    )
+
+
+def _last_line(console: Path) -> str:
+    """Where Python, and this framework, say what was wrong."""
+    lines = console.read_bytes()[-4096:].decode("utf-8", "replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")[:500]
+
+
+def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
+    for one in running:
+        with suppress(ProcessLookupError):
+            if before < 2:
+                one.process.send_signal(number if before == 0 else signal.SIGTERM)
+            else:
+                os.killpg(one.process.pid, signal.SIGKILL)
+    log.info(f"{signal.Signals(number).name}: {len(running)} running jobs are told to stop")
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """The SIGINTs and SIGTERMs that came inside the block."""
+    received: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
+    try:
+        yield received
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _lock(job: Job) -> int | None:
+    """A descriptor that holds the job's folder; None where a process of another sweep does."""
+    descriptor = os.open(job.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        if not job.waits:
+            log.info(f"#{job.number} waits: a process of another sweep is still in {job.folder}")
+        job.waits = True
+        return None
+    return descriptor
+
+
+_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
+
+
+def _end_with_parent() -> None:
+    """In the child, before the job: get SIGTERM when the sweep is killed (Linux; elsewhere it runs on)."""
+    if _LIBRARY is not None:
+        _LIBRARY.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG

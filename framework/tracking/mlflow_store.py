@@ -1,0 +1,267 @@
+"""A run in an MLflow store. Imports MLflow, so it is imported only when a store is opened."""
+
+import getpass
+import logging
+import os
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from fcntl import LOCK_EX, LOCK_UN, flock
+from pathlib import Path
+from typing import final
+
+from framework.errors import CheckpointError
+from framework.storage.cache import folder as cache_folder
+from framework.tracking.run_info import RunInfo, default_uri, sqlite_path, store_uri, without_password
+from framework.tracking.sender import Record, Store, reason
+
+os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+# One retry instead of minutes of them: who calls this tries again by itself, and has to notice its end.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # MLflow's, about its own dependencies
+    from mlflow import MlflowClient
+    from mlflow.entities import Metric, Param, Run, RunTag
+    from mlflow.exceptions import MlflowException
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+_log = logging.getLogger(__name__)
+logging.getLogger("alembic").setLevel(logging.WARNING)
+logging.getLogger("mlflow").setLevel(logging.WARNING)
+# These tell each failed attempt at length; the sender says it once.
+logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
+logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)
+
+_KEY, _FOLDER = "framework.key", "framework.folder"  # tags
+_LONGEST_NAME = 250  # characters
+
+
+@final
+class MlflowStore(Store):
+    """A run in an MLflow store; it is created if it is not there.
+
+    Args:
+        folder: of the run.
+        info: of the run; its id is looked for first, then its key. If it says RUNNING, MLflow does so too.
+
+    Raises:
+        Exception: whatever MLflow, SQLAlchemy or the network raise when the store is locked, full or away.
+    """
+
+    def __init__(self, folder: Path, info: RunInfo) -> None:
+        self._folder = folder
+        self._client, experiment_id = _opened(info)
+        run = self._found(info, experiment_id)
+        self.replay = {"replay_after": info.replay_after, "replay_until": info.replay_until}
+        sent, owed = info.sent, info.owed
+        if run is None:
+            run = self._created(info, experiment_id)
+            sent, owed, self.replay = 0, (), {"replay_after": None, "replay_until": {}}
+        elif run.info.lifecycle_stage == "deleted":
+            raise RuntimeError(f"run {run.info.run_id} was deleted there; restore it in MLflow")
+        elif info.status == "RUNNING":
+            self._client.update_run(run.info.run_id, status="RUNNING")
+            self._client.set_tag(run.info.run_id, _FOLDER, str(folder))  # it may have been moved
+        self.identity = {
+            "run_id": run.info.run_id,
+            "experiment_id": run.info.experiment_id,
+            "sent": sent,
+            "owed": owed,
+            **self.replay,
+        }
+        self._run_id: str = run.info.run_id
+        self._params: dict[str, str] = dict(run.data.params)
+        # The last step of each metric; RunData itself gives the values alone.
+        self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
+        self._renamed: set[str] = set()
+
+    def send(self, batch: Sequence[Record]) -> None:
+        """As in `Store`: SQL stores know a metric by key, time, step and value, and keep it once."""
+        if "status" in batch[0]:
+            status, end = batch[0]["status"], round(batch[0]["time"] * 1000)
+            if status == "RUNNING":
+                self._client.update_run(self._run_id, status=status)
+            else:
+                self._client.set_terminated(self._run_id, status, end)
+        elif "resumed_after" in batch[0]:
+            self.replay = {"replay_after": batch[0]["resumed_after"], "replay_until": dict(self._stored)}
+        else:
+            metrics = [metric for record in batch for metric in self._metrics(record)]
+            params, tags = self._params_and_tags(batch)
+            self._log(metrics, params, tags)
+            for metric in metrics:
+                self._stored[metric.key] = max(metric.step, self._stored.get(metric.key, metric.step))
+            self._params |= {param.key: param.value for param in params}
+
+    def send_file(self, path: str, place: str) -> None:
+        """As in `Store`; a file that is gone is said and passed over."""
+        file = self._folder / path
+        if file.is_dir():
+            self._client.log_artifacts(
+                self._run_id, str(file), f"{place}/{file.name}" if place else file.name
+            )
+        elif file.exists():
+            self._client.log_artifact(self._run_id, str(file), place or None)
+        else:
+            _log.warning("%s is gone before it could be stored.", file)
+
+    def _found(self, info: RunInfo, experiment_id: str) -> Run | None:
+        if info.run_id is not None:
+            try:
+                return self._client.get_run(info.run_id)
+            except MlflowException as error:
+                if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                    raise
+            uri = without_password(info.uri)
+            _log.warning("%s knows no run %s: the run is stored there anew.", uri, info.run_id)
+        found = self._client.search_runs([experiment_id], f"tags.`{_KEY}` = '{info.key}'", max_results=1)
+        return found[0] if found else None
+
+    def _created(self, info: RunInfo, experiment_id: str) -> Run:
+        tags = {_KEY: info.key, _FOLDER: str(self._folder), "mlflow.user": _user()}
+        tags |= {"mlflow.source.name": "python -m framework", "mlflow.source.type": "LOCAL"}
+        if info.parent:
+            tags["mlflow.parentRunId"] = info.parent
+        return self._client.create_run(experiment_id, int(info.started * 1000), tags, info.run_name)
+
+    def _metrics(self, record: Record) -> Iterator[Metric]:
+        after, until = self.replay["replay_after"], self.replay["replay_until"]
+        for name, value in record.get("values", {}).items():
+            key, step = self._name(name), record["step"]
+            if after is None or not after < step <= until.get(key, after):
+                yield Metric(key, float(value), round(record["time"] * 1000), step)
+
+    def _params_and_tags(self, batch: Sequence[Record]) -> tuple[list[Param], list[RunTag]]:
+        params: dict[str, str] = {}
+        tags: dict[str, str] = {}
+        for record in batch:
+            tags |= {self._name(key): value for key, value in record.get("tags", {}).items()}
+            for name, value in record.get("params", {}).items():
+                key = self._name(name)
+                before = self._params.get(key, params.get(key))
+                if before is None:
+                    params[key] = value
+                elif before != value:  # MLflow lets no parameter change
+                    tags[f"changed.{key}"[:_LONGEST_NAME]] = value
+        return [Param(*item) for item in params.items()], [RunTag(*item) for item in tags.items()]
+
+    def _log(self, metrics: Sequence[Metric], params: Sequence[Param], tags: Sequence[RunTag]) -> None:
+        if not (metrics or params or tags):
+            return
+        try:
+            self._client.log_batch(self._run_id, metrics, params, tags, synchronous=True)
+        except MlflowException as error:
+            deleted = self._client.get_run(self._run_id).info.lifecycle_stage == "deleted"
+            if error.error_code != "INVALID_PARAMETER_VALUE" or deleted:
+                raise
+            # One entry is refused for good. Find it, lest everything behind it wait for ever.
+            singles = [([entry], [], []) for entry in metrics]
+            singles += [([], [entry], []) for entry in params] + [([], [], [entry]) for entry in tags]
+            for single in singles:
+                try:
+                    self._client.log_batch(self._run_id, *single, synchronous=True)
+                except MlflowException as fault:
+                    if fault.error_code != "INVALID_PARAMETER_VALUE":
+                        raise
+                    _log.warning("MLflow refuses an entry; the journal keeps it: %s", reason(fault))
+
+    def _name(self, name: str) -> str:
+        parts = re.sub(r"[^/\w.\- :]", "_", name)[:_LONGEST_NAME].split("/")
+        key = "/".join(part for part in parts if part not in ("", ".", "..")) or "_"
+        if key != name and name not in self._renamed:
+            self._renamed.add(name)
+            _log.warning("MLflow takes no name like %r; there it is %r.", name, key)
+        return key
+
+
+def run_folder(run_id: str, uri: str | None = None) -> Path:
+    """The folder a run was made in, or else a copy, in the cache, of the checkpoints in its store.
+
+    Args:
+        run_id: of MLflow.
+        uri: of the store; None: outputs/mlflow.db in the working directory.
+
+    Raises:
+        CheckpointError: the store has no such run, or the run has no checkpoints.
+    """
+    uri = store_uri(uri) if uri else default_uri(Path.cwd() / "outputs" / "any")
+    shown = without_password(uri)
+    path = sqlite_path(uri)
+    if path is not None and not path.is_file():  # MLflow would make one
+        raise CheckpointError(f"There is no tracking store {path}. Give its address (logger.uri=...).")
+    client = MlflowClient(tracking_uri=uri)
+    try:
+        run = client.get_run(run_id)
+        made = Path(run.data.tags.get(_FOLDER, ""))
+        if _FOLDER in run.data.tags and made.is_dir():
+            return made
+        if not client.list_artifacts(run_id, "checkpoints"):
+            raise CheckpointError(
+                f"Run {run_id} of {shown} has no checkpoints, and its folder {made} is gone."
+            )
+        copy = cache_folder("runs") / run_id
+        copy.mkdir(exist_ok=True)
+        client.download_artifacts(run_id, "checkpoints", str(copy))
+    except MlflowException as error:
+        raise CheckpointError(f"Run {run_id} cannot be had from {shown}: {reason(error)}.") from error
+    return copy
+
+
+def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
+    """A client of the run's store, and the id of its experiment; both made where they are not."""
+    path = sqlite_path(info.uri)
+    if path is None:
+        client = MlflowClient(tracking_uri=info.uri)
+        return client, _experiment(client, info)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # MLflow's own migrations and get-or-create fail when several processes begin at once.
+    with _locked(path.with_name(f".{path.name}.lock")):
+        if not path.exists() or path.stat().st_size == 0:
+            _make_database(path, info)
+        client = MlflowClient(tracking_uri=info.uri)
+        return client, _experiment(client, info)
+
+
+def _make_database(path: Path, info: RunInfo) -> None:
+    """Make an SQLite store aside and rename it: MLflow cannot mend one whose making was cut short."""
+    partial = path.with_name(f".{path.name}.partial")
+    for leftover in (partial, partial.with_name(f"{partial.name}-journal")):
+        leftover.unlink(missing_ok=True)
+    SqlAlchemyStore(f"sqlite:///{partial}", info.artifacts).engine.dispose()
+    partial.replace(path)
+    # MLflow keeps its connections by address: they may lead to a deleted file that was there before.
+    SqlAlchemyStore(info.uri, info.artifacts).engine.dispose()
+
+
+def _experiment(client: MlflowClient, info: RunInfo) -> str:
+    found = client.get_experiment_by_name(info.experiment)
+    if found is None:
+        try:
+            return client.create_experiment(info.experiment, artifact_location=info.artifacts)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+        found = client.get_experiment_by_name(info.experiment)  # somebody was faster
+    if found is None or found.lifecycle_stage == "deleted":
+        raise RuntimeError(
+            f"experiment {info.experiment!r} was deleted there; restore it, or choose another name"
+        )
+    return found.experiment_id
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("a") as file:
+        flock(file, LOCK_EX)
+        try:
+            yield
+        finally:
+            flock(file, LOCK_UN)  # a child forked meanwhile holds the descriptor too
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container may have no name for its user
+        return "unknown"

@@ -1,0 +1,205 @@
+"""Carries a journal to a store, in batches, for as long as that takes."""
+
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from framework.errors import UserError
+from framework.tracking.journal import Journal
+from framework.tracking.run_info import RunInfo, Sidecar, without_password
+
+_log = logging.getLogger(__name__)
+
+_BATCH = 1000  # metrics, parameters and tags that a store takes at once
+_LINES = 50  # waiting lines that are worth a call of the store
+_SECONDS = 2.0  # no line waits longer while the store answers
+_PAUSE = 0.5  # seconds between calls at least: a fast training is not to be slowed by its own numbers
+_FIRST_RETRY, _LAST_RETRY = 1.0, 30.0  # seconds between attempts, doubled each time
+
+Record = dict[str, Any]
+
+
+class Store(ABC):
+    """One run in a store. Whatever a method raises is taken for a store that is away: it is called again."""
+
+    identity: Mapping[str, Any]
+    """Fields of `RunInfo` as they are once the store is open."""
+    replay: Mapping[str, Any]
+    """The fields `replay_...` of `RunInfo`, after what was sent so far."""
+
+    @abstractmethod
+    def send(self, batch: Sequence[Record]) -> None:
+        """Store one of `batches`; the same one may come twice, and is stored once."""
+
+    @abstractmethod
+    def send_file(self, path: str, place: str) -> None:
+        """Store a file or a directory, its path absolute or in the run folder, under the folder `place`."""
+
+
+OpenStore = Callable[[Path, RunInfo], Store]
+"""From a run folder and what is known of the run to the run in its store."""
+
+
+def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
+    """Records in order, put together for few calls of the store.
+
+    Metrics, parameters and tags go together; files, changes of status and resumptions go one by one.
+    """
+    batch: list[Record] = []
+    size = 0
+    for record in records:
+        entries = sum(len(record.get(kind, ())) for kind in ("values", "params", "tags"))
+        alone = not record.keys() & {"values", "params", "tags"}
+        if batch and (alone or size + entries > _BATCH):
+            yield batch
+            batch, size = [], 0
+        if alone:
+            yield [record]
+        else:
+            batch.append(record)
+            size += entries
+    if batch:
+        yield batch
+
+
+def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> int:
+    """Send what the journal has by now and the store lacks, or as much until `stop()`; how many lines.
+
+    What is logged meanwhile waits for the next call, or a training would be followed line by line.
+    """
+    count, last_line = 0, journal.last
+    while sidecar.info.sent < last_line and (records := journal.read(sidecar.info.sent)):
+        for batch in batches(records):
+            if stop():
+                return count
+            last = batch[-1]["n"]
+            if "artifact" in batch[0]:
+                # Owed now and sent afterwards: files that cannot be stored must not hold up the numbers.
+                owed = (*sidecar.info.owed, (batch[0]["artifact"], batch[0]["folder"]))
+                sidecar.update(sent=last, owed=owed)
+            else:
+                store.send(batch)
+                sidecar.update(sent=last, **store.replay)
+            count += len(batch)
+    return count
+
+
+def send_owed(sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> None:
+    """Send the files that wait, in order."""
+    while sidecar.info.owed and not stop():
+        store.send_file(*sidecar.info.owed[0])
+        sidecar.update(owed=sidecar.info.owed[1:])
+
+
+def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> int:
+    """Send everything once, of a run whose process has ended; how many lines of the journal that were.
+
+    Raises:
+        UserError: the store did not take everything.
+    """
+    try:
+        store = open_store(folder, sidecar.info)
+        sidecar.update(**store.identity)
+        count = send_new(journal, sidecar, store, lambda: False)
+        send_owed(sidecar, store, lambda: False)
+    except Exception as error:
+        raise UserError(
+            f"The tracking store {without_password(sidecar.info.uri)} did not take everything "
+            f"({reason(error)}). What it lacks is kept in {journal.path}; try again when the store is back."
+        ) from error
+    return count
+
+
+class Sender(threading.Thread):
+    """Sends a growing journal until told to finish; no failure of the store ends it."""
+
+    def __init__(self, folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> None:
+        super().__init__(name="tracking", daemon=True)  # a store that hangs does not keep the process alive
+        self.tried = threading.Event()
+        """The store has answered once, or has failed once."""
+        self._folder = folder
+        self._journal = journal
+        self._sidecar = sidecar
+        self._open_store = open_store
+        self._store: Store | None = None
+        self._waiting_lines = 0
+        self._wake = threading.Event()
+        self._finishing = threading.Event()
+        self._abandoned = False
+        self._away_since: float | None = None
+
+    def notice(self) -> None:
+        """One more line waits."""
+        self._waiting_lines += 1
+        if self._waiting_lines >= _LINES:
+            self._wake.set()
+
+    def warn(self, why: str) -> None:
+        """Say that the store is away, unless that was said."""
+        if self._away_since is None:
+            self._away_since = time.monotonic()
+            _log.warning(
+                "The tracking store %s cannot be reached or written (%s). The run goes on; everything is "
+                "kept in %s and sent when the store is back.",
+                without_password(self._sidecar.info.uri),
+                why,
+                self._journal.path,
+            )
+
+    def finish(self, patience: float) -> bool:
+        """Send the rest and stop; whether everything was sent within `patience` seconds."""
+        self._finishing.set()
+        self._wake.set()
+        self.join(patience)
+        self._abandoned = True
+        info = self._sidecar.info
+        return not self.is_alive() and info.sent >= self._journal.last and not info.owed
+
+    def run(self) -> None:
+        retry = _FIRST_RETRY
+        while not self._abandoned:
+            finishing = self._finishing.is_set()
+            self._waiting_lines = 0
+            self._wake.clear()
+            try:
+                self._send()
+            except Exception as error:
+                self._store = None  # looked for anew, as it may be another one then
+                self.warn(reason(error))
+                self.tried.set()
+                # Once finishing there is little time: it is spent on trying.
+                if finishing:
+                    time.sleep(_FIRST_RETRY)
+                else:
+                    self._finishing.wait(retry)
+                retry = min(2 * retry, _LAST_RETRY)
+                continue
+            retry = _FIRST_RETRY
+            self.tried.set()
+            if self._away_since is not None:
+                seconds, self._away_since = time.monotonic() - self._away_since, None
+                uri = without_password(self._sidecar.info.uri)
+                _log.warning("The tracking store %s is back after %.0f s and has everything.", uri, seconds)
+            if finishing:
+                return
+            if not self._finishing.wait(_PAUSE):
+                self._wake.wait(_SECONDS - _PAUSE)
+
+    def _send(self) -> None:
+        if self._store is None:
+            self._store = self._open_store(self._folder, self._sidecar.info)
+            self._sidecar.update(**self._store.identity)
+        send_new(self._journal, self._sidecar, self._store, lambda: self._abandoned)
+        send_owed(self._sidecar, self._store, lambda: self._abandoned)
+
+
+def reason(error: BaseException) -> str:
+    """What an exception of a store says, or rather the one it came from, in a line that can be shown."""
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause  # "Connection refused" and "database is locked" stand at the bottom
+    line = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    return without_password(line if len(line) <= 200 else line[:199] + "…").rstrip(". ")

@@ -1,0 +1,395 @@
+"""Recording a run: what it logs stands in the local journal at once, and in a store when that can take it."""
+
+import importlib
+import json
+import logging
+import shlex
+import time
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, final
+
+from framework.errors import DataError, UserError
+from framework.tracking.journal import Journal, write_atomically
+from framework.tracking.run_info import (
+    SIDECAR,
+    RunInfo,
+    Sidecar,
+    artifact_folder,
+    default_uri,
+    read_run_info,
+    store_uri,
+    without_password,
+)
+from framework.tracking.sender import OpenStore, Sender, send_all
+
+__all__ = ["MlflowTracker", "NoTracker", "RunInfo", "Tracker", "mark_dead", "read_run_info", "sync"]
+
+_log = logging.getLogger(__name__)
+
+Status = Literal["FINISHED", "FAILED", "KILLED"]
+
+JOURNAL = "journal.jsonl"
+LONGEST_PARAMETER = 250  # characters; some servers cut off the rest without a word
+
+
+class Tracker(ABC):
+    """Records one run. One process per run folder: the others of a distributed training use no tracker.
+
+    `open` comes first and `close` last. Between them nothing here raises or waits for the sake of a store:
+    what is logged is in the journal when the call returns, within a tenth of a millisecond for metrics, and
+    reaches the store later. Steps are optimiser steps; names are like "validation/loss".
+    """
+
+    journal: Journal
+
+    @abstractmethod
+    def open(self) -> None:
+        """Begin the run, or go on with it: its status is RUNNING from here on.
+
+        Raises:
+            DataError: the run folder cannot be written, or another process writes there.
+        """
+
+    @abstractmethod
+    def log_params(self, flat: Mapping[str, object]) -> None:
+        """Record the config, keys dotted. A value stays; another one later becomes a tag `changed.<key>`."""
+
+    @abstractmethod
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        """Record texts that describe the run; the last value of a tag counts."""
+
+    @abstractmethod
+    def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
+        """Record numbers, NaN and infinities among them."""
+
+    @abstractmethod
+    def log_artifact(self, path: Path, folder: str = "") -> None:
+        """Record a file or a directory, under `folder` in the store. Leave it there: it is read later."""
+
+    @abstractmethod
+    def drop_after(self, step: int) -> None:
+        """Forget the metrics after `step`, from which the run is resumed and which it will repeat."""
+
+    @abstractmethod
+    def close(self, status: Status) -> None:
+        """End the run. Waits, within bounds, for the store to take what is still on its way."""
+
+    @abstractmethod
+    def leave_open(self) -> None:
+        """As `close`, but the run goes on: another tracker will open it again."""
+
+    @property
+    @abstractmethod
+    def run_id(self) -> str | None:
+        """The store's id of the run; None without a store, or as long as it was not reached."""
+
+    @property
+    @abstractmethod
+    def url(self) -> str:
+        """What to type or to open in order to see the run."""
+
+
+@final
+class NoTracker(Tracker):
+    """Keeps the journal of metrics and nothing else.
+
+    Args:
+        folder: of the run.
+        resumed: go on with the journal in the folder, rather than set it aside; None: if its run did not end.
+    """
+
+    def __init__(self, folder: Path, *, resumed: bool | None = None) -> None:
+        self.folder = folder
+        self.journal = Journal(folder / JOURNAL)
+        self._resumed = resumed
+        self._sidecar: Sidecar | None = None
+
+    def open(self) -> None:
+        wanted = RunInfo(None, "", "", "", None, None, uuid.uuid4().hex, time.time(), "RUNNING")
+        self._sidecar = _begin(self.folder, self.journal, wanted, self._resumed)
+
+    def log_params(self, flat: Mapping[str, object]) -> None:
+        """Nothing: the config is in the run folder."""
+
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        """Nothing: nobody could search them."""
+
+    def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
+        self.journal.write(values, step, epoch)
+
+    def log_artifact(self, path: Path, folder: str = "") -> None:
+        """Nothing: the file is where it is."""
+
+    def drop_after(self, step: int) -> None:
+        self.journal.drop_after(step)
+
+    def close(self, status: Status) -> None:
+        if self._sidecar is not None:
+            self._sidecar.update(status=status)
+        self.journal.close()
+
+    def leave_open(self) -> None:
+        self.journal.close()
+
+    @property
+    def run_id(self) -> None:
+        return None
+
+    @property
+    def url(self) -> str:
+        return str(self.journal.path)
+
+
+@final
+class MlflowTracker(Tracker):
+    """Sends a run to an MLflow store from a thread of its own, in batches, however long that takes.
+
+    Everything logged is a line of the journal, and the store is a copy of it. The thread sends what is new
+    when 50 lines wait or two seconds have passed; when the store is locked, full or away it tries again, for
+    ever and ever less often. What the process could not send before it ended, `sync` sends. What the store
+    has is not sent again: a resumed run repeats the steps after its checkpoint, and of these the store keeps
+    what it got first.
+
+    A short run that somebody else will `sync` when it has ended (a sweep, which has MLflow at hand already) need not
+    pay for MLflow's import, several seconds: with `wait` nothing is sent before that time is over.
+
+    Args:
+        folder: of the run.
+        uri: an MLflow tracking URI; None: `default_uri(folder)`.
+        experiment: its name in MLflow; made if new.
+        run_name: shown in MLflow.
+        parent: run id under which MLflow shows this one.
+        run_id: of the run to go on with; None: a new run, or the one in the folder if that has no id yet.
+        resumed: whether to go on with the run in the folder, or to set that aside; None: as `run_id` tells.
+        patience: seconds `close` waits for the store.
+        opening_patience: seconds `open` waits for the store.
+        wait: seconds after opening before the first line is sent; a run that ends sooner sends nothing.
+
+    Raises:
+        ConfigError: `uri` names a store that MLflow cannot keep runs in.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        uri: str | None,
+        experiment: str,
+        run_name: str,
+        parent: str | None,
+        run_id: str | None,
+        resumed: bool | None = None,
+        patience: float = 60.0,
+        opening_patience: float = 30.0,
+        wait: float = 0.0,
+    ) -> None:
+        self.folder = folder.absolute()
+        self.journal = Journal(self.folder / JOURNAL)
+        uri = store_uri(uri) if uri else default_uri(self.folder)
+        self._wanted = RunInfo(
+            run_id=run_id,
+            uri=uri,
+            experiment=experiment,
+            run_name=run_name,
+            parent=parent,
+            artifacts=artifact_folder(uri, self.folder),
+            key=uuid.uuid4().hex,
+            started=time.time(),
+            status="RUNNING",
+        )
+        self._resumed = resumed
+        self._patience = patience
+        self._opening_patience = opening_patience
+        self._sends_from = time.monotonic() + wait if wait else 0.0
+        self._sidecar: Sidecar | None = None
+        self._sender: Sender | None = None
+        self._closed = False
+
+    def open(self) -> None:
+        self._closed = False
+        self._sidecar = _begin(self.folder, self.journal, self._wanted, self._resumed)
+        self.journal.append(status="RUNNING")
+        self._notice()
+
+    def _start_sending(self, sidecar: Sidecar) -> None:
+        # Imported here and not in the sender's thread: imports of two threads can get into each other's way.
+        sender = Sender(self.folder, self.journal, sidecar, _mlflow_store())
+        sender.start()
+        if not sender.tried.wait(self._opening_patience):
+            sender.warn("no answer yet")
+        self._sender = sender
+
+    def log_params(self, flat: Mapping[str, object]) -> None:
+        shown = {key: str(value) for key, value in flat.items()}
+        long = {key: value for key, value in shown.items() if len(value) > LONGEST_PARAMETER}
+        if long:
+            shown |= {key: value[: LONGEST_PARAMETER - 1] + "…" for key, value in long.items()}
+            self._keep_whole(long)
+        self._log(params=shown)
+
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        self._log(tags=dict(tags))
+
+    def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
+        self.journal.write(values, step, epoch)
+        self._notice()
+
+    def log_artifact(self, path: Path, folder: str = "") -> None:
+        path = path.absolute()
+        # Relative where it can be: a run folder may be moved before it is synced.
+        inside = path.is_relative_to(self.folder)
+        self._log(artifact=str(path.relative_to(self.folder) if inside else path), folder=folder)
+
+    def drop_after(self, step: int) -> None:
+        self.journal.drop_after(step)
+
+    def close(self, status: Status) -> None:
+        if self._sidecar is not None and not self._closed:
+            self.journal.append(status=status)
+            self._sidecar.update(status=status)
+        self.leave_open()
+
+    def leave_open(self) -> None:
+        if self._sidecar is None or self._closed:
+            return
+        self._closed = True
+        if self._sender is not None and not self._sender.finish(self._patience):
+            _log.warning(
+                "Part of this run has not reached the tracking store %s; it is kept in %s, and "
+                "`python -m framework mode=sync mode.run=%s` will send it.",
+                without_password(self._sidecar.info.uri),
+                self.journal.path,
+                shlex.quote(str(self.folder)),
+            )
+        self._sender = None
+        self.journal.close()
+
+    def _keep_whole(self, params: dict[str, str]) -> None:
+        path = self.folder / "params.json"
+        try:
+            earlier = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+            write_atomically(path, json.dumps({**earlier, **params}, indent=1).encode())
+        except OSError as error:
+            _log.warning("Parameters too long for the store are not in %s either: %s.", path, error.strerror)
+        else:
+            self.log_artifact(path)
+
+    def _log(self, **record: Any) -> None:
+        self.journal.append(**record)
+        self._notice()
+
+    def _notice(self) -> None:
+        """One more line waits; start sending when it is time."""
+        if self._sender is None and self._sidecar is not None and not self._closed:
+            if time.monotonic() >= self._sends_from:
+                self._start_sending(self._sidecar)
+        elif self._sender is not None:
+            self._sender.notice()
+
+    @property
+    def run_id(self) -> str | None:
+        return self._sidecar.info.run_id if self._sidecar else self._wanted.run_id
+
+    @property
+    def url(self) -> str:
+        info = self._sidecar.info if self._sidecar else self._wanted
+        if not info.uri.startswith("http"):
+            return f"mlflow ui --backend-store-uri {shlex.quote(without_password(info.uri))}"
+        base = without_password(info.uri).rstrip("/")
+        return f"{base}/#/experiments/{info.experiment_id}/runs/{info.run_id}" if info.run_id else base
+
+
+def sync(folder: Path) -> int:
+    """Send what the store lacks of a run whose process has ended; how many lines of its journal that were.
+
+    Raises:
+        DataError: no run with a store is there, or its process is alive.
+        UserError: the store did not take everything; what it took is not sent again.
+    """
+    folder = folder.absolute()
+    info = read_run_info(folder)
+    if info is None or not info.uri:
+        raise DataError(f"{folder} holds no run that goes to a store: it has no {SIDECAR}, or logger=none.")
+    journal = Journal(folder / JOURNAL)
+    journal.open(after=info.sent)  # and so nobody else sends
+    try:
+        return send_all(folder, journal, Sidecar(folder, info), _mlflow_store())
+    finally:
+        journal.close()
+
+
+def mark_dead(folder: Path, status: Status = "KILLED") -> bool:
+    """Close a run whose process died without closing it; False where there is nothing to close.
+
+    Sends what the store lacks, too. Where the store is away, the journal and `run.json` hold the status, and
+    a later `sync` tells the store.
+
+    Raises:
+        DataError: the process is alive.
+    """
+    folder = folder.absolute()
+    info = read_run_info(folder)
+    if info is None or info.status != "RUNNING":
+        return False
+    journal = Journal(folder / JOURNAL)
+    journal.open(after=info.sent)
+    sidecar = Sidecar(folder, info)
+    journal.append(status=status)
+    sidecar.update(status=status)
+    try:
+        if info.uri:
+            send_all(folder, journal, sidecar, _mlflow_store())
+    except UserError as error:
+        _log.warning("%s", error)
+    finally:
+        journal.close()
+    return True
+
+
+def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None) -> Sidecar:
+    """Take hold of a run folder: go on with the run in it, or set that aside."""
+    earlier = read_run_info(folder)
+    journal.open(after=earlier.sent if earlier else 0)
+    if earlier is not None and _continues(earlier, wanted, resumed):
+        known = replace(
+            wanted,
+            run_id=wanted.run_id or earlier.run_id,
+            key=earlier.key,
+            started=earlier.started,
+            experiment_id=earlier.experiment_id,
+        )
+        if (earlier.uri, earlier.run_id) == (known.uri, known.run_id):  # another store gets everything
+            known = replace(
+                known,
+                sent=earlier.sent,
+                owed=earlier.owed,
+                replay_after=earlier.replay_after,
+                replay_until=earlier.replay_until,
+            )
+    else:
+        known = wanted
+        if earlier is not None or journal.last:
+            number = next(k for k in range(1, 1 << 30) if not (folder / f"journal.{k}.jsonl").exists())
+            if earlier is not None:
+                (folder / SIDECAR).replace(folder / f"run.{number}.json")
+            journal.set_aside(folder / f"journal.{number}.jsonl")
+    sidecar = Sidecar(folder, known)
+    sidecar.update()
+    return sidecar
+
+
+def _continues(earlier: RunInfo, wanted: RunInfo, resumed: bool | None) -> bool:
+    if resumed is not None:
+        return resumed
+    if wanted.run_id is not None:
+        return wanted.run_id == earlier.run_id
+    return earlier.run_id is None and earlier.status != "FINISHED"
+
+
+def _mlflow_store() -> OpenStore:
+    """What opens a run in MLflow; MLflow is imported here and nowhere else."""
+    return importlib.import_module("framework.tracking.mlflow_store").MlflowStore

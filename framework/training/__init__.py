@@ -1,0 +1,1 @@
+"""Training steps, the order of batches, checkpoints, cached features, fitting without gradient."""

@@ -1,0 +1,50 @@
+"""Fits density heads that learn from the whole training split at once."""
+
+from collections.abc import Iterable
+
+import torch
+
+from framework.data import Batch
+from framework.density_head import Fitted
+from framework.errors import DataError
+from framework.model import Model, Predictor
+from framework.training.batches import Batches
+
+
+def fitted_models(predictor: Predictor) -> list[Model]:
+    """Those with such a head, wherever they are wrapped."""
+    found = [module for module in predictor.modules() if isinstance(module, Model)]
+    return [model for model in found if isinstance(model.head, Fitted)]
+
+
+@torch.no_grad()
+def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
+    """Fit every such head to the features of the training split; the members of an ensemble with seeds of their own.
+
+    Args:
+        predictor: what reads the batches' inputs.
+        batches: not augmented.
+
+    Raises:
+        DataError: a feature is not finite; names the sample.
+    """
+    seen = list(batches.of(batches.data.train()))
+    target = torch.cat([batch["target"] for batch in seen])
+    for number, model in enumerate(fitted_models(predictor)):
+        features = torch.cat([model.raw(batch["input"]) for batch in seen])
+        bad = (~features.isfinite()).any(1).nonzero().flatten()
+        if len(bad):
+            index = torch.cat([batch["index"] for batch in seen])[bad[0]]
+            raise DataError(
+                f"{len(bad)} of {len(features)} training samples have features that are not finite, the first is "
+                f"sample {int(index)}. Mend or leave out those samples, or look at the encoder."
+            )
+        assert isinstance(model.head, Fitted)
+        model.head.fit(features, target, seed + number)
+
+
+@torch.no_grad()
+def mean_loss(predictor: Predictor, batches: Iterable[Batch]) -> float:
+    """Over the samples, nats."""
+    losses = [predictor.loss(batch["input"], batch["target"]) for batch in batches]
+    return float(torch.cat(losses).mean())

@@ -1,0 +1,255 @@
+"""The one LightningModule of the density road, and the callbacks that keep a run whole."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor, nn
+
+from framework.configuration.settings import OptimizerSettings
+from framework.data import Batch, Data
+from framework.errors import NonFiniteLoss
+from framework.model import Preceded, Predictor
+from framework.objective import Objective
+from framework.tracking.signals import Stopper
+from framework.tracking.tracker import Tracker
+from framework.training.batches import seed_step
+
+# fused: one pass over the memory of each parameter instead of several, half the time of a small network's step
+OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
+    "adam": partial(torch.optim.Adam, fused=True),
+    "adamw": partial(torch.optim.AdamW, fused=True),
+    "sgd": partial(torch.optim.SGD, fused=True),
+    "nadam": torch.optim.NAdam,
+    "radam": torch.optim.RAdam,
+}
+
+
+class Training(pl.LightningModule):
+    """Minimises the predictor's mean loss plus the objectives.
+
+    Noise (dropout, latent draws, augmentation) is a function of (seed, step); a loss that is not finite stops the
+    run before the optimiser sees it.
+
+    Args:
+        encoded: whether batches hold cached features (training.cached_features) and not inputs; the predictor is a
+            `Preceded` then.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        objectives: Sequence[Objective],
+        data: Data,
+        optimizer: OptimizerSettings,
+        seed: int,
+        description: dict[str, Any],
+        *,
+        encoded: bool = False,
+    ) -> None:
+        super().__init__()
+        self.predictor = predictor
+        self.objectives = nn.ModuleList(objectives)
+        self.augment = data.augment
+        self.optimizer_settings = optimizer
+        self.seed = seed
+        self.description = description
+        self.encoded = encoded
+
+    @property
+    def learner(self) -> Predictor:
+        """What reads the batches."""
+        if self.encoded:
+            assert isinstance(self.predictor, Preceded)
+            return self.predictor.predictor
+        return self.predictor
+
+    def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        # by batches, not by optimiser steps: those stand still while gradients are accumulated
+        seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train", self.global_rank)
+        batch = self.augment(batch)
+        losses = self.learner.loss(batch["input"], batch["target"])
+        loss = losses.mean()
+        for objective in self.objectives:
+            loss = loss + objective(self.learner, batch)
+        if not math.isfinite(value := loss.item()):
+            raise NonFiniteLoss(self._blame(losses, batch, value))
+        self.last_loss = value
+        return loss
+
+    def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
+        seed_step(self.seed, batch_index, "validation")
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        loss = self.learner.loss(batch["input"], batch["target"]).mean()
+        self.log("validation/loss", loss, on_epoch=True, batch_size=len(batch["target"]), sync_dist=True)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        chosen = self.optimizer_settings
+        momentum = {} if chosen.momentum is None else {"momentum": chosen.momentum}
+        optimizer = OPTIMIZERS[chosen.name](
+            self.parameters(), lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **momentum
+        )
+        total = self._planned_steps()
+
+        def factor(step: int) -> float:
+            warm = min(1.0, (step + 1) / (chosen.warmup_steps + 1))
+            if chosen.schedule == "constant":
+                return warm
+            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _planned_steps(self) -> int:
+        """Optimiser steps until the end, for the schedule.
+
+        Not `trainer.estimated_stepping_batches`: it starts the loader, whose workers then fetch from the first batch
+        before a resumed run knows where it is.
+        """
+        trainer: Any = self.trainer
+        batches = len(trainer.datamodule.train_dataloader())
+        limit = trainer.limit_train_batches
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        steps = math.ceil(batches / trainer.accumulate_grad_batches) * max(1, trainer.max_epochs or 1)
+        return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["framework"] = self.description
+
+    def _blame(self, losses: Tensor, batch: Batch, value: float) -> str:
+        bad = (~losses.detach().isfinite()).nonzero().flatten().tolist()
+        rows = [int(batch["index"][row]) for row in bad]
+        who = f"samples {rows[:10]} of the training split" if rows else "an objective, not a sample"
+        return (
+            f"The training loss became {value} at step {self.global_step} (epoch {self.current_epoch}), through {who}. "
+            "The weights were not changed by this step and the last checkpoint is kept. Look at these samples, lower "
+            "optimizer.learning_rate, or set trainer.gradient_clip_val."
+        )
+
+
+class KeepCheckpoints(pl.Callback):
+    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, where it is to be kept, best.ckpt.
+
+    `last` is saved at the end of every epoch that was validated, of the last one, and every `every_steps` steps; `best`
+    whenever the validation loss is lower than ever. Each write is whole or absent (framework.training.checkpoint).
+
+    Attributes:
+        kept_loss: validation loss of the weights that will be tested, nats.
+        kept_epoch: theirs, from 0.
+    """
+
+    def __init__(self, folder: Path, every_steps: int | None, keep: Literal["best", "last"] = "best") -> None:
+        self.folder = folder
+        self.every_steps = every_steps
+        self.keep: Literal["best", "last"] = keep
+        self.kept_loss = math.inf
+        self.kept_epoch = -1
+
+    @property
+    def kept(self) -> Path:
+        """The checkpoint whose weights will be tested."""
+        return self.folder / f"{self.keep}.ckpt"
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"kept_loss": self.kept_loss, "kept_epoch": self.kept_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.kept_loss = state_dict["kept_loss"]
+        self.kept_epoch = state_dict["kept_epoch"]
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        # not at an epoch's last batch: a run resumed from there would skip the validation that is about to come
+        if self.every_steps and trainer.global_step % self.every_steps == 0 and not trainer.is_last_batch:
+            self.save_last(trainer)
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if trainer.sanity_checking or trainer.state.fn != "fit":
+            return
+        loss = float(trainer.callback_metrics["validation/loss"])
+        if self.keep == "last" or loss < self.kept_loss:
+            self.kept_loss, self.kept_epoch = loss, trainer.current_epoch
+            if self.keep == "best":
+                trainer.save_checkpoint(self.kept)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        done, every = trainer.current_epoch + 1, trainer.check_val_every_n_epoch or 1
+        if done % every == 0 or done == trainer.max_epochs or trainer.should_stop:
+            self.save_last(trainer)
+
+    def save_last(self, trainer: pl.Trainer) -> None:
+        last = self.folder / "last.ckpt"
+        if last.exists() and trainer.is_global_zero:
+            last.replace(self.folder / "previous.ckpt")
+        trainer.save_checkpoint(last)
+
+
+class Report(pl.Callback):
+    """Sends losses and the learning rate to the tracker."""
+
+    def __init__(self, tracker: Tracker, every_steps: int) -> None:
+        self.tracker = tracker
+        self.every_steps = every_steps
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if trainer.global_step % self.every_steps == 0 and trainer.is_global_zero:
+            assert isinstance(pl_module, Training)
+            rate = trainer.optimizers[0].param_groups[0]["lr"]
+            self.tracker.log_metrics(
+                {"train/loss": pl_module.last_loss, "train/learning_rate": rate},
+                trainer.global_step,
+                trainer.current_epoch,
+            )
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if not trainer.sanity_checking and trainer.is_global_zero and trainer.state.fn == "fit":
+            loss = float(trainer.callback_metrics["validation/loss"])
+            self.tracker.log_metrics({"validation/loss": loss}, trainer.global_step, trainer.current_epoch)
+
+
+class StopAtBatch(pl.Callback):
+    """While fitting, a signal waits for the batch to end, or for the epoch's end if it is the last one; then last.ckpt
+    is saved and the run stops."""
+
+    def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:
+        self.stopper = stopper
+        self.keep = keep
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.stopper.wait = True
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self.stopper.wait = False
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self.stopper.received is not None and not trainer.is_last_batch:
+            self.keep.save_last(trainer)
+            self.stopper.stop()
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if self.stopper.received is not None:
+            self.keep.save_last(trainer)
+            self.stopper.stop()
+
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        # The last checkpoint stands: one saved inside validation would skip the rest of it on resuming.
+        if self.stopper.received is not None:
+            self.stopper.stop()

@@ -1,0 +1,1 @@
+"""Data sets, a folder for each or for a family that shares code."""

@@ -1,0 +1,1 @@
+"""Registered bodies: scans of synthetic people, and FAUST."""

@@ -1,0 +1,153 @@
+"""Body models in their usual layout, and in our own: `v_template`, `shapedirs` and so on in an .npz or a .pkl.
+
+The layout of the published body models with linear blend skinning: `v_template` (V, 3), `shapedirs` (V, 3, B),
+`J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J) whose first row holds parents, `f` (F, 3), and for most
+`posedirs` (V, 3, 9 (J - 1)), or with 4 (J - 1) + 1 features. Other keys are left alone. Pickles go through
+plugins.data.bodies.restricted_pickle: nothing that a file names is run.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from framework.errors import DataError
+from plugins.data.bodies import restricted_pickle
+from plugins.data.bodies.body import Body
+
+NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
+OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
+LARGEST = 2**27
+"""Numbers that a sparse matrix may have when it is written out."""
+WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
+
+
+def read(file: Path) -> Body:
+    """A body model from a file in the usual layout.
+
+    Raises:
+        DataError: no such file, another format, something in it that is neither arrays nor plain values, an array
+            missing or of another shape. Says which.
+    """
+    try:
+        if file.suffix == ".npz":
+            # a stream of our own: NumPy leaves a damaged file open
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+                return _body(file, {name: _member(file, stored, name) for name in _named(stored)})
+        if file.suffix == ".pkl":
+            return _body(file, _unpickled(file))
+    except FileNotFoundError:
+        raise DataError(f"{file}: no such file; wanted a body model. Mend the path.") from None
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{file}: cannot be read ({error}). Restore it from its source.") from error
+    raise DataError(f"{file}: wanted a body model whose name ends in .npz or .pkl.")
+
+
+def save(body: Body, file: Path) -> None:
+    """Write a body as an .npz of our own layout, whole or not at all."""
+    arrays = {name: np.asarray(getattr(body, name)) for name in OWN}
+    arrays |= {"source": np.array(body.source), "names": np.array(body.names, dtype=np.str_)}
+    if body.pose_shapes is not None:
+        arrays["pose_shapes"] = body.pose_shapes
+    part = file.with_name(f".{file.name}.part")
+    with part.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+    part.replace(file)
+
+
+def load(file: Path) -> Body:
+    """A body that `save` wrote.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    try:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        parents = tuple(int(parent) for parent in arrays.pop("parents"))
+        names = tuple(str(name) for name in arrays.pop("names"))
+        return Body(source=str(arrays.pop("source")), parents=parents, names=names, **arrays)
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{file}: cannot be read as a body ({error}). Delete it: it is made anew.") from error
+
+
+def _named(stored: Any) -> list[str]:
+    return [name for name in (*NEEDED, "posedirs") if name in stored.files]
+
+
+def _member(file: Path, stored: Any, name: str) -> np.ndarray:
+    try:
+        return stored[name]
+    except ValueError as error:
+        raise DataError(
+            f"{file}: {name} cannot be read as plain numbers ({error}). Save it as an array of numbers. {WANTED}"
+        ) from error
+
+
+def _unpickled(file: Path) -> Mapping[str, Any]:
+    try:
+        found = restricted_pickle.load(file.read_bytes())
+    except restricted_pickle.PickleRefused as error:
+        raise DataError(
+            f"{file}: refused as a pickle: {error}. Only arrays are read from pickles; nothing in this file was run. "
+            f"{WANTED}"
+        ) from error
+    if not isinstance(found, dict):
+        raise DataError(f"{file}: holds {type(found).__name__}. {WANTED}")
+    return found
+
+
+def _body(file: Path, found: Mapping[str, Any]) -> Body:
+    missing = [name for name in NEEDED if name not in found]
+    if missing:
+        names = ", ".join(map(str, found)) or "nothing"
+        raise DataError(f"{file}: {', '.join(missing)} not in it; it holds {names}. {WANTED}")
+    posedirs = found.get("posedirs")
+    arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}
+    template, shapes, regressor = arrays["v_template"], arrays["shapedirs"], arrays["J_regressor"]
+    if shapes.ndim == 2:  # of a single coefficient
+        shapes = shapes[..., None]
+    table = arrays["kintree_table"]
+    if (
+        template.ndim != 2
+        or shapes.shape[:2] != template.shape
+        or table.ndim != 2
+        or regressor.shape != (table.shape[1], len(template))
+    ):
+        shown = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise DataError(f"{file}: {shown} do not fit together. {WANTED}")
+    wanted = template.dtype
+    return Body(
+        source=str(file),
+        template=template,
+        faces=arrays["f"].astype(np.int64),
+        weights=arrays["weights"].astype(wanted),
+        # the root's parent is -1, or what that becomes as an unsigned number
+        parents=tuple(
+            -1 if not 0 <= parent < table.shape[1] else int(parent) for parent in table[0].tolist()
+        ),
+        # joints are linear in the vertices (Loper et al. 2015, eq. 10), so each coefficient displaces them too
+        joints=(regressor @ template).astype(wanted),
+        shapes=shapes.astype(wanted),
+        joint_shapes=np.einsum("jv,vcs->jcs", regressor, shapes).astype(wanted),
+        pose_shapes=None if posedirs is None else _numbers(file, "posedirs", posedirs).astype(wanted),
+    )
+
+
+def _numbers(file: Path, name: str, value: Any) -> np.ndarray:
+    if sparse.issparse(value) and value.shape[0] * value.shape[1] > LARGEST:
+        raise DataError(
+            f"{file}: {name} is a sparse matrix of {value.shape}, too large to be a body's. {WANTED}"
+        )
+    array = value.toarray() if sparse.issparse(value) else np.asarray(value)
+    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise DataError(
+            f"{file}: {name} is {array.dtype} {array.shape} with numbers that are not finite, or no numbers. {WANTED}"
+        )
+    if array.dtype.kind == "f":
+        return array.astype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
+    return array if name in ("f", "kintree_table") else array.astype(np.float64)

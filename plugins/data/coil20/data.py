@@ -1,0 +1,143 @@
+"""COIL-20, real objects on a turntable; the contract is framework.data's."""
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data
+from framework.datasets import images
+from framework.datasets.fields import Fields
+from framework.datasets.images import Crop
+from framework.target import Target
+from plugins.data.coil20.manifold import look_alikes, spline_weights
+from plugins.data.coil20.views import STEP_DEG, VIEWS, read_views
+
+GROUPS = ("unique", "look-alikes")
+
+
+class COIL20(Data):
+    """Columbia Object Image Library: 20 objects seen every 5° of a turntable (Nene, Nayar & Murase 1996).
+
+    Views every `every` degrees are for training, those in the middle between two of them for validation, all others
+    for the test: what is learnt is to interpolate. A training batch is drawn from the objects' appearance manifolds,
+    periodic cubic splines through the training views (Murase & Nayar 1995), at random angles, if `interpolate` says so.
+
+    Results are also reported apart for the objects that look alike from two opposite sides: those whose training
+    views half a turn apart are nearer to one another than neighbouring ones, on the mean.
+    """
+
+    bibtex = """@techreport{nene1996coil20,
+  title = {Columbia Object Image Library (COIL-20)},
+  author = {Nene, Sameer A. and Nayar, Shree K. and Murase, Hiroshi},
+  institution = {Columbia University},
+  number = {CUCS-005-96},
+  year = {1996}
+}"""
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        every: Literal[15, 20, 30, 40, 45, 60, 90] = 20,
+        image_size: Annotated[int, Field(ge=8, le=128)] = 32,
+        interpolate: bool = True,
+        jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.05,
+    ) -> None:
+        self.root = root
+        self.every = every
+        self.image_size = image_size
+        self.interpolate = interpolate
+        self.jitter = jitter
+
+    def prepare(self) -> None:
+        views = read_views(self.root, self.image_size)  # (object, view, 1, side, side)
+        stride = self.every // STEP_DEG
+        index = torch.arange(VIEWS)
+        split = torch.where(index % stride == 0, 0, torch.where(index % stride == stride // 2, 1, 2))
+        training = views[:, split == 0].float()
+        alike = look_alikes(training)
+        self.target = Target("angle", ("azimuth",))
+        self.input_shape = (1, self.image_size, self.image_size)
+        self.groups = GROUPS
+        self.synthetic = False
+        self.skipped = 0
+        self._tables = [self._table(views, alike, split == number) for number in range(3)]
+        self._training = training
+        self._weights = spline_weights(VIEWS // stride)
+        self._alike = [number + 1 for number in alike.nonzero()[:, 0].tolist()]
+        self._digest = hashlib.sha256(views.numpy().tobytes()).hexdigest()
+
+    def _table(self, views: Tensor, alike: Tensor, chosen: Tensor) -> Fields:
+        objects, count = len(views), int(chosen.sum())
+        azimuth = torch.arange(VIEWS)[chosen] * math.radians(STEP_DEG)
+        azimuth = torch.where(azimuth >= math.pi, azimuth - 2 * math.pi, azimuth)
+        which = torch.arange(objects).repeat_interleave(count)
+        return Fields(
+            input=views[:, chosen].flatten(0, 1),
+            target=azimuth.float().repeat(objects)[:, None],
+            group=alike.long()[which],
+            object=which,
+            index=torch.arange(objects * count),
+        )
+
+    def train(self) -> Dataset[Batch]:
+        return self._tables[0]
+
+    def validation(self) -> Dataset[Batch]:
+        return self._tables[1]
+
+    def test(self) -> Dataset[Batch]:
+        return self._tables[2]
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return images.unlabelled(
+            [Crop(Path(file), None, 0.0, self.image_size, 1, upright=True) for file in files]
+        )
+
+    def augment(self, batch: Batch) -> Batch:
+        if self.interpolate:
+            batch = self._interpolated(batch)
+        if not self.jitter:
+            return batch
+        never = torch.zeros(len(batch["target"]), dtype=torch.bool)
+        return {**batch, "input": images.augmented(batch["input"], never, self.jitter)}
+
+    def _interpolated(self, batch: Batch) -> Batch:
+        """The same objects, each turned by up to half a step between two training views."""
+        target = batch["target"]
+        shift = (torch.rand(len(target), 1, device=target.device) - 0.5) * math.radians(self.every)
+        turned = target + shift
+        turn = torch.remainder(turned[:, 0].double() / (2 * math.pi), 1.0)
+        row = (turn * len(self._weights)).long().clamp(max=len(self._weights) - 1).cpu()
+        seen = self._training[batch["object"].cpu()]
+        drawn = torch.einsum("bv,bvchw->bchw", self._weights[row], seen).clamp(0, 255).round()
+        return {
+            **batch,
+            "input": drawn.to(batch["input"].dtype).to(batch["input"].device),
+            "target": torch.where(turned >= math.pi, turned - 2 * math.pi, turned),
+        }
+
+    def fingerprint(self) -> Mapping[str, str]:
+        sizes = {
+            name: str(len(table))
+            for name, table in zip(("train", "validation", "test"), self._tables, strict=True)
+        }
+        alike = " ".join(map(str, self._alike))
+        return {
+            "root": str(self.root),
+            "version": "COIL-20",
+            **sizes,
+            "look_alikes": alike,
+            "sha256": self._digest,
+        }
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)

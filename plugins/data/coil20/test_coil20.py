@@ -1,0 +1,177 @@
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.io import savemat
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError
+from plugins.data.coil20.manifold import FINE, look_alikes, spline_weights
+
+
+def turntable(symmetric=False):
+    """20 objects × 72 views: a blob going round, twice a turn where it is symmetric."""
+    angle = np.radians(5) * np.arange(72) * (2 if symmetric else 1)
+    row, column = np.mgrid[:32, :32]
+    views = []
+    for number in range(20):
+        place = 16 + 8 * np.stack([np.cos(angle + number), np.sin(angle + number)], -1)
+        gap = (row - place[:, :1, None]) ** 2 + (column - place[:, 1:, None]) ** 2
+        views.append(255 * np.exp(-gap / 40))
+    return np.stack(views).round().astype(np.uint8)
+
+
+def as_matlab(folder, views, **more):
+    pixels = views.swapaxes(-1, -2).reshape(1440, 1024)
+    savemat(folder / "COIL20.mat", {"X": pixels, "Y": np.repeat(np.arange(1, 21), 72)[:, None], **more})
+    return folder
+
+
+def data(root, **config):
+    return build("data", resolve("data", {"name": "coil20", "root": str(root), **config}))
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return as_matlab(tmp_path_factory.mktemp("coil"), turntable())
+
+
+def test_views_angles_and_splits(root):
+    coil = data(root)
+    coil.prepare()
+    views = torch.from_numpy(turntable())
+    sizes = []
+    seen = torch.zeros(20, 72, dtype=torch.int64)
+    for split, residues in ((coil.train(), {0}), (coil.validation(), {2}), (coil.test(), {1, 3})):
+        sizes.append(len(split))
+        batch = split.__getitems__(range(len(split)))
+        view = (batch["target"][:, 0].double() / math.radians(5)).round().long() % 72
+        assert {int(number) % 4 for number in view} == residues
+        assert torch.equal(batch["input"][:, 0], views[batch["object"], view])
+        assert (batch["target"].abs() <= math.pi).all()
+        seen[batch["object"], view] += 1
+    assert sizes == [360, 360, 720]
+    assert (seen == 1).all()  # every view of every object, once
+
+
+def test_the_processed_images_are_read_like_the_matlab_file(root, tmp_path):
+    for number, views in enumerate(turntable(), start=1):
+        for view, pixels in enumerate(views):
+            Image.fromarray(pixels).save(tmp_path / f"obj{number}__{view}.png")
+    one, other = data(root), data(tmp_path)
+    one.prepare()
+    other.prepare()
+    assert torch.equal(one.train().fields["input"], other.train().fields["input"])
+    (tmp_path / "obj7__3.png").unlink()
+    with pytest.raises(DataError, match=r"obj7__3\.png is missing"):
+        data(tmp_path).prepare()
+
+
+def test_objects_that_repeat_after_half_a_turn_are_found(tmp_path):
+    views = turntable()
+    views[[2, 9]] = turntable(symmetric=True)[[2, 9]]
+    coil = data(as_matlab(tmp_path, views))
+    coil.prepare()
+    batch = coil.test().fields
+    assert set(batch["object"][batch["group"] == 1].tolist()) == {2, 9}
+    assert coil.groups == ("unique", "look-alikes")
+    assert coil.fingerprint()["look_alikes"] == "3 10"
+
+
+def test_the_spline_passes_through_its_views_and_closes():
+    weights = spline_weights(18).double()
+    np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
+    turn = (np.arange(FINE) + 0.5) / FINE * 2 * np.pi
+    # harmonics up to the third are smooth against 18 views: the spline reproduces them to its own order
+    for harmonic in (0, 1, 2, 3):
+        found = weights.numpy() @ np.cos(harmonic * np.arange(18) * 2 * np.pi / 18)
+        np.testing.assert_allclose(found, np.cos(harmonic * turn), atol=6e-3)
+
+
+def test_interpolated_views_show_the_object_at_their_angle(root):
+    coil = data(root, jitter=0.0)
+    coil.prepare()
+    batch = coil.train().__getitems__(range(360))
+    torch.manual_seed(0)
+    turned = coil.augment(batch)
+    shift = torch.remainder(turned["target"] - batch["target"] + math.pi, 2 * math.pi) - math.pi
+    assert shift.abs().max() <= math.radians(10) + 1e-5
+    assert shift.std() > math.radians(5)
+    # the blob's own angle, from its centre of mass, less the object's starting angle
+    pixels = turned["input"][:, 0].double()
+    place = torch.arange(32.0).double() - 16
+    row, column = (pixels.sum(2) * place).sum(1), (pixels.sum(1) * place).sum(1)
+    azimuth = torch.atan2(column, row) - batch["object"]
+    error = torch.remainder(azimuth - turned["target"][:, 0] + math.pi, 2 * math.pi) - math.pi
+    assert error.abs().max() < math.radians(3)
+    assert (turned["target"].abs() <= math.pi).all()
+
+
+def test_without_interpolation_and_jitter_a_batch_stays_as_it_is(root):
+    coil = data(root, jitter=0.0, interpolate=False)
+    coil.prepare()
+    batch = coil.train().__getitems__([5, 7])
+    assert coil.augment(batch) is batch
+
+
+def test_views_are_resized(root):
+    coil = data(root, image_size=48)
+    coil.prepare()
+    assert coil.train()[0]["input"].shape == coil.input_shape == (1, 48, 48)
+
+
+@pytest.mark.parametrize("every, training", [(15, 24), (60, 6)])
+def test_other_steps(root, every, training):
+    coil = data(root, every=every)
+    coil.prepare()
+    assert (len(coil.train()), len(coil.validation())) == (20 * training, 20 * training)
+    assert len(coil.test()) == 20 * (72 - 2 * training)
+
+
+@pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
+def test_the_real_objects():
+    coil = data(Path(os.environ["REAL_DATA_ROOT"]) / "orientation")
+    coil.prepare()
+    assert coil.fingerprint()["look_alikes"] == "3 5 6 8 9 11 14 19"
+
+
+def test_look_alikes_of_a_constant_object_are_none():
+    assert not look_alikes(torch.ones(1, 18, 1, 4, 4)).any()
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"X": np.zeros((1440, 1024))}, "X came as float64"),
+        ({"X": np.zeros((1439, 1024), np.uint8)}, r"\(1439, 1024\)"),
+        ({"Y": np.ones((1440, 1))}, "does not name 20 objects"),
+    ],
+)
+def test_another_matlab_file_is_refused(tmp_path, change, message):
+    if "Y" in change:
+        change = {"Y": change["Y"].astype(np.int64)}
+    with pytest.raises(DataError, match=message):
+        data(as_matlab(tmp_path, turntable(), **change)).prepare()
+
+
+def test_damaged_missing_and_unnamed_files_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"neither COIL20\.mat nor obj1__0\.png"):
+        data(tmp_path).prepare()
+    (tmp_path / "COIL20.mat").write_bytes(b"no MATLAB file")
+    with pytest.raises(DataError, match="cannot be read as a MATLAB file"):
+        data(tmp_path).prepare()
+    savemat(tmp_path / "COIL20.mat", {"fea": np.zeros(3)})
+    with pytest.raises(DataError, match="holds fea"):
+        data(tmp_path / "COIL20.mat").prepare()
+    with pytest.raises(DataError, match=r"data\.root is not set: COIL-20 is published for research"):
+        build("data", resolve("data", {"name": "coil20"})).prepare()
+
+
+@pytest.mark.parametrize("config", [{"every": 25}, {"image_size": 4}, {"jitter": 1.0}])
+def test_a_config_out_of_range_is_refused(config):
+    with pytest.raises(ConfigError, match=r"data\."):
+        resolve("data", {"name": "coil20", **config})

@@ -1,0 +1,1 @@
+"""Head pose from images: IDIAP, TownCentre and CAVIAR."""

@@ -1,0 +1,105 @@
+"""The folder of the CAVIAR crops and its label file, `or_label.mat`: MATLAB 5.
+
+Its struct arrays `or_label_train` and `or_label_test` have one element an image, whose fields are by their order gaze
+(degrees), x, y, size and name without suffix; what the fields are called does not matter.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.io
+from scipy.io.matlab import mat_struct
+
+from framework.datasets.matlab import read_variables
+from framework.errors import DataError
+
+LABELS = "or_label.mat"
+SPLITS = ("train", "test")
+FIELDS = ("gaze", "x", "y", "size", "name")
+HEADER = b"MATLAB 5.0 MAT-file, synthetic labels".ljust(116)  # SciPy's holds the date
+
+
+class Label(NamedTuple):
+    """An image's name without suffix, and its gaze in degrees."""
+
+    name: str
+    gaze: float
+
+
+def check_root(root: Path) -> None:
+    """Refuse a folder that does not hold the crops.
+
+    Raises:
+        DataError: it is missing, or a part of it is; says which.
+    """
+    if not root.is_dir():
+        raise DataError(
+            f"data.root = {root}: no such folder; wanted the unpacked CAVIARShoppingCenterFullOccl, or null."
+        )
+    missing = [f"{split}/" for split in SPLITS if not (root / split).is_dir()]
+    missing += [LABELS] if not (root / LABELS).is_file() else []
+    if missing:
+        inner = root / "CAVIARShoppingCenterFullOccl"
+        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
+        raise DataError(
+            f"data.root = {root} is not laid out as CAVIARShoppingCenterFullOccl: no {', no '.join(missing)}."
+            f"{hint}"
+        )
+
+
+def read_labels(file: Path) -> dict[str, list[Label]]:
+    """The labels of "train" and "test", in the file's order.
+
+    Raises:
+        DataError: the file cannot be read, lacks a struct array, or one of its elements is no label.
+    """
+    names = [f"or_label_{split}" for split in SPLITS]
+    try:
+        content = read_variables(file, names)
+    except NotImplementedError:
+        raise DataError(
+            f"{file}: a MATLAB 7.3 file; wanted version 5, as published. Save it with '-v7'."
+        ) from None
+    except Exception as error:  # nearly any, where the file is damaged
+        raise DataError(
+            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from its source."
+        ) from error
+    missing = [name for name in names if name not in content]
+    if missing:
+        raise DataError(f"{file}: holds no {' and no '.join(missing)}. Restore it from its source.")
+    return {
+        split: [
+            _label(file, f"{name}({number})", entry)
+            for number, entry in enumerate(np.atleast_1d(content[name]).ravel(), start=1)
+        ]
+        for split, name in zip(SPLITS, names, strict=True)
+    }
+
+
+def _label(file: Path, where: str, entry: Any) -> Label:
+    fields = vars(entry) if isinstance(entry, mat_struct) else {"_fieldnames": []}
+    values = [fields[name] for name in fields["_fieldnames"]]
+    if len(values) == len(FIELDS) and isinstance(values[-1], str) and values[-1]:
+        gaze = np.asarray(values[0])
+        if gaze.size == 1 and gaze.dtype.kind in "iuf":
+            return Label(values[-1], float(gaze.item()))
+    raise DataError(
+        f"{file}: {where} holds {values}; wanted a struct of {', '.join(FIELDS)}, gaze a number of degrees. "
+        "Restore it from its source."
+    )
+
+
+def write_labels(file: Path, labels: Mapping[str, Sequence[Label]], side: int) -> None:
+    """Write a label file as published, with x, y and size of a whole image; the same labels give the same bytes."""
+    content = {}
+    for split, found in labels.items():
+        array = np.empty((1, len(found)), dtype=[(name, object) for name in FIELDS])
+        for index, label in enumerate(found):
+            array[0, index] = (label.gaze, side / 2, side / 2, float(side), label.name)
+        content[f"or_label_{split}"] = array
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, content, do_compression=True)
+    file.write_bytes(HEADER + stream.getvalue()[len(HEADER) :])

@@ -1,0 +1,135 @@
+"""The folders of the TownCentre heads: one a person, and in it for each image a text file with its label.
+
+`<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0; the image is the other file whose name
+starts with `<stem>`, and the second of the parts of its name that `_` separates is the person's number.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.errors import DataError
+from plugins.data.head_pose.labelled_images import SPLIT_SEED, Labelled
+
+TRAIN_SHARE, VALIDATION_SHARE = 0.8, 0.1
+
+
+class Head(NamedTuple):
+    """An image of person number `person`; pan in radians, any number of turns."""
+
+    image: Path
+    person: int
+    pan: float
+
+
+class Found(NamedTuple):
+    """The valid heads in a root, how many are marked as not valid, and the labels that cannot be used."""
+
+    heads: list[Head]
+    invalid: int
+    faults: list[DataError]
+
+
+def find_heads(root: Path) -> Found:
+    """All heads in a root, in the order of their names.
+
+    Raises:
+        DataError: the folder is missing, or holds no folder with label files.
+    """
+    if not root.is_dir():
+        raise DataError(
+            f"data.root = {root}: no such folder; wanted the unpacked TownCentreHeadImages, or null."
+        )
+    found = Found([], 0, [])
+    invalid, labels = 0, 0
+    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+        names = sorted(path.name for path in folder.iterdir())
+        texts = [name for name in names if name.endswith(".txt")]
+        pictures = [name for name in names if not name.endswith(".txt")]
+        labels += len(texts)
+        for text in texts:
+            try:
+                pan, valid = read_label(folder / text)
+                if valid:
+                    image = _image(folder, text, pictures)
+                    found.heads.append(Head(image, _person(image), math.radians(pan)))
+                else:
+                    invalid += 1
+            except DataError as error:
+                found.faults.append(error)
+    if not labels:
+        inner = root / "TownCentreHeadImages"
+        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
+        raise DataError(
+            f"data.root = {root} is not laid out as TownCentreHeadImages: no folder in it holds a label file "
+            f"`<image>.txt`.{hint}"
+        )
+    return found._replace(invalid=invalid)
+
+
+def read_label(file: Path) -> tuple[float, bool]:
+    """Pan in degrees, and whether the image may be used.
+
+    Raises:
+        DataError: the file cannot be read, or its lines are others.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{file}: cannot be read ({error}). Restore it from its source.") from error
+    entries = [line.partition("=") for line in text.splitlines()]
+    fields = {name.strip(): value.strip() for name, _, value in entries}
+    try:
+        return float(fields["pan"]), {"0": False, "1": True}[fields["valid"]]
+    except (KeyError, ValueError):
+        raise DataError(
+            f"{file}: {text[:80]!r}; wanted two lines, `pan = ` with degrees and `valid = ` with 0 or 1. "
+            "Restore it from its source."
+        ) from None
+
+
+def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
+    """The image of a label: of those that start with its stem, the one that does not go on with a digit."""
+    stem = text.removesuffix(".txt")
+    names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
+    if len(names) != 1:
+        raise DataError(
+            f"{folder / text}: {len(names)} images have names that start with {stem!r}"
+            f"{': ' if names else ''}{', '.join(names[:3])}; wanted one. Restore it, or take the label out."
+        )
+    return folder / names[0]
+
+
+def _person(image: Path) -> int:
+    parts = image.stem.split("_")
+    if len(parts) < 2 or not parts[1].isdecimal():
+        raise DataError(
+            f"{image}: the name does not tell the person; wanted a number as the second of the parts that `_` "
+            "separates. Restore the published name."
+        )
+    return int(parts[1])
+
+
+def by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
+    """The splits by person, 80, 10 and 10 % of them, as the thesis authors' code draws them."""
+    people = np.unique([head.person for head in heads])
+    drawn = np.random.RandomState(SPLIT_SEED).rand(len(people))
+    share = dict(zip(people.tolist(), drawn.tolist(), strict=True))
+    splits: dict[str, list[Labelled]] = {"train": [], "validation": [], "test": []}
+    for head in heads:
+        splits[_split(share[head.person])].append(Labelled(head.image, (head.pan,)))
+    return splits
+
+
+def _split(share: float) -> str:
+    if share < TRAIN_SHARE:
+        return "train"
+    return "validation" if share < TRAIN_SHARE + VALIDATION_SHARE else "test"
+
+
+def label_text(pan: float, valid: bool) -> str:
+    """A label file's content; `pan` in degrees."""
+    return f"pan = {pan:+.2f}\nvalid = {int(valid)}\n"

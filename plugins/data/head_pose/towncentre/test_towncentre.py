@@ -1,0 +1,313 @@
+"""The folders of TownCentre heads: what is read, how people are split, what is refused, and what is drawn."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from sklearn.kernel_ridge import KernelRidge
+
+from framework.configuration import schema
+from framework.datasets.fields import Fields
+from framework.errors import ConfigError, DataError
+from framework.storage import generated
+from plugins.data.head_pose.towncentre import generator
+from plugins.data.head_pose.towncentre.data import TownCentre
+from plugins.data.head_pose.towncentre.labels import Head, by_person, find_heads, read_label
+
+SPLITS = ("train", "validation", "test")
+PEOPLE = 40
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def pixels(number: int) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 256, (50, 50, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Forty people with two images each, pan 10° × person and 5° more; the names as published have more numbers."""
+    place = tmp_path / "TownCentreHeadImages"
+    for person in range(PEOPLE):
+        folder = place / f"person{person}"
+        folder.mkdir(parents=True)
+        for second in range(2):
+            stem = f"image_{person}_{second}"
+            Image.fromarray(pixels(2 * person + second)).save(folder / f"{stem}_17_{second}.png")
+            pan = 10 * person + 5 * second - 720
+            (folder / f"{stem}.txt").write_text(f"pan = {pan:+.2f}\nvalid = 1\n", encoding="utf-8")
+    (place / "readme.md").write_text("not a folder", encoding="utf-8")
+    return place
+
+
+def prepared(root: Path | None, **config: Any) -> TownCentre:
+    config = {"name": "towncentre", "root": root and str(root), **config}
+    data = schema.build("data", schema.resolve("data", config))
+    data.prepare()
+    return data
+
+
+def table(data: TownCentre, split: str) -> Mapping[str, torch.Tensor]:
+    dataset = {"train": data.train, "validation": data.validation, "test": data.test}[split]()
+    assert isinstance(dataset, Fields)
+    return dataset.fields
+
+
+# ---- the published layout --------------------------------------------------------------------------------
+
+
+def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
+    data = prepared(root)
+    np.random.seed(13)  # noqa: NPY002  (their code seeds the global generator)
+    drawn = np.random.rand(PEOPLE)  # noqa: NPY002
+    people = {
+        "train": np.flatnonzero(drawn < 0.8).tolist(),
+        "validation": np.flatnonzero((drawn >= 0.8) & (drawn < 0.9)).tolist(),
+        "test": np.flatnonzero(drawn > 0.9).tolist(),
+    }
+    for split in SPLITS:
+        fields = table(data, split)
+        expected = {
+            pixels(2 * person + second).tobytes(): 10.0 * person + 5 * second
+            for person in people[split]
+            for second in range(2)
+        }
+        assert len(fields["input"]) == len(expected) > 0
+        for image, target in zip(fields["input"], fields["target"], strict=True):
+            pan = math.radians(expected.pop(image.permute(1, 2, 0).contiguous().numpy().tobytes()))
+            assert math.cos(float(target) - pan) == pytest.approx(1)
+            assert abs(float(target)) < math.pi + 1e-6
+    assert data.target.names == ("pan",)
+    assert data.input_shape == (3, 50, 50)
+    assert data.groups == ("towncentre",)
+    assert not data.synthetic
+    assert (data.skipped, data.invalid) == (0, 0)
+    assert data.fingerprint()["version"] == "TownCentreHeadImages"
+    assert prepared(root).fingerprint() == data.fingerprint()
+
+
+def test_split_does_not_depend_on_the_order_of_folders_and_keeps_the_shares() -> None:
+    heads = [Head(Path(f"{person}.jpg"), person, 0.0) for person in range(10_000)]
+    splits = by_person(heads)
+    shares = [len(splits[split]) / len(heads) for split in SPLITS]
+    assert shares == pytest.approx([0.8, 0.1, 0.1], abs=0.01)
+    turned = by_person(heads[::-1])
+    for split in SPLITS:
+        assert set(turned[split]) == set(splits[split])
+
+
+def test_heads_that_are_not_valid_are_left_out_and_counted(root: Path) -> None:
+    (root / "person3" / "image_3_0.txt").write_text("pan = +1.00\nvalid = 0\n", encoding="utf-8")
+    data = prepared(root)
+    assert data.invalid == 1
+    assert data.skipped == 0
+    assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 1
+
+
+def test_a_stem_that_begins_another_takes_its_own_image(root: Path) -> None:
+    folder = root / "person3"
+    Image.fromarray(pixels(99)).save(folder / "image_3_10_17_0.png")
+    (folder / "image_3_10.txt").write_text("pan = -90.00\nvalid = 1\n", encoding="utf-8")
+    heads = {head.image.name: head for head in find_heads(root).heads}
+    assert heads["image_3_1_17_1.png"].pan == pytest.approx(math.radians(10 * 3 + 5 - 720))
+    assert heads["image_3_10_17_0.png"].pan == pytest.approx(math.radians(-90))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("pan = +123.45\nvalid = 1\n", (123.45, True)),
+        ("pan = -0.50\r\nvalid = 0\r\n", (-0.5, False)),
+        ("valid=1\npan=370", (370.0, True)),
+    ],
+)
+def test_label_files(tmp_path: Path, text: str, expected: tuple[float, bool]) -> None:
+    (tmp_path / "one.txt").write_bytes(text.encode())
+    assert read_label(tmp_path / "one.txt") == expected
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"pan = \nvalid = 1\n",
+        b"pan = 3\n",
+        b"pan = 3\nvalid = 2\n",
+        b"tilt = 3\nvalid = 1",
+        b"pan = 1\xff",
+    ],
+)
+def test_label_file_that_is_none_is_named(root: Path, content: bytes) -> None:
+    file = root / "person3" / "image_3_0.txt"
+    file.write_bytes(content)
+    with pytest.raises(DataError) as caught:
+        prepared(root)
+    assert f"1 of {2 * PEOPLE} samples cannot be read:\n  {file}: " in str(caught.value)
+    assert prepared(root, skip_unreadable=True).skipped == 1
+
+
+def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: Path) -> None:
+    (root / "person3" / "image_3_0_17_0.png").unlink()
+    Image.fromarray(pixels(1)).save(root / "person4" / "image_4_0_99.png")
+    broken = root / "person5" / "image_5_1_17_1.png"
+    broken.write_bytes(broken.read_bytes()[:200])
+    (root / "person6" / "image_6_0.txt").rename(root / "person6" / "other.txt")
+    (root / "person6" / "image_6_0_17_0.png").rename(root / "person6" / "other.png")
+    with pytest.raises(DataError) as caught:
+        prepared(root)
+    message = str(caught.value)
+    assert message.startswith(f"4 of {2 * PEOPLE} samples cannot be read")
+    for part in (
+        "image_3_0.txt: 0 images have names that start with 'image_3_0'; wanted one",
+        "image_4_0.txt: 2 images have names that start with 'image_4_0': image_4_0_17_0.png, image_4_0_99.png",
+        "image_5_1_17_1.png: cannot be read as an image",
+        "other.png: the name does not tell the person",
+        "data.skip_unreadable=true",
+    ):
+        assert part in message
+    data = prepared(root, skip_unreadable=True)
+    assert data.skipped == 4
+    assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 4
+
+
+def test_pan_that_is_not_finite_is_never_skipped(root: Path) -> None:
+    (root / "person3" / "image_3_0.txt").write_text("pan = nan\nvalid = 1\n", encoding="utf-8")
+    with pytest.raises(
+        DataError, match=r"1 images have an angle that is not finite:\n.*image_3_0_17_0\.png: nan"
+    ):
+        prepared(root, skip_unreadable=True)
+
+
+def test_wrong_layouts_say_what_is_wanted(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"data\.root = .*nowhere: no such folder; wanted the unpacked Town"):
+        prepared(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"is not laid out as .* Did you mean .*TownCentreHeadImages\?"):
+        prepared(tmp_path)
+    with pytest.raises(DataError, match=r"no folder in it holds a label file .* Unpack the whole archive"):
+        prepared(root / "person3")
+
+
+def test_empty_split(root: Path) -> None:
+    for folder in sorted(root.glob("person*"))[2:]:
+        for file in folder.glob("*.txt"):
+            file.write_text("pan = 1\nvalid = 0\n", encoding="utf-8")
+    with pytest.raises(
+        DataError, match=r"split is empty \(4 images in all, 0 unreadable, 76 marked as not valid"
+    ):
+        prepared(root)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("image_size", 4), ("test_blur", -1), ("images", 3), ("jitter", math.nan), ("rot", "x")],
+)
+def test_config_out_of_range(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=rf"data\.{key}"):
+        schema.resolve("data", {"name": "towncentre", key: value})
+
+
+# ---- the rest of the contract ----------------------------------------------------------------------------
+
+
+def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
+    data = prepared(root, jitter=0.0)
+    batch = dict(table(data, "train"))
+    torch.manual_seed(0)
+    varied = data.augment(batch)
+    flipped = (255 * varied["input"] - batch["input"].flip(-1)).abs().amax((1, 2, 3)) < 0.01
+    assert 10 < int(flipped.sum()) < len(flipped) - 10
+    expected = torch.where(flipped[:, None], -batch["target"], batch["target"])
+    assert torch.equal(varied["target"], expected)
+    off = prepared(root, jitter=0.0, mirror=False)
+    assert off.augment(batch) is batch
+
+
+def test_test_blur_changes_the_test_split_only(root: Path) -> None:
+    sharp, smooth = prepared(root), prepared(root, test_blur=2.0)
+    for split in ("train", "validation"):
+        assert torch.equal(table(sharp, split)["input"], table(smooth, split)["input"])
+    changes = [table(data, "test")["input"].float().diff(dim=3).abs().mean() for data in (smooth, sharp)]
+    assert changes[0] < 0.2 * changes[1]
+    assert torch.equal(table(sharp, "test")["target"], table(smooth, "test")["target"])
+    assert (sharp.fingerprint()["test_blur"], smooth.fingerprint()["test_blur"]) == ("0.0", "2.0")
+
+
+def test_read_takes_a_users_own_files(root: Path) -> None:
+    data = TownCentre()
+    file = root / "person3" / "image_3_0_17_0.png"
+    samples = data.read([file])
+    assert isinstance(samples, Fields)
+    assert samples.fields.keys() == {"input", "index"}
+    assert np.array_equal(data.picture(samples[0]["input"]), pixels(6))
+
+
+# ---- the synthetic set -----------------------------------------------------------------------------------
+
+
+def files_of(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def test_generation_is_the_same_to_the_byte_whatever_the_threads(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contents = []
+    for painters in (1, 3):
+        monkeypatch.setattr(generated, "PAINTERS", painters)
+        monkeypatch.setenv("FRAMEWORK_CACHE", str(cache / str(painters)))
+        contents.append(files_of(generator.generate(48, 5)))
+    first, second = contents
+    assert len(first) == 2 * 48 + 1
+    assert first == second
+    other = files_of(generator.generate(48, 6))
+    assert first.keys() == other.keys()
+    assert not any(first[name] == other[name] for name in first if name.endswith(".jpg"))
+    mark = json.loads(first["synthetic.json"])
+    assert (mark["seed"], mark["images"]) == (5, 48)
+
+
+def test_generated_set_is_read_as_it_was_drawn() -> None:
+    data = prepared(None, images=600)
+    assert data.synthetic
+    assert data.fingerprint()["root"] == "synthetic, seed 0"
+    counts = [len(table(data, split)["input"]) for split in SPLITS]
+    assert sum(counts) == 600 - data.invalid
+    assert 3 < data.invalid < 40
+    assert counts[0] > 400
+    drawn = []
+    for number in range(600):
+        heading = np.random.default_rng([0, 1, number // generator.EACH])
+        generator.synthetic_heads.person(heading)
+        random = np.random.default_rng([0, 0, number])
+        pan = generator.pose(heading.uniform(0, 360), random).pan
+        if random.random() >= 0.03:
+            drawn.append((pan + 180) % 360 - 180)
+    read = torch.cat([table(data, split)["target"] for split in SPLITS]).rad2deg().flatten()
+    np.testing.assert_allclose(np.sort(read.numpy()), np.sort(drawn), atol=0.006)
+
+
+def test_pictures_agree_with_their_labels() -> None:
+    """A kernel regression of sin(pan) on coarse grey pictures: on mirror images its sign is turned."""
+    data = prepared(None, images=1200, image_size=16)
+
+    def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
+        fields = table(data, split)
+        grey = fields["input"].flip(-1) if mirrored else fields["input"]
+        grey = grey.float().mean(1).flatten(1)
+        grey = (grey - grey.mean(1, keepdim=True)) / (grey.std(1, keepdim=True) + 1)
+        return grey.numpy(), fields["target"][:, 0].sin().numpy()
+
+    regression = KernelRidge(kernel="rbf", gamma=2e-3, alpha=0.3).fit(*columns("train", mirrored=False))
+    for mirrored, sign in ((False, 1), (True, -1)):
+        pictures, sine = columns("test", mirrored=mirrored)
+        assert sign * np.corrcoef(regression.predict(pictures), sine)[0, 1] > 0.4

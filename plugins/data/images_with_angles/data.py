@@ -1,0 +1,138 @@
+"""A user's own images and angles; the contract is framework.data's."""
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data
+from framework.datasets import images
+from framework.datasets.images import Crop
+from framework.errors import DataError, did_you_mean
+from framework.target import Target
+from plugins.data.images_with_angles.table import SPLITS, Row, read_table
+
+
+class ImagesWithAngles(Data):
+    """Your own folder of images with a CSV table of their angles in degrees.
+
+    `mirror` names the angles that change sign in a mirror image; where it names any, half of the images are
+    mirrored in training.
+    """
+
+    bibtex = """@misc{images_with_angles,
+  title = {Images with angles from a folder of the user's own},
+  note = {Cite the source of these images}
+}"""
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        csv: str = "angles.csv",
+        angle_columns: list[str] | None = None,
+        angles_in: Literal["degrees", "radians"] | None = None,
+        image_size: Annotated[int, Field(ge=8, le=1024)] = 48,
+        grayscale: bool = False,
+        mirror: list[str] | None = None,
+        jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08,
+        skip_unreadable: bool = False,
+    ) -> None:
+        self.root = root
+        self.csv = csv
+        self.angle_columns = angle_columns
+        self.angles_in: Literal["degrees", "radians"] | None = angles_in
+        self.image_size = image_size
+        self.channels = 1 if grayscale else 3
+        self.mirror = tuple(mirror or ())
+        self.jitter = jitter
+        self.skip_unreadable = skip_unreadable
+
+    def prepare(self) -> None:
+        if self.root is None:
+            raise DataError("data.root is not set; wanted the folder that holds your images and their table.")
+        root = Path(self.root).expanduser()
+        if not root.is_dir():
+            raise DataError(f"data.root = {root}: no such folder; wanted the one that holds your images.")
+        table = read_table(root / self.csv, self.angle_columns, self.angles_in)
+        for name in self.mirror:
+            if name not in table.columns:
+                raise DataError(
+                    f"data.mirror names {name!r}, which is no angle.{did_you_mean(name, table.columns)} "
+                    f"The angles: {', '.join(table.columns)}."
+                )
+        self.target = Target("angle", table.columns)
+        self.input_shape = (self.channels, self.image_size, self.image_size)
+        self.groups = (root.resolve().name,)
+        self.synthetic = False
+        self._signs = torch.tensor([-1.0 if name in self.mirror else 1.0 for name in table.columns])
+        self._digest = hashlib.sha256(repr(table).encode()).hexdigest()
+        self._read(root, table.rows)
+
+    def _read(self, root: Path, rows: Sequence[Row]) -> None:
+        in_memory = images.fit_in_memory(len(rows), self.image_size, self.channels)
+        faults: list[DataError] = []
+        self._tables = {}
+        for split in SPLITS:
+            chosen = [row for row in rows if row.split == split]
+            crops = [self._crop(root / row.file) for row in chosen]
+            angles = [[(a + math.pi) % (2 * math.pi) - math.pi for a in row.angles] for row in chosen]
+            fields = {
+                "target": torch.tensor(angles, dtype=torch.float32).reshape(
+                    len(chosen), len(self.target.names)
+                ),
+                "group": torch.zeros(len(chosen), dtype=torch.int64),
+            }
+            self._tables[split], bad = images.load(crops, fields, f"the {split} images", in_memory=in_memory)
+            faults += bad
+        if faults and not self.skip_unreadable:
+            remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
+            raise DataError(images.fault_message(faults, len(rows), remedy))
+        self.skipped = len(faults)
+        for split, table in self._tables.items():
+            if len(table) == 0:
+                raise DataError(
+                    f"The {split} split is empty ({len(rows)} images in all, {self.skipped} unreadable). Add "
+                    f"images, or say with a column `split` which are for {', '.join(SPLITS)}."
+                )
+
+    def _crop(self, file: Path) -> Crop:
+        return Crop(file, None, 0.0, self.image_size, self.channels, upright=True)
+
+    def train(self) -> Dataset[Batch]:
+        return self._tables["train"]
+
+    def validation(self) -> Dataset[Batch]:
+        return self._tables["validation"]
+
+    def test(self) -> Dataset[Batch]:
+        return self._tables["test"]
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return images.unlabelled([self._crop(Path(file)) for file in files])
+
+    def augment(self, batch: Batch) -> Batch:
+        if not self.mirror and not self.jitter:
+            return batch
+        mirrored = (torch.rand(len(batch["target"])) < 0.5) & bool(self.mirror)
+        target = batch["target"]
+        turned = target * self._signs.to(target)
+        return {
+            **batch,
+            "input": images.augmented(batch["input"], mirrored, self.jitter),
+            "target": torch.where(mirrored.to(target.device)[:, None], turned, target),
+        }
+
+    def fingerprint(self) -> Mapping[str, str]:
+        sizes = {split: str(len(table)) for split, table in self._tables.items()}
+        return {"root": str(self.root), "version": self.csv, **sizes, "sha256": self._digest}
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)

@@ -1,0 +1,243 @@
+"""A user's folder and table: what is read, and what is refused."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from framework.configuration import schema
+from framework.datasets.fields import Fields
+from framework.errors import ConfigError, DataError
+from plugins.data.images_with_angles.data import ImagesWithAngles
+from plugins.data.images_with_angles.table import SPLITS, split_of
+
+
+def folder(place: Path, table: str | None = None, images: int = 40) -> Path:
+    """Images whose red is their number, and a table of their pan (10° × number) and tilt (-number)."""
+    lines = ["file,pan,tilt,note"]
+    for number in range(images):
+        name = f"{number:03d}.png"
+        Image.fromarray(np.full((6, 9, 3), (number, 50, 200), np.uint8)).save(place / name)
+        lines.append(f"{name},{10 * number},{-number},text")
+    (place / "angles.csv").write_text(table if table is not None else "\n".join(lines), encoding="utf-8")
+    return place
+
+
+def prepared(root: Path, **config: Any) -> ImagesWithAngles:
+    config = {"name": "images_with_angles", "root": str(root), "image_size": 8, **config}
+    data = schema.build("data", schema.resolve("data", config))
+    data.prepare()
+    return data
+
+
+def fields(data: ImagesWithAngles, split: str) -> Mapping[str, torch.Tensor]:
+    dataset = getattr(data, split)()
+    assert isinstance(dataset, Fields)
+    return dataset.fields
+
+
+def test_whole_folder(tmp_path: Path) -> None:
+    data = prepared(folder(tmp_path))
+    assert data.target.kind == "angle"
+    assert data.target.names == ("pan", "tilt")  # the note is no number
+    assert data.input_shape == (3, 8, 8)
+    assert data.groups == (tmp_path.name,)
+    assert not data.synthetic
+    assert data.skipped == 0
+    seen = []
+    for split in SPLITS:
+        table = fields(data, split)
+        numbers = table["input"][:, 0, 0, 0].tolist()
+        assert torch.all(table["input"][:, 2] == 200)
+        assert table["target"].dtype == torch.float32
+        for number, target in zip(numbers, table["target"].tolist(), strict=True):
+            assert math.cos(target[0] - math.radians(10 * number)) == pytest.approx(1)
+            assert target[1] == pytest.approx(-math.radians(number))
+            assert split_of(f"{number:03d}.png") == split
+        assert torch.equal(table["index"], torch.arange(len(numbers)))
+        assert torch.equal(table["group"], torch.zeros(len(numbers), dtype=torch.int64))
+        seen += numbers
+    assert sorted(seen) == list(range(40))
+    assert prepared(tmp_path).fingerprint() == data.fingerprint()
+
+
+def test_columns_splits_and_grey(tmp_path: Path) -> None:
+    table = "file , split,yaw,roll\n000.png,train,370,5\n001.png,test,-190,6\n002.png,validation,0,7\n\n"
+    data = prepared(folder(tmp_path, table, 3), angle_columns=["roll", "yaw", "roll"], grayscale=True)
+    assert data.target.names == ("roll", "yaw")
+    assert data.input_shape == (1, 8, 8)
+    for split, roll, yaw in (("train", 5, 10), ("test", 6, 170), ("validation", 7, 0)):
+        expected = torch.tensor([[math.radians(roll), math.radians(yaw)]])
+        torch.testing.assert_close(fields(data, split)["target"], expected)
+    assert data.picture(fields(data, "train")["input"][0]).shape == (8, 8, 3)
+
+
+def test_split_by_name_is_70_15_15_and_never_moves() -> None:
+    counts = Counter(split_of(f"image_{number}.jpg") for number in range(20000))
+    for split, share in (("train", 0.70), ("validation", 0.15), ("test", 0.15)):
+        assert counts[split] / 20000 == pytest.approx(share, abs=0.01)
+    assert [split_of(name) for name in ("a.png", "b.png", "c.png", "d.png", "e.png", "f.png")] == [
+        "train", "train", "train", "train", "train", "train",
+    ]  # fmt: skip
+
+
+LINES = [f"{number:03d}.png,{10 * number},{number}" for number in range(30)]
+
+
+def table_with(line: str, header: str = "file,pan,tilt", place: int = 3) -> str:
+    return "\n".join([header, *LINES[:place], line, *LINES[place:]])
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("", r"has no column `file`\. Its first line names: nothing"),
+        ("files,pan\n000.png,3", r"has no column `file`\. Did you mean 'files'\?"),
+        ("file;pan\n000.png;3", r"Its first line names: file;pan\. Wanted names separated by commas"),
+        ("file,pan", r"no line below its first; wanted one for each image"),
+        ("file,pan,pan\n000.png,3,4", r"names the column 'pan' twice"),
+        ("file,note\n000.png,hello", r"has no column of numbers beside `file` and `split`"),
+        (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc'; wanted a finite number of degrees"),
+        (table_with("777.png,,4"), r"line 5, column 'pan': ''; wanted a finite number"),
+        (table_with("777.png,1_0,4"), r"line 5, column 'pan': '1_0'; wanted a finite number"),
+        (table_with("777.png,3,nan"), r"line 5, column 'tilt': 'nan'; wanted a finite number"),
+        (table_with("777.png,-inf,3"), r"line 5, column 'pan': '-inf'; wanted a finite number"),
+        (table_with("777.png,3"), r"line 5: 2 cells; wanted 3"),
+        (table_with("777.png,3,4,5"), r"line 5: 4 cells; wanted 3"),
+        (table_with("  ,3,4"), r"line 5: no `file`; wanted the name of an image"),
+        (table_with("001.png,3,4"), r"line 5: '001\.png' stands already in line 3"),
+        ('file,pan\n"000.png,3', r"cannot be read .* wanted UTF-8 text, separated by commas"),
+        ("file,pan,split\n000.png,3,trian", r"line 2, column `split`: 'trian'; .* Did you mean 'train'\?"),
+        (
+            "file,pan,split\n000.png,3,train",
+            r"The validation split is empty \(1 images in all, 0 unreadable\)",
+        ),
+    ],
+)
+def test_wrong_tables_are_refused(tmp_path: Path, table: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        prepared(folder(tmp_path, table, 30))
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"data\.root is not set; wanted the folder that holds your images"):
+        ImagesWithAngles().prepare()
+    with pytest.raises(DataError, match=r"data\.root = .*nowhere: no such folder"):
+        prepared(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"labels\.csv: no such file; wanted a table .* data\.csv"):
+        prepared(folder(tmp_path), csv="labels.csv")
+    with pytest.raises(DataError, match=r"names 'pam', which .* does not have\. Did you mean 'pan'\?"):
+        prepared(tmp_path, angle_columns=["pam"])
+    with pytest.raises(DataError, match=r"column 'note': 'text'; wanted a finite number"):
+        prepared(tmp_path, angle_columns=["note"])
+    with pytest.raises(DataError, match="angle_columns is empty"):
+        prepared(tmp_path, angle_columns=[])
+    with pytest.raises(
+        DataError, match=r"data\.mirror names 'pam', which is no angle\. Did you mean 'pan'\?"
+    ):
+        prepared(tmp_path, mirror=["pam"])
+    (tmp_path / "angles.csv").write_bytes("file,pan\nä.png,3".encode("latin-1"))
+    with pytest.raises(DataError, match=r"angles\.csv: cannot be read .* wanted UTF-8 text"):
+        prepared(tmp_path)
+
+
+def test_table_written_by_a_spreadsheet(tmp_path: Path) -> None:
+    """A byte-order mark, carriage returns, quotes and blank lines are no faults."""
+    text = "file,pan\r\n" + "".join(f'"{n:03d}.png", {10 * n}.5\r\n,\r\n' for n in range(40))
+    folder(tmp_path)
+    (tmp_path / "angles.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    data = prepared(tmp_path)
+    assert sum(len(fields(data, split)["index"]) for split in SPLITS) == 40
+
+
+def radians_table(values: Sequence[float]) -> str:
+    return "file,pan\n" + "\n".join(f"{index:03d}.png,{value}" for index, value in enumerate(values))
+
+
+def test_radians_are_noticed(tmp_path: Path) -> None:
+    values = np.linspace(-3.1, 3.1, 40).round(4).tolist()
+    message = r"looks like radians; wanted degrees\. Set angles_in: radians"
+    with pytest.raises(DataError, match=message):
+        prepared(folder(tmp_path, radians_table(values)))
+    for unit, factor in (("radians", 1.0), ("degrees", math.pi / 180)):
+        data = prepared(tmp_path, angles_in=unit)
+        targets = torch.cat([fields(data, split)["target"] for split in SPLITS])
+        expected = torch.tensor(values) * factor
+        torch.testing.assert_close(targets.flatten().sort().values, expected.sort().values)
+
+
+@pytest.mark.parametrize(
+    "values", [[0.0] * 40, [*[1.0] * 39, 6.3], [1.0] * 20], ids=["all zero", "one beyond 2π", "few rows"]
+)
+def test_small_degrees_are_not_refused_without_reason(tmp_path: Path, values: list[float]) -> None:
+    rows = [f"{index:03d}.png,{value},{SPLITS[index % 3]}" for index, value in enumerate(values)]
+    prepared(folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
+
+
+def test_unreadable_images_are_named_or_skipped(tmp_path: Path) -> None:
+    folder(tmp_path)
+    (tmp_path / "003.png").unlink()
+    (tmp_path / "007.png").write_bytes(b"\x89PNG")
+    with pytest.raises(DataError) as caught:
+        prepared(tmp_path)
+    message = str(caught.value)
+    assert message.startswith("2 of 40 samples cannot be read")
+    assert "003.png: no such file" in message
+    assert "007.png: cannot be read as an image" in message
+    assert "data.skip_unreadable=true" in message
+    data = prepared(tmp_path, skip_unreadable=True)
+    assert data.skipped == 2
+    assert sum(len(fields(data, split)["index"]) for split in SPLITS) == 38
+
+
+def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> None:
+    batch = {
+        "input": torch.randint(0, 256, (64, 3, 8, 8), dtype=torch.uint8),
+        "target": torch.rand(64, 2) + 0.1,
+    }
+    data = prepared(folder(tmp_path), mirror=["tilt"], jitter=0.0)
+    varied = data.augment(batch)
+    flipped = (255 * varied["input"] - batch["input"].flip(-1)).abs().amax((1, 2, 3)) < 0.01
+    assert 15 < int(flipped.sum()) < 50
+    expected = torch.where(flipped[:, None], batch["target"] * torch.tensor([1.0, -1.0]), batch["target"])
+    assert torch.equal(varied["target"], expected)
+    assert prepared(tmp_path, jitter=0.0).augment(batch) is batch
+    unmirrored = prepared(tmp_path).augment(batch)
+    assert torch.equal(unmirrored["target"], batch["target"])
+    assert 0 <= float(unmirrored["input"].min()) <= float(unmirrored["input"].max()) <= 1
+
+
+def test_read_gives_inputs_as_the_splits_hold_them(tmp_path: Path) -> None:
+    data = prepared(folder(tmp_path), grayscale=True)
+    names = [name for name in ("000.png", "001.png", "002.png", "003.png") if split_of(name) == "train"]
+    read = data.read([tmp_path / name for name in names])
+    assert isinstance(read, Fields)
+    assert read.fields.keys() == {"input", "index"}
+    assert torch.equal(read.fields["input"], fields(data, "train")["input"][: len(names)])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("angles_in", "gradians"), ("image_size", 2), ("jitter", math.nan), ("rot", "x")]
+)
+def test_config_out_of_range(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=rf"data\.{key}"):
+        schema.resolve("data", {"name": "images_with_angles", key: value})
+
+
+@given(st.text(max_size=60))
+@settings(deadline=None, max_examples=60)
+def test_any_text_for_a_table_is_refused_with_a_sentence(
+    tmp_path_factory: pytest.TempPathFactory, text: str
+) -> None:
+    place = tmp_path_factory.mktemp("any")
+    (place / "angles.csv").write_text("file,pan\n" + text, encoding="utf-8", errors="replace", newline="")
+    with pytest.raises(DataError):
+        prepared(place)

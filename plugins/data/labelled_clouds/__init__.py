@@ -1,0 +1,1 @@
+"""Point clouds with classes: ModelNet40, DALES and a user's own folders."""

@@ -1,0 +1,273 @@
+"""PASCAL3D+ as labelled crops; the contract is framework.data's."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.configuration import schema
+from framework.data import Batch, Data
+from framework.datasets import images
+from framework.datasets.images import Box, Crop
+from framework.errors import DataError, did_you_mean
+from framework.renderer import Renderer
+from framework.storage import cache
+from framework.storage.generated import read_mark
+from framework.target import Target
+from plugins.data.pascal3d import layout
+from plugins.data.pascal3d.generator import VERSION, generated
+from plugins.data.pascal3d.layout import CLASSES, Annotation
+
+SPLIT_SEED = 13  # that of the thesis authors' code
+
+
+class Sample(NamedTuple):
+    annotation: Annotation
+    group: int
+
+
+class Pascal3D(Data):
+    """Rigid objects in photographs and their azimuth, elevation and tilt; generated where no root is given.
+
+    Beside the contract's fields a batch has "symmetry" (int64: 1 none, 2 the same after 180° of azimuth, 4
+    after 90°, 0 after any turn; 1 for real data) and, for generated data, "blur" (float32: standard deviation
+    of the blur, pixels of the input).
+
+    Attributes:
+        excluded: how many objects the protocol left out, by reason; set by `prepare`.
+    """
+
+    bibtex = """@inproceedings{xiang2014beyond,
+  author = {Xiang, Yu and Mottaghi, Roozbeh and Savarese, Silvio},
+  title = {Beyond {PASCAL}: A Benchmark for {3D} Object Detection in the Wild},
+  booktitle = {IEEE Winter Conference on Applications of Computer Vision (WACV)},
+  year = {2014}
+}"""
+    target = Target("angle", ("azimuth", "elevation", "tilt"))
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        category: str | list[str] = "car",
+        image_size: Annotated[int, Field(ge=8, le=1024)] = 48,
+        margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1,
+        include_occluded: bool = False,
+        skip_unreadable: bool = False,
+        validation_share: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)] = 0.2,
+        mirror: bool = True,
+        jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08,
+        images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400,
+        generator_seed: Annotated[int, Field(ge=0)] = 0,
+        renderer: Renderer | str = "zbuffer",
+    ) -> None:
+        self.root = root
+        self.categories = (category,) if isinstance(category, str) else tuple(category)
+        self.image_size = image_size
+        self.margin = margin
+        self.include_occluded = include_occluded
+        self.skip_unreadable = skip_unreadable
+        self.validation_share = validation_share
+        self.mirror = mirror
+        self.jitter = jitter
+        self.images = images
+        self.generator_seed = generator_seed
+        self.renderer = renderer
+
+    def prepare(self) -> None:
+        roots = self._roots()
+        self.groups = tuple(roots)
+        self.input_shape = (3, self.image_size, self.image_size)
+        self.synthetic = any(read_mark(root) is not None for root in roots.values())
+        self.excluded: Counter[str] = Counter()
+        faults: list[DataError] = []
+        samples: dict[str, list[Sample]] = {"train": [], "validation": [], "test": []}
+        for group, (category, root) in enumerate(roots.items()):
+            lists = layout.split_lists(category)
+            learned = list(self._kept(root, category, lists["train"], self.include_occluded, faults))
+            held_out = validation_files(learned, self.validation_share)
+            for annotation in learned:
+                split = "validation" if annotation.file in held_out else "train"
+                samples[split].append(Sample(annotation, group))
+            tested = self._kept(root, category, lists["test"], False, faults)
+            samples["test"] += [Sample(annotation, group) for annotation in tested]
+        _refuse_wrong_labels(samples)
+        self._read(samples, faults)
+        self._digest = _digest(samples)
+
+    def _roots(self) -> dict[str, Path]:
+        """Every class and where its data lie; they are generated here where no root is given."""
+        categories = dict.fromkeys(self.categories)
+        for category in categories:
+            if category not in CLASSES:
+                raise DataError(
+                    f"data.category = {category!r} is no class of PASCAL3D+."
+                    f"{did_you_mean(category, CLASSES)} Wanted one or more of: {', '.join(CLASSES)}."
+                )
+        if not categories:
+            raise DataError(f"data.category is empty; wanted one or more of: {', '.join(CLASSES)}.")
+        if self.root is not None:
+            root = Path(self.root).expanduser()
+            for category in categories:
+                layout.check_root(root, category)
+            return dict.fromkeys(categories, root)
+        renderer = self.renderer
+        if isinstance(renderer, str):
+            renderer = schema.build("renderer", schema.resolve("renderer", renderer))
+        parent = cache.folder("pascal3d")
+        return {
+            category: generated(parent, category, self.images, self.generator_seed, renderer)
+            for category in categories
+        }
+
+    def _kept(
+        self,
+        root: Path,
+        category: str,
+        lists: Sequence[tuple[str, Path]],
+        include_occluded: bool,
+        faults: list[DataError],
+    ) -> Iterator[Annotation]:
+        """The objects of a split that the protocol keeps; what cannot be read is added to `faults`."""
+        names = [(source, name) for source, file in lists for name in layout.read_list(root / file)]
+        for source, name in dict.fromkeys(names):
+            try:
+                annotations = layout.read_annotations(root, category, source, name)
+            except DataError as error:
+                faults.append(error)
+                continue
+            for annotation in annotations:
+                reason = reason_to_exclude(annotation, include_occluded)
+                if reason is None:
+                    yield annotation
+                else:
+                    self.excluded[reason] += 1
+
+    def _read(self, samples: Mapping[str, Sequence[Sample]], faults: Sequence[DataError]) -> None:
+        """Read every split's crops; complain at once of all that could not be read, here or before."""
+        faults = list(faults)
+        total = len(faults) + sum(map(len, samples.values()))
+        in_memory = images.fit_in_memory(total, self.image_size, 3)
+        self._tables = {}
+        for split, chosen in samples.items():
+            crops = [
+                Crop(annotation.image, annotation.box, self.margin, self.image_size)
+                for annotation, _ in chosen
+            ]
+            table, bad = images.load(crops, self._fields(chosen), f"the {split} images", in_memory=in_memory)
+            self._tables[split] = table
+            faults += bad
+        if faults and not self.skip_unreadable:
+            remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
+            if self.root is None:
+                remedy = f"Delete {cache.folder('pascal3d')}: the data are generated anew."
+            raise DataError(images.fault_message(faults, total, remedy))
+        self.skipped = len(faults)
+        for split, table in self._tables.items():
+            if len(table) == 0:
+                reasons = ", ".join(f"{count} {reason}" for reason, count in self.excluded.items()) or "none"
+                raise DataError(
+                    f"The {split} split of {', '.join(self.groups)} is empty: no object is left of its lists "
+                    f"(left out: {reasons}; unreadable: {self.skipped}). Check the lists, or use other data."
+                )
+
+    def _fields(self, samples: Sequence[Sample]) -> dict[str, Tensor]:
+        labels = [[layout.radians(angle) for angle in annotation.angles or ()] for annotation, _ in samples]
+        fields = {
+            "target": torch.tensor(labels, dtype=torch.float32).reshape(len(samples), 3),
+            "group": torch.tensor([group for _, group in samples], dtype=torch.int64),
+            "symmetry": torch.tensor([annotation.symmetry for annotation, _ in samples], dtype=torch.int64),
+        }
+        if self.synthetic:
+            blur = [self._scale(annotation.box) * (annotation.blur or 0.0) for annotation, _ in samples]
+            fields["blur"] = torch.tensor(blur, dtype=torch.float32)
+        return fields
+
+    def _scale(self, box: Box) -> float:
+        """Pixels of the input for each pixel of the picture."""
+        left, top, right, bottom = box
+        return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
+
+    def train(self) -> Dataset[Batch]:
+        return self._tables["train"]
+
+    def validation(self) -> Dataset[Batch]:
+        return self._tables["validation"]
+
+    def test(self) -> Dataset[Batch]:
+        return self._tables["test"]
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        crops = [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
+        return images.unlabelled(crops)
+
+    def augment(self, batch: Batch) -> Batch:
+        if not self.mirror and not self.jitter:
+            return batch
+        mirrored = (torch.rand(len(batch["target"])) < 0.5) & self.mirror
+        # The mirror image of a mirror-symmetric object seen at (a, e, t) is that object seen at (-a, e, -t).
+        sign = torch.ones_like(batch["target"])
+        sign[:, 0] = sign[:, 2] = 1 - 2 * mirrored.to(sign)
+        varied = images.augmented(batch["input"], mirrored, self.jitter)
+        return {**batch, "input": varied, "target": batch["target"] * sign}
+
+    def fingerprint(self) -> Mapping[str, str]:
+        generated_root = f"synthetic, seed {self.generator_seed}"
+        return {
+            "root": generated_root if self.root is None else self.root,
+            "version": f"generator {VERSION}" if self.synthetic else "PASCAL3D+ release 1.1",
+            **{split: str(len(table)) for split, table in self._tables.items()},
+            "sha256": self._digest,
+        }
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)
+
+
+def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
+    """Why the protocol leaves an object out; None: it does not."""
+    if annotation.angles is None:
+        return "without a fine label"
+    if annotation.difficult:
+        return "difficult"
+    if (annotation.truncated or annotation.occluded) and not include_occluded:
+        return "truncated or occluded"
+    return None
+
+
+def validation_files(annotations: Sequence[Annotation], share: float) -> set[Path]:
+    """The files held out of training: whole images, so that no image is in both splits."""
+    files = sorted({annotation.file for annotation in annotations})
+    order = np.random.default_rng(SPLIT_SEED).permutation(len(files))
+    return {files[index] for index in order[: round(share * len(files))]}
+
+
+def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
+    wrong = [
+        f"{annotation.file}: azimuth, elevation, theta = {annotation.angles}"
+        for chosen in samples.values()
+        for annotation, _ in chosen
+        if not np.isfinite(annotation.angles or ()).all()
+    ]
+    if wrong:
+        raise DataError(
+            f"{len(wrong)} objects have an angle that is not finite; wanted degrees:{images.listed(wrong)}\n"
+            "Mend these annotations, or take the images off their lists."
+        )
+
+
+def _digest(samples: Mapping[str, Sequence[Sample]]) -> str:
+    """A hash over the names, boxes and labels of every split."""
+    digest = hashlib.sha256()
+    for split, chosen in samples.items():
+        for annotation, _ in chosen:
+            line = f"{split} {annotation.image.name} {annotation.box} {annotation.angles}\n"
+            digest.update(line.encode())
+    return digest.hexdigest()

@@ -1,0 +1,227 @@
+"""The official folders of PASCAL3D+ release 1.1: its lists of images, and its annotations in MATLAB files.
+
+Annotations/<class>_{pascal,imagenet}/<name>.mat, Images/<class>_{pascal,imagenet}/<name>.{jpg,JPEG},
+Image_sets/<class>_imagenet_{train,val}.txt, PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_{train,val}.txt.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io.matlab import mat_struct
+
+from framework.datasets.images import Box
+from framework.datasets.matlab import read_variables
+from framework.errors import DataError
+
+CLASSES = (
+    "aeroplane", "bicycle", "boat", "bottle", "bus", "car",
+    "chair", "diningtable", "motorbike", "sofa", "train", "tvmonitor",
+)  # fmt: skip
+VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
+SUFFIXES = {"pascal": (".jpg", ".JPEG"), "imagenet": (".JPEG", ".jpg")}
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """One object of the class that was asked for.
+
+    Attributes:
+        file: of the annotation.
+        image: where the image should be.
+        box: in pixels from the image's outer corner; may reach beyond the image.
+        angles: azimuth, elevation and tilt in degrees, any number of turns; None where there is only a coarse
+            label, or none at all.
+        symmetry, blur: only in generated data; 1 and None elsewhere.
+    """
+
+    file: Path
+    image: Path
+    box: Box
+    angles: tuple[float, float, float] | None
+    truncated: bool
+    occluded: bool
+    difficult: bool
+    symmetry: int
+    blur: float | None
+
+
+def check_root(root: Path, category: str) -> None:
+    """Refuse a folder that does not hold the release.
+
+    Raises:
+        DataError: it is missing, or a folder or list is missing from it; says which.
+    """
+    if not root.is_dir():
+        raise DataError(
+            f"data.root = {root}: no such folder; wanted the unpacked PASCAL3D+_release1.1, or null."
+        )
+    folders = [Path(top, f"{category}_{source}") for top in ("Annotations", "Images") for source in SUFFIXES]
+    lists = [name for names in split_lists(category).values() for _, name in names]
+    missing = [str(path) + "/" for path in folders if not (root / path).is_dir()]
+    missing += [str(path) for path in lists if not (root / path).is_file()]
+    if missing:
+        inner = [child.name for child in sorted(root.iterdir()) if (child / "Annotations").is_dir()]
+        hint = f" Did you mean {root / inner[0]}?" if inner else " Unpack the whole release there."
+        raise DataError(
+            f"data.root = {root} is not laid out as PASCAL3D+ release 1.1: no {', no '.join(missing)}.{hint}"
+        )
+
+
+def split_lists(category: str) -> dict[str, list[tuple[str, Path]]]:
+    """Sources and lists for training (VOC train, all of ImageNet) and test (VOC val).
+
+    The protocol of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
+    """
+    return {
+        "train": [
+            ("pascal", VOC_LISTS / f"{category}_train.txt"),
+            ("imagenet", Path("Image_sets") / f"{category}_imagenet_train.txt"),
+            ("imagenet", Path("Image_sets") / f"{category}_imagenet_val.txt"),
+        ],
+        "test": [("pascal", VOC_LISTS / f"{category}_val.txt")],
+    }
+
+
+def read_list(file: Path) -> list[str]:
+    """The image names of a list; names whose flag is -1 (the class is not in the image) are left out.
+
+    Raises:
+        DataError: a line is neither a name nor a name and one of the flags -1, 0, 1.
+    """
+    names = []
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(
+            f"{file}: cannot be read ({error}); wanted a list of image names. Restore it."
+        ) from error
+    for number, line in enumerate(lines, start=1):
+        match line.split():
+            case []:
+                continue
+            case [name] | [name, "1" | "0"]:
+                names.append(name)
+            case [_, "-1"]:
+                continue
+            case _:
+                raise DataError(
+                    f"{file} line {number}: {line!r}; wanted an image name, or a name and one of -1, 0, 1. "
+                    "Restore the list from the release."
+                )
+    return list(dict.fromkeys(names))
+
+
+def read_annotations(root: Path, category: str, source: str, name: str) -> list[Annotation]:
+    """The objects of class `category` in one annotation file.
+
+    Raises:
+        DataError: the file is missing, is no MATLAB file, or is not built like an annotation.
+    """
+    folder = f"{category}_{source}"
+    file = root / "Annotations" / folder / f"{name}.mat"
+    record = _load(file)
+    image = _image(root / "Images" / folder, name, source, _text(record, "filename"))
+    found = []
+    for number, entry in enumerate(_structs(getattr(record, "objects", None)), start=1):
+        if _text(entry, "class") != category:
+            continue
+        corners = _numbers(entry, "bbox")
+        if len(corners) != 4 or not all(map(math.isfinite, corners)):
+            raise DataError(
+                f"{file}: object {number} has the bbox {corners}; wanted four finite numbers x1 y1 x2 y2. "
+                "Mend the annotation."
+            )
+        x1, y1, x2, y2 = corners
+        symmetry = _number(entry, "symmetry")
+        found.append(
+            Annotation(
+                file=file,
+                image=image,
+                box=(x1 - 1, y1 - 1, x2, y2),  # counted from 1, both ends included
+                angles=_angles(getattr(entry, "viewpoint", None)),
+                truncated=bool(_number(entry, "truncated")),
+                occluded=bool(_number(entry, "occluded")),
+                difficult=bool(_number(entry, "difficult")),
+                symmetry=1 if symmetry is None or not math.isfinite(symmetry) else int(symmetry),
+                blur=_number(entry, "blur"),
+            )
+        )
+    return found
+
+
+def _load(file: Path) -> mat_struct:
+    try:
+        content = read_variables(file, ["record"])
+    except FileNotFoundError:
+        raise DataError(
+            f"{file}: no such file, though a list names it. Restore it from the release."
+        ) from None
+    except NotImplementedError:
+        raise DataError(
+            f"{file}: a MATLAB 7.3 file; wanted version 5, as released. Save it with '-v7'."
+        ) from None
+    except Exception as error:  # nearly any, where the file is damaged
+        raise DataError(
+            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from the release."
+        ) from error
+    record = content.get("record")
+    if not isinstance(record, mat_struct):
+        raise DataError(
+            f"{file}: holds no struct `record`; wanted a PASCAL3D+ annotation. Restore it from the release."
+        )
+    return record
+
+
+def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
+    """The image that lies in the folder; the likeliest name where there is none."""
+    candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES[source]]
+    if recorded:
+        candidates.append(folder / Path(recorded).name)
+    return next((path for path in candidates if path.is_file()), candidates[0])
+
+
+def _structs(value: Any) -> Iterator[mat_struct]:
+    """The structs of a struct array or cell array of any length; one struct alone comes without the array."""
+    for item in np.atleast_1d(np.asarray(value, dtype=object)).ravel():
+        if isinstance(item, mat_struct):
+            yield item
+
+
+def _text(entry: mat_struct, name: str) -> str:
+    """A field's text; nothing where it is missing, empty or no text."""
+    value = getattr(entry, name, None)
+    return value.strip() if isinstance(value, str) else ""
+
+
+def _numbers(entry: mat_struct, name: str) -> list[float]:
+    """A field's numbers; none where it is missing, empty or holds something else."""
+    value = np.asarray(getattr(entry, name, None))
+    real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
+    return value.astype(np.float64).ravel().tolist() if real else []
+
+
+def _number(entry: mat_struct, name: str) -> float | None:
+    """A field's first number; None where there is none."""
+    return next(iter(_numbers(entry, name)), None)
+
+
+def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
+    """The fine labels in degrees, which may be NaN in a damaged file; None where there are only coarse ones.
+
+    An object is finely annotated where the fields are filled and its distance is not 0.
+    """
+    if not isinstance(viewpoint, mat_struct) or _number(viewpoint, "distance") == 0:
+        return None
+    azimuth, elevation, tilt = (_number(viewpoint, name) for name in ("azimuth", "elevation", "theta"))
+    if azimuth is None or elevation is None or tilt is None:
+        return None
+    return azimuth, elevation, tilt
+
+
+def radians(degrees: float) -> float:
+    """The same angle in [-π, π)."""
+    return math.radians((degrees + 180) % 360 - 180)

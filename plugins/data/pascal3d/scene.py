@@ -1,0 +1,237 @@
+"""One labelled picture: objects from random viewpoints over a backdrop, and what a camera does to them."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Collection, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from numpy.typing import NDArray
+from PIL import Image, ImageFilter
+from torch import Tensor
+
+from framework.geometry.camera import Camera, look_from
+from framework.renderer import Scene
+from plugins.data.pascal3d.backdrop import Picture, background, blob, texture
+from plugins.data.pascal3d.families import FAMILIES
+from plugins.data.pascal3d.shapes import Mesh
+from plugins.data.pascal3d.viewpoints import viewpoint
+
+SUPERSAMPLING = 2
+Edges = tuple[float, float, float, float]
+Draw = Callable[[Scene, Collection[str]], Mapping[str, Tensor]]
+"""A framework.renderer.Renderer."""
+
+
+class View(NamedTuple):
+    """Degrees; `distance` in object diagonals; `focal` and `principal` in pixels, as in framework.geometry.camera."""
+
+    azimuth: float
+    elevation: float
+    tilt: float
+    distance: float
+    focal: float
+    principal: tuple[float, float]
+
+
+class Thing(NamedTuple):
+    """An object in a picture, as it is annotated.
+
+    `box` holds its first column and row and its last ones, counted from 0; `fine` is False where only a
+    coarse label is given.
+    """
+
+    category: str
+    view: View
+    box: tuple[int, int, int, int]
+    truncated: bool
+    occluded: bool
+    difficult: bool
+    fine: bool
+    symmetry: int
+
+
+class Layer(NamedTuple):
+    """A drawn object: colour times cover, (height, width, 3), and cover, (height, width), both 0…1."""
+
+    color: Picture
+    cover: NDArray[np.float32]
+
+
+def camera_of(view: View) -> Camera:
+    """The camera of a view; its picture is one pixel, until `window` says which part is wanted."""
+    angles = (math.radians(angle) for angle in (view.azimuth, view.elevation, view.tilt))
+    camera = look_from(*angles, distance=view.distance, field_of_view=1.0, size=(1, 1))
+    return dataclasses.replace(camera, focal=(view.focal, view.focal), principal=view.principal)
+
+
+def window(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale: int) -> Camera:
+    """The camera for `size` (height, width) pixels from `corner` (x, y) on, each divided `scale` times."""
+    middle = (scale - 1) / 2  # where a pixel's centre lies among its parts
+    (fx, fy), (cx, cy) = camera.focal, camera.principal
+    return dataclasses.replace(
+        camera,
+        focal=(scale * fx, scale * fy),
+        principal=(scale * (cx - corner[0]) + middle, scale * (cy - corner[1]) + middle),
+        height=scale * size[0],
+        width=scale * size[1],
+    )
+
+
+def outline(mesh: Mesh, camera: Camera) -> Edges:
+    """Left, top, right and bottom of the projected vertices, pixels."""
+    inside = camera.rotation.double().numpy() @ mesh.vertices.T + camera.translation.double().numpy()[:, None]
+    column = camera.focal[0] * inside[0] / inside[2] + camera.principal[0]
+    row = camera.focal[1] * inside[1] / inside[2] + camera.principal[1]
+    return float(column.min()), float(row.min()), float(column.max()), float(row.max())
+
+
+def lit(mesh: Mesh, random: Generator) -> NDArray[np.float64]:
+    """Vertex colours under sky light and one lamp, whose azimuth is independent of the camera's."""
+    azimuth, height = random.uniform(0, 2 * np.pi), random.uniform(0.2, 1.4)
+    lamp = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    ambient = random.uniform(0.4, 0.7)
+    sky = ambient * (0.75 + 0.25 * mesh.normals[:, 2])
+    direct = (1.3 - ambient) * np.clip(mesh.normals @ lamp, 0, None)
+    return np.clip(mesh.colors * (sky + direct)[:, None], 0, 1)
+
+
+def draw(
+    renderer: Draw,
+    mesh: Mesh,
+    colors: NDArray[np.float64],
+    camera: Camera,
+    edges: Edges,
+    size: tuple[int, int],
+) -> Layer:
+    """The object alone, (height, width) = `size`; only what lies within `edges` (`outline`) is rendered."""
+    height, width = size
+    left, top, right, bottom = edges
+    x0, x1 = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
+    y0, y1 = max(0, math.floor(top)), min(height, math.ceil(bottom) + 1)
+    layer = Layer(np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32))
+    if x0 >= x1 or y0 >= y1:
+        return layer
+    scene = Scene(
+        vertices=torch.from_numpy(mesh.vertices).float(),
+        faces=torch.from_numpy(mesh.faces),
+        colors=torch.from_numpy(colors).float(),
+        camera=window(camera, (x0, y0), (y1 - y0, x1 - x0), SUPERSAMPLING),
+    )
+    drawn = renderer(scene, ("color", "mask"))
+    layer.color[y0:y1, x0:x1] = _averaged(drawn["color"].cpu().numpy())
+    layer.cover[y0:y1, x0:x1] = _averaged(drawn["mask"].cpu().numpy().astype(np.float32))
+    return layer
+
+
+def _averaged(fine: Picture) -> Picture:
+    """The mean of every block of SUPERSAMPLING × SUPERSAMPLING pixels."""
+    step = range(SUPERSAMPLING)
+    total = sum(fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in step for column in step)
+    return np.asarray(total / np.float32(SUPERSAMPLING**2))
+
+
+class Shot(NamedTuple):
+    """A finished picture. `blur` is the standard deviation of the Gaussian it was blurred with, pixels."""
+
+    pixels: NDArray[np.uint8]
+    things: list[Thing]
+    blur: float
+
+
+def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
+    """A picture of an object of `category`; sometimes with a second object, or something in the way."""
+    size = height, width = int(random.integers(96, 129)), int(random.integers(112, 145))
+    main = _place(category, random, renderer, size, aside=random.random() < 0.1)
+    pieces = [main]
+    if random.random() < 0.15:
+        other = category if random.random() < 0.3 else str(random.choice(list(FAMILIES)))
+        pieces.insert(int(random.random() < 0.25), _place(other, random, renderer, size, aside=True))
+
+    view = main.view
+    drop = -view.focal * math.tan(math.radians(view.elevation))  # to the horizon of a camera that looks down
+    tilt = math.radians(view.tilt)
+    horizon = (view.principal[0] + drop * math.sin(tilt), view.principal[1] + drop * math.cos(tilt))
+    pixels = background(random, height, width, horizon, tilt)
+    hidden: list[NDArray[np.float32]] = []
+    for piece in pieces:  # from far to near
+        pixels = pixels * (1 - piece.layer.cover[..., None]) + piece.layer.color
+        hidden = [np.maximum(mask, piece.layer.cover) for mask in hidden] + [np.zeros_like(piece.layer.cover)]
+    if random.random() < 0.1:
+        left, top, right, bottom = box_of(main.layer)
+        center = (random.uniform(left, right), random.uniform(top, bottom))
+        mask = blob(random, height, width, center, float(max(right - left, bottom - top)))
+        pixels += mask[..., None] * (texture(random, height, width) - pixels)
+        hidden = [np.maximum(other, mask) for other in hidden]
+
+    blur = random.uniform(0.5, 3.5) if random.random() < 0.25 else 0.0
+    things = [_annotated(piece, mask, random) for piece, mask in zip(pieces, hidden, strict=True)]
+    return Shot(_exposed(pixels, blur, random), things, blur)
+
+
+class _Piece(NamedTuple):
+    category: str
+    view: View
+    layer: Layer
+    inside: float  # share of its outline's box that lies in the picture
+
+
+def _place(category: str, random: Generator, renderer: Draw, size: tuple[int, int], *, aside: bool) -> _Piece:
+    """A new object of `category`, drawn; `aside` lets it reach out of the picture."""
+    mesh = FAMILIES[category].build(random).mesh()
+    view = View(*viewpoint(category, random), float(random.uniform(2.2, 6.0)), 1.0, (0.0, 0.0))
+    camera = camera_of(view)
+    left, top, right, bottom = outline(mesh, camera)
+    extent = np.array([right - left, bottom - top])
+    longest = random.uniform(56, 100) if random.random() < 0.9 else random.uniform(28, 56)
+    room = np.array([size[1], size[0]], dtype=np.float64)
+    focal = float(min(longest / extent.max(), ((room - 6) / extent).min()))
+    span = focal * extent
+    low, high = span / 2 + 2, room - 3 - span / 2  # of the middle, so that the whole object is seen
+    if aside:
+        low, high = low - 0.4 * span, high + 0.4 * span
+    middle = random.uniform(low, high)
+    x, y = (middle - focal * np.array([left + right, top + bottom]) / 2).tolist()
+    camera = dataclasses.replace(camera, focal=(focal, focal), principal=(x, y))
+    (left, top), (right, bottom) = (middle - span / 2).tolist(), (middle + span / 2).tolist()
+    layer = draw(renderer, mesh, lit(mesh, random), camera, (left, top, right, bottom), size)
+    if aside and layer.cover.max() < 0.5:  # only a gap of the object lies in the picture
+        return _place(category, random, renderer, size, aside=False)
+    cut = np.minimum(middle + span / 2, room - 0.5) - np.maximum(middle - span / 2, -0.5)
+    return _Piece(category, view._replace(focal=focal, principal=(x, y)), layer, float((cut / span).prod()))
+
+
+def box_of(layer: Layer) -> tuple[int, int, int, int]:
+    """First column and row and last column and row of what the object clearly covers."""
+    covered = layer.cover >= 0.5 * layer.cover.max()
+    columns, rows = np.flatnonzero(covered.any(0)), np.flatnonzero(covered.any(1))
+    return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
+
+
+def _annotated(piece: _Piece, hidden: NDArray[np.float32], random: Generator) -> Thing:
+    cover = piece.layer.cover
+    share = float((cover * hidden).sum() / cover.sum())
+    left, top, right, bottom = box_of(piece.layer)
+    return Thing(
+        category=piece.category,
+        view=piece.view,
+        box=(left, top, right, bottom),
+        truncated=piece.inside < 0.95,
+        occluded=share > 0.1,
+        difficult=share > 0.6 or max(right - left, bottom - top) < 36,
+        fine=random.random() >= 0.02,
+        symmetry=FAMILIES[piece.category].symmetry,
+    )
+
+
+def _exposed(pixels: Picture, blur: float, random: Generator) -> NDArray[np.uint8]:
+    """Brightness, blur and the sensor's noise."""
+    gain, offset = random.uniform(0.8, 1.2), random.uniform(-0.05, 0.05)
+    image = Image.fromarray((255 * np.clip(gain * pixels + offset, 0, 1)).astype(np.uint8))
+    if blur:
+        image = image.filter(ImageFilter.GaussianBlur(blur))
+    strength = int(random.integers(0, 15))
+    noise = random.integers(-strength, strength, pixels.shape, dtype=np.int8, endpoint=True)
+    return np.clip(np.asarray(image, dtype=np.int16) + noise, 0, 255).astype(np.uint8)

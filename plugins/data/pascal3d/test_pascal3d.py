@@ -1,0 +1,634 @@
+"""The reader of the official layout, its protocol, its complaints, and the data contract."""
+
+import math
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+import torch
+from PIL import Image
+
+from framework.configuration import schema
+from framework.datasets import images
+from framework.datasets.fields import Fields
+from framework.datasets.images import Crop, Crops
+from framework.errors import ConfigError, DataError
+from framework.renderer import Renderer
+from plugins.data.pascal3d import layout
+from plugins.data.pascal3d.data import Pascal3D, validation_files
+from plugins.data.pascal3d.generator import generated
+from plugins.data.pascal3d.layout import VOC_LISTS, read_annotations
+from plugins.data.pascal3d.scene import shoot
+
+
+@pytest.fixture(scope="session")
+def renderer() -> Renderer:
+    return schema.build("renderer", schema.resolve("renderer", "zbuffer"))
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Path:
+    """A generated root of 80 cars, which tests read and do not change."""
+    return generated(tmp_path_factory.mktemp("roots"), "car", 80, 0, renderer)
+
+
+@pytest.fixture
+def root(drawn: Path, tmp_path: Path) -> Path:
+    """The same root, for a test to spoil."""
+    return Path(shutil.copytree(drawn, tmp_path / "root"))
+
+
+def prepared(root: Path, **config: Any) -> Pascal3D:
+    data = Pascal3D(root=str(root), **config)
+    data.prepare()
+    return data
+
+
+def table(data: Pascal3D, split: str) -> Mapping[str, torch.Tensor]:
+    dataset = {"train": data.train, "validation": data.validation, "test": data.test}[split]()
+    assert isinstance(dataset, Fields)
+    return dataset.fields
+
+
+# ---- single annotations, as MATLAB writes them -----------------------------------------------------------
+
+FINE = {"azimuth": 30.0, "elevation": 10.0, "theta": -5.0, "distance": 4.0}
+CAR = {"class": "car", "bbox": [11.0, 21.0, 50.0, 60.0], "viewpoint": FINE}
+EMPTY = np.zeros((0, 0))
+
+
+def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
+    """A MATLAB struct array; fields that an entry lacks are empty, as MATLAB fills them."""
+    names = list(dict.fromkeys(name for entry in entries for name in entry))
+    array = np.empty((1, len(entries)), dtype=[(name, object) for name in names])
+    for index, entry in enumerate(entries):
+        array[0, index] = tuple(entry.get(name, EMPTY) for name in names)
+    return array
+
+
+def annotated(
+    folder: Path, *objects: dict[str, Any], filename: str = "one.jpg", **record: Any
+) -> list[layout.Annotation]:
+    """What the reader makes of one annotation file with these objects."""
+    place = folder / "Annotations" / "car_pascal"
+    place.mkdir(parents=True, exist_ok=True)
+    content = {"filename": filename, "objects": struct_array(list(objects)), **record}
+    scipy.io.savemat(place / "one.mat", {"record": content})
+    return read_annotations(folder, "car", "pascal", "one")
+
+
+def test_one_object(tmp_path: Path) -> None:
+    (one,) = annotated(tmp_path, CAR)
+    assert one.box == (10.0, 20.0, 50.0, 60.0)  # counted from 1 and both ends included: 40 × 40 pixels
+    assert one.angles == (30.0, 10.0, -5.0)
+    assert (one.truncated, one.occluded, one.difficult) == (False, False, False)
+    assert (one.symmetry, one.blur) == (1, None)
+    assert one.image == tmp_path / "Images" / "car_pascal" / "one.jpg"
+
+
+def test_one_object_that_is_a_plain_struct(tmp_path: Path) -> None:
+    (one,) = annotated(tmp_path, objects=CAR)
+    assert one.angles == (30.0, 10.0, -5.0)
+
+
+def test_objects_in_a_cell_array(tmp_path: Path) -> None:
+    cells = np.empty((1, 2), dtype=object)
+    cells[0, 0], cells[0, 1] = CAR, {**CAR, "truncated": 1}
+    assert [one.truncated for one in annotated(tmp_path, objects=cells)] == [False, True]
+
+
+def test_many_objects_of_many_classes_and_flags(tmp_path: Path) -> None:
+    person = {"class": "person", "bbox": [1, 2, 3, 4]}
+    found = annotated(
+        tmp_path, person, {**CAR, "truncated": 1}, {**CAR, "occluded": True}, {**CAR, "difficult": 1.0}, CAR
+    )
+    flags = [(one.truncated, one.occluded, one.difficult) for one in found]
+    assert flags == [(True, False, False), (False, True, False), (False, False, True), (False, False, False)]
+
+
+def test_no_objects(tmp_path: Path) -> None:
+    assert annotated(tmp_path, objects=EMPTY) == []
+
+
+@pytest.mark.parametrize(
+    "viewpoint",
+    [
+        None,
+        EMPTY,
+        {"azimuth_coarse": 45.0, "elevation_coarse": 0.0, "distance": 0.0},
+        {
+            "azimuth_coarse": 45.0,
+            "elevation_coarse": 0.0,
+            "azimuth": EMPTY,
+            "elevation": EMPTY,
+            "theta": EMPTY,
+        },
+        {**FINE, "distance": 0.0},
+        {**FINE, "theta": EMPTY},
+        {**FINE, "azimuth": "left"},
+    ],
+    ids=["missing", "empty", "coarse", "empty fields", "distance 0", "no theta", "text"],
+)
+def test_what_has_no_fine_label(tmp_path: Path, viewpoint: Any) -> None:
+    changed = {name: value for name, value in CAR.items() if name != "viewpoint"}
+    if viewpoint is not None:
+        changed["viewpoint"] = viewpoint
+    (one,) = annotated(tmp_path, changed)
+    assert one.angles is None
+
+
+def test_distance_that_is_not_given_does_not_make_a_label_coarse(tmp_path: Path) -> None:
+    (one,) = annotated(tmp_path, {**CAR, "viewpoint": {"azimuth": 1.0, "elevation": 2, "theta": 3}})
+    assert one.angles == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize("degrees", [-725.0, -180.0, -0.0, 179.5, 180.0, 359.0, 360.0, 1000.25])
+def test_angles_of_any_number_of_turns(degrees: float) -> None:
+    angle = layout.radians(degrees)
+    assert -math.pi <= angle < math.pi
+    assert math.cos(angle) == pytest.approx(math.cos(math.radians(degrees)), abs=1e-9)
+    assert math.sin(angle) == pytest.approx(math.sin(math.radians(degrees)), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "bbox", ["text", EMPTY, [1.0, 2.0, 3.0], [1.0, 2.0, math.nan, 4.0], [1.0, 2.0, math.inf, 4.0]]
+)
+def test_box_that_is_none(tmp_path: Path, bbox: Any) -> None:
+    with pytest.raises(DataError, match=r"one\.mat: object 2 has the bbox .* wanted four finite numbers"):
+        annotated(tmp_path, {"class": "person", "bbox": [1, 2, 3, 4]}, {**CAR, "bbox": bbox})
+
+
+def test_image_is_found_by_either_suffix_and_by_the_recorded_name(tmp_path: Path) -> None:
+    place = tmp_path / "Images" / "car_pascal"
+    place.mkdir(parents=True)
+    for name in ("odd.png", "one.JPEG", "one.jpg"):  # each is preferred to those before it
+        (place / name).write_bytes(b"")
+        (one,) = annotated(tmp_path, CAR, filename="odd.png")
+        assert one.image == place / name
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, r"one\.mat: no such file, though a list names it"),
+        (b"", r"one\.mat: cannot be read as a MATLAB file"),
+        (b"not a matrix at all" * 20, r"one\.mat: cannot be read as a MATLAB file"),
+        (
+            b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400),
+            r"one\.mat: a MATLAB 7\.3 file; .* '-v7'",
+        ),
+    ],
+    ids=["missing", "empty", "text", "7.3"],
+)
+def test_annotation_that_cannot_be_read(tmp_path: Path, content: bytes | None, message: str) -> None:
+    place = tmp_path / "Annotations" / "car_pascal"
+    place.mkdir(parents=True)
+    if content is not None:
+        (place / "one.mat").write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        read_annotations(tmp_path, "car", "pascal", "one")
+
+
+def test_annotation_that_is_cut_short_or_is_another_matrix(tmp_path: Path) -> None:
+    annotated(tmp_path, CAR)
+    file = tmp_path / "Annotations" / "car_pascal" / "one.mat"
+    whole = file.read_bytes()
+    for length in range(0, len(whole), 97):
+        file.write_bytes(whole[:length])
+        with pytest.raises(DataError, match=r"one\.mat"):
+            read_annotations(tmp_path, "car", "pascal", "one")
+    scipy.io.savemat(file, {"other": 1})
+    with pytest.raises(DataError, match="holds no struct `record`"):
+        read_annotations(tmp_path, "car", "pascal", "one")
+    scipy.io.savemat(file, {"record": 1})
+    with pytest.raises(DataError, match="holds no struct `record`"):
+        read_annotations(tmp_path, "car", "pascal", "one")
+
+
+@pytest.mark.filterwarnings("ignore")  # SciPy warns of some damage beside
+@pytest.mark.parametrize("compressed", [False, True])
+def test_damaged_annotations_are_read_or_named(tmp_path: Path, compressed: bool) -> None:
+    """SciPy alone crashes the process on about one in twenty of the uncompressed ones."""
+    annotated(tmp_path, CAR, {**CAR, "truncated": 1})
+    file = tmp_path / "Annotations" / "car_pascal" / "one.mat"
+    record = scipy.io.loadmat(file)["record"]
+    scipy.io.savemat(file, {"record": record}, do_compression=compressed)
+    whole = file.read_bytes()
+    random = np.random.default_rng(0)
+    refused = 0
+    for _ in range(300):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        places = random.integers(0, len(whole), 3)
+        damaged[places] = random.integers(0, 256, 3)
+        file.write_bytes(damaged.tobytes())
+        try:
+            found = read_annotations(tmp_path, "car", "pascal", "one")
+        except DataError as error:
+            assert str(error).startswith(str(file))
+            refused += 1
+        else:
+            assert len(found) <= 2
+    assert refused > 200
+
+
+def test_lists(tmp_path: Path) -> None:
+    file = tmp_path / "car_train.txt"
+    file.write_text(
+        "2008_000001 -1\n2008_000002  1\n\n2008_000003  0\n2008_000002 1\nn01_2\n", encoding="utf-8"
+    )
+    assert layout.read_list(file) == ["2008_000002", "2008_000003", "n01_2"]
+    file.write_text("2008_000001 1\n2008_000002 7\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"car_train\.txt line 2: '2008_000002 7'; wanted"):
+        layout.read_list(file)
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DataError, match=r"car_train\.txt: cannot be read"):
+        layout.read_list(file)
+
+
+# ---- whole roots -----------------------------------------------------------------------------------------
+
+
+def test_generated_root_reads_back_what_was_drawn(drawn: Path, renderer: Renderer) -> None:
+    """Every picture is drawn again, and the protocol applied by hand."""
+    data = prepared(drawn)
+    assert data.synthetic
+    expected: dict[str, list[tuple[float, ...]]] = {"learned": [], "test": []}
+    left_out = {"without a fine label": 0, "difficult": 0, "truncated or occluded": 0}
+    for number in range(80):
+        shot = shoot("car", np.random.default_rng([0, 5, number]), renderer)
+        for thing in (thing for thing in shot.things if thing.category == "car"):
+            if not thing.fine:
+                left_out["without a fine label"] += 1
+            elif thing.difficult:
+                left_out["difficult"] += 1
+            elif thing.truncated or thing.occluded:
+                left_out["truncated or occluded"] += 1
+            else:
+                angles = (thing.view.azimuth, thing.view.elevation, thing.view.tilt)
+                left, top, right, bottom = thing.box
+                side = 1.2 * (1 + max(right - left, bottom - top))
+                blur = shot.blur * 48 / side
+                expected["test" if number >= 64 else "learned"].append((*angles, blur))
+    assert dict(data.excluded) == {reason: count for reason, count in left_out.items() if count}
+    assert data.skipped == 0
+
+    def labels(*splits: str) -> np.ndarray:
+        fields = [table(data, split) for split in splits]
+        columns = [torch.cat([f["target"].rad2deg(), f["blur"][:, None]], dim=1) for f in fields]
+        rows = torch.cat(columns).double().numpy()
+        rows[:, 0] %= 360
+        return rows[np.argsort(rows[:, 0])]
+
+    for name, splits in (("test", ("test",)), ("learned", ("train", "validation"))):
+        rows = np.array(expected[name])
+        np.testing.assert_allclose(labels(*splits), rows[np.argsort(rows[:, 0])], atol=1e-4)
+
+
+def test_fields_of_a_batch(drawn: Path) -> None:
+    data = prepared(drawn, image_size=32)
+    fields = table(data, "train")
+    count = len(data.train())  # type: ignore[arg-type]
+    assert data.input_shape == (3, 32, 32)
+    assert data.groups == ("car",)
+    assert data.target.names == ("azimuth", "elevation", "tilt")
+    assert fields["input"].shape == (count, 3, 32, 32)
+    assert fields["input"].dtype == torch.uint8
+    assert fields["target"].dtype == torch.float32
+    assert torch.all(abs(fields["target"]) <= math.pi + 1e-6)
+    assert torch.equal(fields["index"], torch.arange(count))
+    assert torch.equal(fields["group"], torch.zeros(count, dtype=torch.int64))
+    assert torch.equal(fields["symmetry"], torch.ones(count, dtype=torch.int64))
+    assert data.picture(fields["input"][0]).shape == (32, 32, 3)
+    assert np.array_equal(data.picture(fields["input"][0]), fields["input"][0].permute(1, 2, 0).numpy())
+
+
+def test_crop_holds_the_object_and_its_margin(drawn: Path) -> None:
+    """The crop's middle is the box's middle: compared with the picture itself, cut by hand."""
+    data = prepared(drawn, margin=0.25, image_size=64)
+    first = layout.read_list(drawn / VOC_LISTS / "car_val.txt")
+    annotation = next(
+        one
+        for name in first
+        for one in read_annotations(drawn, "car", "pascal", name)
+        if not (one.truncated or one.occluded or one.difficult) and one.angles
+    )
+    left, top, right, bottom = annotation.box
+    half = 0.75 * max(right - left, bottom - top)
+    x, y = (left + right) / 2, (top + bottom) / 2
+    with Image.open(annotation.image) as image:
+        picture = np.asarray(image.convert("RGB"), dtype=float)
+    rows = np.clip(
+        np.floor(y - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, picture.shape[0] - 1
+    ).astype(int)
+    columns = np.clip(
+        np.floor(x - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, picture.shape[1] - 1
+    ).astype(int)
+    nearest = picture[rows][:, columns]
+    crop = table(data, "test")["input"][0].permute(1, 2, 0).numpy().astype(float)
+    assert abs(crop - nearest).mean() < 12
+    shifted = np.roll(nearest, 6, axis=1)
+    assert abs(crop - nearest).mean() < 0.7 * abs(crop - shifted).mean()
+
+
+def test_splits_share_no_image_and_do_not_depend_on_chance(drawn: Path) -> None:
+    first, second = prepared(drawn), prepared(drawn)
+    assert first.fingerprint() == second.fingerprint()
+    for split in ("train", "validation", "test"):
+        assert torch.equal(table(first, split)["input"], table(second, split)["input"])
+    learned = [
+        one
+        for source, file in layout.split_lists("car")["train"]
+        for name in layout.read_list(drawn / file)
+        for one in read_annotations(drawn, "car", source, name)
+    ]
+    held_out = validation_files(learned, 0.2)
+    files = {one.file for one in learned}
+    assert len(files) == 64
+    assert len(held_out) == 13
+    assert held_out < files
+    assert validation_files(learned[::-1], 0.2) == held_out
+
+
+def test_occluded_objects_may_be_learned_from_but_are_never_tested(drawn: Path) -> None:
+    without, with_them = prepared(drawn), prepared(drawn, include_occluded=True)
+    learned = [
+        len(table(d, "train")["index"]) + len(table(d, "validation")["index"]) for d in (without, with_them)
+    ]
+    assert learned[1] > learned[0]
+    assert torch.equal(table(without, "test")["target"], table(with_them, "test")["target"])
+    freed = without.excluded["truncated or occluded"] - with_them.excluded["truncated or occluded"]
+    assert learned[1] - learned[0] == freed
+
+
+def test_real_data_have_no_symmetry_and_no_blur(root: Path) -> None:
+    """A root without the mark is taken for real, whatever its annotations hold."""
+    (root / "synthetic.json").unlink()
+    data = prepared(root)
+    assert not data.synthetic
+    assert "blur" not in table(data, "train")
+    assert data.fingerprint()["version"] == "PASCAL3D+ release 1.1"
+
+
+def test_several_classes_are_groups(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renderer: Renderer
+) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
+    config = {"category": ["bottle", "diningtable", "bottle"], "images": 40, "image_size": 16}
+    data = schema.build("data", schema.resolve("data", {"name": "pascal3d", **config}))
+    data.prepare()
+    assert data.groups == ("bottle", "diningtable")
+    fields = table(data, "train")
+    assert {(int(g), int(s)) for g, s in zip(fields["group"], fields["symmetry"], strict=True)} == {
+        (0, 0),
+        (1, 2),
+    }
+    alone = Pascal3D(category="bottle", images=40, image_size=16, renderer=renderer)
+    alone.prepare()
+    bottles = fields["group"] == 0
+    assert torch.equal(table(alone, "train")["target"], fields["target"][bottles])
+
+
+def test_grey_and_cmyk_pictures_are_read_as_colour(root: Path) -> None:
+    pictures = sorted((root / "Images" / "car_pascal").glob("*.jpg"))
+    for file, mode in zip(pictures, ("L", "CMYK"), strict=False):
+        with Image.open(file) as image:
+            converted = image.convert(mode)
+        converted.save(file)
+    data = prepared(root)
+    assert table(data, "train")["input"].shape[1] == 3
+    assert data.skipped == 0
+
+
+def test_box_beyond_the_image_is_clipped(root: Path) -> None:
+    def reach_out(record: dict[str, Any]) -> None:
+        record["bbox"] = np.array([[-50.0, -20.0, 900.0, 700.0]])
+
+    before = len(table(prepared(root), "test")["index"])
+    change_objects(root, "car_val", reach_out)
+    data = prepared(root)
+    assert len(table(data, "test")["index"]) == before
+    assert data.skipped == 0
+
+
+def change_objects(
+    root: Path, list_name: str, change: Callable[[dict[str, Any]], None], only: int = 1
+) -> list[str]:
+    """Rewrite the first `only` annotations of a VOC list whose first object is kept; their names."""
+    changed = []
+    for name in layout.read_list(root / VOC_LISTS / f"{list_name}.txt"):
+        file = root / "Annotations" / "car_pascal" / f"{name}.mat"
+        (one, *others) = read_annotations(root, "car", "pascal", name)
+        if others or one.angles is None or one.truncated or one.occluded or one.difficult:
+            continue
+        entry = {**CAR, "bbox": np.add(one.box, (1, 1, 0, 0)), "viewpoint": dict(FINE), "symmetry": 1}
+        change(entry)
+        scipy.io.savemat(file, {"record": {"filename": f"{name}.jpg", "objects": struct_array([entry])}})
+        changed.append(name)
+        if len(changed) == only:
+            return changed
+    raise AssertionError(f"fewer than {only} annotations to change in {list_name}")
+
+
+# ---- complaints ------------------------------------------------------------------------------------------
+
+
+def test_missing_root() -> None:
+    with pytest.raises(
+        DataError, match=r"data\.root = /nowhere: no such folder; wanted the unpacked PASCAL3D"
+    ):
+        Pascal3D(root="/nowhere").prepare()
+
+
+def test_wrong_layout_says_what_is_missing_and_where_it_may_be(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no Annotations/bus_pascal/.*Unpack the whole release there"):
+        prepared(root, category="bus")
+    (root / "Image_sets" / "car_imagenet_val.txt").unlink()
+    shutil.rmtree(root / "Images" / "car_imagenet")
+    with pytest.raises(DataError, match=r"no Images/car_imagenet/, no Image_sets/car_imagenet_val\.txt\."):
+        prepared(root)
+    with pytest.raises(DataError, match=r"Did you mean .*/root\?"):
+        prepared(tmp_path)
+
+
+def test_class_that_is_misspelt_or_none(drawn: Path) -> None:
+    with pytest.raises(
+        DataError, match=r"'motorbyke' is no class of PASCAL3D\+\. Did you mean 'motorbike'\?"
+    ):
+        prepared(drawn, category="motorbyke")
+    with pytest.raises(DataError, match="category is empty"):
+        prepared(drawn, category=[])
+
+
+def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
+    names = layout.read_list(root / "Image_sets" / "car_imagenet_train.txt")[:4]
+    (root / "Annotations" / "car_imagenet" / f"{names[0]}.mat").write_bytes(b"broken")
+    (root / "Annotations" / "car_imagenet" / f"{names[1]}.mat").unlink()
+    test_name = change_objects(root, "car_val", lambda entry: None)[0]
+    picture = root / "Images" / "car_pascal" / f"{test_name}.jpg"
+    picture.write_bytes(picture.read_bytes()[:900])
+    other = change_objects(root, "car_train", lambda entry: entry.update(bbox=[500.0, 500, 600, 600]))[0]
+    with pytest.raises(DataError) as caught:
+        prepared(root)
+    message = str(caught.value)
+    assert message.startswith("4 of ")
+    for part in (f"{names[0]}.mat", f"{names[1]}.mat", f"{test_name}.jpg", f"{other}.jpg: the box"):
+        assert part in message
+    assert "data.skip_unreadable=true" in message
+    data = prepared(root, skip_unreadable=True)
+    assert data.skipped == 4
+    for split in ("train", "validation", "test"):
+        fields = table(data, split)
+        assert torch.equal(fields["index"], torch.arange(len(fields["input"])))
+        assert {len(field) for field in fields.values()} == {len(fields["input"])}
+
+
+def test_generated_data_that_are_damaged_are_to_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renderer: Renderer
+) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
+    data = Pascal3D(images=20, renderer=renderer)
+    data.prepare()
+    next(tmp_path.rglob("car_pascal/*.mat")).write_bytes(b"")
+    with pytest.raises(DataError, match=rf"Delete {tmp_path}/pascal3d: the data are generated anew"):
+        data.prepare()
+
+
+@pytest.mark.parametrize("name", ["azimuth", "elevation", "theta"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_angle_that_is_not_finite_is_never_skipped(root: Path, name: str, value: float) -> None:
+    changed = change_objects(
+        root, "car_train", lambda entry: entry["viewpoint"].update({name: value}), only=2
+    )
+    with pytest.raises(DataError) as caught:
+        prepared(root, skip_unreadable=True)
+    assert str(caught.value).startswith("2 objects have an angle that is not finite; wanted degrees")
+    assert all(f"{one}.mat" in str(caught.value) for one in changed)
+
+
+def test_empty_split(root: Path) -> None:
+    (root / VOC_LISTS / "car_val.txt").write_text("", encoding="utf-8")
+    with pytest.raises(
+        DataError, match=r"The test split of car is empty: no object is left .*left out: \d+ "
+    ):
+        prepared(root)
+    (root / VOC_LISTS / "car_train.txt").write_text("", encoding="utf-8")
+    for half in ("train", "val"):
+        (root / "Image_sets" / f"car_imagenet_{half}.txt").write_text("", encoding="utf-8")
+    with pytest.raises(DataError, match="The train split of car is empty"):
+        prepared(root)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("image_size", 4),
+        ("margin", math.nan),
+        ("validation_share", 1.0),
+        ("images", 3),
+        ("jitter", -1),
+        ("mirorr", True),
+    ],
+)
+def test_config_out_of_range(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=rf"data\.{key}"):
+        schema.resolve("data", {"name": "pascal3d", key: value})
+
+
+# ---- the rest of the contract ----------------------------------------------------------------------------
+
+
+def test_large_data_are_read_when_used(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inside = prepared(drawn)
+    monkeypatch.setattr(images, "IN_MEMORY", 0)
+    outside = prepared(drawn)
+    lazy = outside.train()
+    assert isinstance(lazy, Crops)
+    eager = table(inside, "train")
+    assert len(lazy) == len(eager["input"])
+    for index in (0, len(lazy) - 1):
+        item = lazy[index]
+        assert item.keys() == eager.keys()
+        assert all(torch.equal(item[name], eager[name][index]) for name in eager)
+
+
+def test_missing_image_is_noticed_before_training_when_reading_late(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = change_objects(root, "car_val", lambda entry: None)[0]
+    (root / "Images" / "car_pascal" / f"{name}.jpg").unlink()
+    monkeypatch.setattr(images, "IN_MEMORY", 0)
+    with pytest.raises(DataError, match=rf"{name}\.jpg: no such file"):
+        prepared(root)
+
+
+def test_read_takes_a_users_own_files(drawn: Path, tmp_path: Path) -> None:
+    data = prepared(drawn, image_size=16)
+    Image.new("RGB", (30, 10), (255, 0, 0)).save(tmp_path / "wide.png")
+    Image.new("L", (5, 9), 128).save(tmp_path / "small.png")
+    samples = data.read([tmp_path / "wide.png", tmp_path / "small.png"])
+    assert isinstance(samples, Fields)
+    assert samples.fields.keys() == {"input", "index"}
+    assert torch.equal(
+        samples[0]["input"], torch.tensor([255, 0, 0], dtype=torch.uint8).view(3, 1, 1).expand(3, 16, 16)
+    )
+    assert torch.all(samples[1]["input"] == 128)
+    (tmp_path / "note.txt").write_text("hello", encoding="utf-8")
+    with pytest.raises(DataError, match=r"1 of 2 .*\n.*note\.txt: cannot be read as an image"):
+        data.read([tmp_path / "wide.png", tmp_path / "note.txt"])
+    with pytest.raises(DataError, match="No image file was given"):
+        data.read([])
+
+
+def test_augment_mirrors_half_of_a_batch_with_its_labels(drawn: Path) -> None:
+    data = prepared(drawn, image_size=16, jitter=0.0)
+    torch.manual_seed(0)
+    pixels = torch.randint(0, 256, (200, 3, 16, 16), dtype=torch.uint8)
+    batch = {"input": pixels, "target": torch.rand(200, 3) + 0.1, "index": torch.arange(200)}
+    varied = data.augment(batch)
+    same = (255 * varied["input"] - pixels).abs().amax((1, 2, 3)) < 0.01
+    flipped = (255 * varied["input"] - pixels.flip(-1)).abs().amax((1, 2, 3)) < 0.01
+    assert torch.all(same ^ flipped)
+    assert 70 < int(flipped.sum()) < 130
+    sign = torch.tensor([-1.0, 1.0, -1.0])
+    torch.testing.assert_close(varied["target"][flipped], batch["target"][flipped] * sign, rtol=0, atol=0)
+    torch.testing.assert_close(varied["target"][same], batch["target"][same], rtol=0, atol=0)
+    assert varied["index"] is batch["index"]
+    assert torch.equal(batch["input"], pixels)
+
+
+def test_augment_depends_on_torchs_seed_alone_and_can_be_switched_off(drawn: Path) -> None:
+    data = prepared(drawn)
+    batch = {name: field[:8] for name, field in table(data, "train").items()}
+    twice = []
+    for _ in range(2):
+        torch.manual_seed(7)
+        twice.append(data.augment(batch))
+    assert torch.equal(twice[0]["input"], twice[1]["input"])
+    assert not torch.equal(data.augment(batch)["input"], twice[0]["input"])
+    off = prepared(drawn, mirror=False, jitter=0.0)
+    assert off.augment(batch) is batch
+    unmirrored = prepared(drawn, mirror=False)
+    assert torch.equal(unmirrored.augment(batch)["target"], batch["target"])
+
+
+def test_fingerprint_changes_with_a_label(root: Path) -> None:
+    change_objects(root, "car_val", lambda entry: None)
+    before = prepared(root).fingerprint()
+    change_objects(root, "car_val", lambda entry: entry["viewpoint"].update(azimuth=31.0))
+    after = prepared(root).fingerprint()
+    assert before["test"] == after["test"]
+    assert before["sha256"] != after["sha256"]
+
+
+def test_crop_of_an_annotation_shows_no_other_pixels_than_the_image_has(drawn: Path) -> None:
+    """A box that spans the image, squared: the border is repeated, nothing black is added."""
+    file = next((drawn / "Images" / "car_pascal").glob("*.jpg"))
+    with Image.open(file) as image:
+        width, height = image.size
+        whole = np.asarray(image.convert("RGB"))
+    pixels = Crop(file, (0.0, 0.0, float(width), float(height)), 0.5, 24).read()
+    assert pixels[:, 0].float().mean() == pytest.approx(whole[0].mean(), abs=12)

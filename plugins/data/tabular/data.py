@@ -1,0 +1,114 @@
+"""A user's own table; the contract is framework.data's."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data
+from framework.errors import DataError
+from plugins.data.tabular.picture import bars
+from plugins.data.tabular.table import SPLITS, Kind, Missing, Question, Table, load, read
+
+Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
+
+
+class Tabular(Data):
+    """Your own CSV table: columns of numbers are read, one column (or several, of one kind) is predicted.
+
+    Inputs are standardised by the mean and standard deviation of the training rows; a column that is constant there
+    becomes 0. Targets keep their own unit; degrees become radians. Batches also hold "line", the row's line in the
+    file. A column `split` says which rows are for train, validation or test, a column `group` in which groups results
+    are also reported.
+
+    Args:
+        path: the file.
+        target: the column to predict, or columns where they are numbers.
+        kind: what the target is: a class label, a real number, or an angle in degrees.
+        columns: what is read; None: every other column most of whose cells are numbers.
+        validation, test: shares of the rows, drawn at random, where there is no column `split`.
+        data_seed: of that draw, whatever the seed of the run.
+        missing: what becomes of rows with an empty cell where a number or a label is wanted.
+    """
+
+    bibtex = """@misc{tabular,
+  title = {A table of the user's own},
+  note = {Cite the source of this table}
+}"""
+
+    def __init__(
+        self,
+        *,
+        path: str | None = None,
+        target: str | list[str] = "target",
+        kind: Kind = "class",
+        columns: list[str] | None = None,
+        validation: Share = 0.15,
+        test: Share = 0.15,
+        data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
+        missing: Missing = "error",
+    ) -> None:
+        names = (target,) if isinstance(target, str) else tuple(dict.fromkeys(target))
+        chosen = None if columns is None else tuple(columns)
+        self.path = path
+        self.question = Question(names, kind, chosen, validation, test, data_seed, missing)
+
+    def prepare(self) -> None:
+        table = self._table
+        self.target = table.target
+        self.input_shape = (len(table.columns),)
+        self.groups = table.groups
+        self.synthetic = False
+        self.skipped = table.skipped
+
+    @cached_property
+    def _table(self) -> Table:
+        if self.path is None:
+            raise DataError("data.path is not set; wanted the CSV file that holds your table.")
+        asked = self.question
+        if not asked.target or (asked.kind == "class" and len(asked.target) > 1):
+            raise DataError(
+                f"data.target = {list(asked.target)} with data.kind={asked.kind}: wanted one column, or several where "
+                "the kind is real or degrees."
+            )
+        if asked.validation + asked.test >= 1:
+            raise DataError(
+                f"data.validation + data.test = {asked.validation + asked.test:g}: wanted less than 1, so that rows "
+                "are left for training."
+            )
+        return load(Path(self.path).expanduser(), asked)
+
+    def train(self) -> Dataset[Batch]:
+        return self._table.splits["train"]
+
+    def validation(self) -> Dataset[Batch]:
+        return self._table.splits["validation"]
+
+    def test(self) -> Dataset[Batch]:
+        return self._table.splits["test"]
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        # the training table again, for its columns, means and deviations: a checkpoint does not hold them
+        return read(files, self._table)
+
+    def augment(self, batch: Batch) -> Batch:
+        return batch
+
+    def fingerprint(self) -> Mapping[str, str]:
+        table = self._table
+        return {
+            "root": str(self.path),
+            "version": "tabular 1",
+            **{name: str(len(table.splits[name])) for name in SPLITS},
+            "columns": ", ".join(table.columns),
+            "constant": ", ".join(table.constant) or "none",
+            "sha256": table.digest,
+        }
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return bars(inputs.detach().cpu().double().numpy())

@@ -1,0 +1,277 @@
+"""From a user's CSV table to numbers: which columns, which rows, which split."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from framework.datasets.csv_columns import Columns, mostly_numbers, number, numbers, read_columns, require
+from framework.datasets.fields import Fields
+from framework.distributions.circular import wrap
+from framework.errors import DataError, did_you_mean
+from framework.target import Target
+
+Kind = Literal["class", "real", "degrees"]
+Missing = Literal["error", "skip"]
+SPLITS = ("train", "validation", "test")
+SPLIT, GROUP = "split", "group"
+MANY_LABELS = 20
+"""More labels than this, all of them numbers and most on one row alone, are no classes."""
+
+
+class Question(NamedTuple):
+    """What is asked of a table; the words are those of the config."""
+
+    target: tuple[str, ...]
+    kind: Kind
+    columns: tuple[str, ...] | None
+    validation: float
+    test: float
+    data_seed: int
+    missing: Missing
+
+
+class Scaling(NamedTuple):
+    """Of each column x: (x / largest - mean) / deviation; divided first so that no square overflows."""
+
+    largest: Float[np.ndarray, "column"]
+    mean: Float[np.ndarray, "column"]
+    deviation: Float[np.ndarray, "column"]
+
+
+class Table(NamedTuple):
+    """A table's answer."""
+
+    target: Target
+    columns: tuple[str, ...]
+    constant: tuple[str, ...]
+    groups: tuple[str, ...]
+    scaling: Scaling
+    splits: dict[str, Fields]
+    skipped: int
+    digest: str
+
+
+def load(file: Path, question: Question) -> Table:
+    """Read, check, split and standardise a table.
+
+    Raises:
+        DataError: the file, a column, a cell, a label or a split is not as wanted; names line and column.
+    """
+    cells = read_columns(file)
+    digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
+    columns = _inputs(cells, question)
+    otherwise = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
+    inputs = np.stack([numbers(cells, name, missing=otherwise) for name in columns], -1)
+    values, absent = _targets(cells, question, otherwise)
+    whole = ~(np.isnan(inputs).any(-1) | absent)
+    rows = np.flatnonzero(whole)
+    groups, group = _groups(file, cells, rows)
+    split = _splits(cells, rows, question)
+    training = rows[split == 0]
+    scaling, constant = fit_scaling(inputs[training])
+    target, encoded = _encode(cells, rows, training, values, question)
+    scaled = as_float32(cells, columns, rows, standardised(inputs[rows], scaling))
+    lines = torch.tensor(cells.lines)[torch.from_numpy(rows)]
+    splits = {}
+    for number_of, name in enumerate(SPLITS):
+        chosen = torch.from_numpy(split == number_of)
+        splits[name] = Fields(
+            input=scaled[chosen],
+            target=encoded[chosen],
+            group=group[chosen],
+            line=lines[chosen],
+            index=torch.arange(int(chosen.sum())),
+        )
+    names = tuple(name for name, same in zip(columns, constant.tolist(), strict=True) if same)
+    return Table(target, columns, names, groups, scaling, splits, len(whole) - len(rows), digest)
+
+
+def read(files: Sequence[Path], table: Table) -> Fields:
+    """The same columns of other files, standardised as the training rows were, one sample a row.
+
+    Raises:
+        DataError: a file cannot be read, lacks a column, or a cell of one is no finite number.
+    """
+    parts = []
+    for file in files:
+        cells = read_columns(Path(file))
+        require(cells, table.columns, "The trained model")
+        inputs = np.stack([numbers(cells, name, missing="") for name in table.columns], -1)
+        rows = np.arange(len(inputs))
+        parts.append(as_float32(cells, table.columns, rows, standardised(inputs, table.scaling)))
+    inputs = torch.cat(parts)
+    return Fields(input=inputs, index=torch.arange(len(inputs)))
+
+
+def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.ndarray]:
+    """The scaling to mean 0 and standard deviation 1, and which columns are constant: those become 0."""
+    constant = inputs.max(0) == inputs.min(0)
+    largest = np.where(constant, 1.0, np.abs(inputs).max(0))
+    shrunk = inputs / largest
+    mean = np.where(constant, inputs[0], shrunk.mean(0))
+    deviation = np.where(constant, 1.0, np.sqrt(np.square(shrunk - mean).mean(0)))
+    return Scaling(largest, mean, deviation), constant
+
+
+def standardised(
+    inputs: Float[np.ndarray, "row column"], scaling: Scaling
+) -> Float[np.ndarray, "row column"]:
+    """The columns in standard deviations from their mean."""
+    with np.errstate(over="ignore"):  # refused by as_float32, with its place
+        return (inputs / scaling.largest - scaling.mean) / scaling.deviation
+
+
+def as_float32(
+    cells: Columns,
+    columns: Sequence[str],
+    rows: Int[np.ndarray, "row"],
+    values: Float[np.ndarray, "row column"],
+) -> Float[Tensor, "row column"]:
+    """Single precision.
+
+    Raises:
+        DataError: a number has no place in it; names line and column.
+    """
+    with np.errstate(over="ignore"):
+        narrow = values.astype(np.float32)
+    wrong = np.argwhere(~np.isfinite(narrow))
+    if len(wrong):
+        row, name = rows[wrong[0, 0]], columns[int(wrong[0, 1])]
+        raise DataError(
+            f"{cells.file} line {cells.lines[row]}, column {name!r}: {cells.cells[name][row]!r} lies beyond "
+            "single precision (3.4e38), as it is or in standard deviations of the training rows. Mend the cell, or "
+            "change the unit."
+        )
+    return torch.from_numpy(narrow)
+
+
+def _inputs(cells: Columns, question: Question) -> tuple[str, ...]:
+    require(cells, question.target, "data.target")
+    if question.columns is not None:
+        require(cells, question.columns, "data.columns")
+        columns = tuple(dict.fromkeys(question.columns))
+        known = set(columns) & set(question.target)
+        if known:
+            raise DataError(
+                f"data.columns names {min(known)!r}, which is what is to be predicted (data.target). Take it out."
+            )
+    else:
+        others = (name for name in cells.cells if name not in (*question.target, SPLIT, GROUP))
+        columns = tuple(name for name in others if mostly_numbers(cells, name))
+    if not columns:
+        raise DataError(
+            f"{cells.file} has no column of numbers to read beside {', '.join(question.target)}; its columns: "
+            f"{', '.join(cells.cells)}. Name some with data.columns."
+        )
+    return columns
+
+
+def _targets(cells: Columns, question: Question, otherwise: str | None) -> tuple[np.ndarray, np.ndarray]:
+    """The targets as the table has them, (row, name) numbers or (row,) labels, and whether a row has none."""
+    if question.kind != "class":
+        values = np.stack([numbers(cells, name, missing=otherwise) for name in question.target], -1)
+        return values, np.asarray(np.isnan(values).any(-1))
+    name = question.target[0]
+    labels = cells.cells[name]
+    if otherwise is not None and "" in labels:
+        raise DataError(
+            f"{cells.file} line {cells.lines[labels.index('')]}, column {name!r}: no label. Write it, or {otherwise}."
+        )
+    return np.array(labels, dtype=object), np.array([label == "" for label in labels])
+
+
+def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ...], Int[Tensor, "row"]]:
+    if GROUP not in cells.cells:
+        return (file.stem,), torch.zeros(len(rows), dtype=torch.int64)
+    words = [cells.cells[GROUP][row] for row in rows]
+    if "" in words:
+        raise DataError(
+            f"{cells.file} line {cells.lines[rows[words.index('')]]}, column `{GROUP}`: no name. Write one in every "
+            "row, or rename the column."
+        )
+    groups = sorted(set(words), key=_order)
+    numbered = {name: index for index, name in enumerate(groups)}
+    return tuple(groups), torch.tensor([numbered[word] for word in words], dtype=torch.int64)
+
+
+def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndarray, "row"]:
+    """Index into SPLITS of each row: as the column says, else shares of a permutation."""
+    if SPLIT in cells.cells:
+        for row, word in enumerate(cells.cells[SPLIT]):
+            if word not in SPLITS:
+                raise DataError(
+                    f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r}; wanted one of "
+                    f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
+                )
+        split = np.array([SPLITS.index(cells.cells[SPLIT][row]) for row in rows], dtype=np.int64)
+        remedy = f"Say so of some rows in the column `{SPLIT}`."
+    else:
+        split = np.zeros(len(rows), dtype=np.int64)
+        order = np.random.default_rng(question.data_seed).permutation(len(rows))
+        validation, test = (round(share * len(rows)) for share in (question.validation, question.test))
+        split[order[:validation]] = 1
+        split[order[validation : validation + test]] = 2
+        remedy = f"Add rows, change data.validation and data.test, or add a column `{SPLIT}`."
+    for index, name in enumerate(SPLITS):
+        if not (split == index).any():
+            raise DataError(
+                f"{cells.file}: the {name} split is empty ({len(rows)} rows, {len(cells.lines) - len(rows)} left out "
+                f"for want of a number). {remedy}"
+            )
+    return split
+
+
+def _encode(
+    cells: Columns, rows: np.ndarray, training: np.ndarray, values: np.ndarray, question: Question
+) -> tuple[Target, Tensor]:
+    """What the target is, and its values as a batch holds them."""
+    if question.kind == "real":
+        return Target("real", question.target), as_float32(cells, question.target, rows, values[rows])
+    if question.kind == "degrees":
+        # whole turns are taken off before the unit is changed: their multiple of 2π would be rounded
+        angle = wrap(torch.from_numpy(np.deg2rad(np.fmod(values[rows], 360.0))))
+        return Target("angle", question.target), angle.float()
+    labels = sorted(set(values[rows]), key=_order)
+    _check_labels(cells, labels, rows, training, values, question.target[0])
+    numbered = {label: index for index, label in enumerate(labels)}
+    return Target("class", tuple(labels)), torch.tensor([numbered[values[row]] for row in rows])
+
+
+def _check_labels(
+    cells: Columns,
+    labels: Sequence[str],
+    rows: np.ndarray,
+    training: np.ndarray,
+    values: np.ndarray,
+    name: str,
+) -> None:
+    if len(labels) == 1:
+        raise DataError(
+            f"{cells.file}, column {name!r}: every row is {labels[0]!r}; wanted two classes or more. Add rows of "
+            "others, or name another data.target."
+        )
+    if len(labels) > max(MANY_LABELS, len(rows) / 2) and all(number(label) is not None for label in labels):
+        raise DataError(
+            f"{cells.file}, column {name!r}: {len(labels)} different numbers in {len(rows)} rows are no classes. Set "
+            "data.kind=real or data.kind=degrees, or name another data.target."
+        )
+    unseen = set(labels) - set(values[training])
+    if unseen:
+        row = next(row for row in rows if values[row] in unseen)
+        raise DataError(
+            f"{cells.file} line {cells.lines[row]}, column {name!r}: no training row is {values[row]!r}, so it cannot "
+            f"be learned. Add such rows, say in a column `{SPLIT}` which row is for what, or set another "
+            "data.data_seed."
+        )
+
+
+def _order(word: str) -> tuple[float, str]:
+    """Numbers by size, before and apart from words."""
+    value = number(word)
+    return (float("inf") if value is None or value != value else value, word)

@@ -1,0 +1,382 @@
+"""A user's table: what is read, what is refused, and a whole run on it."""
+
+import csv
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.configuration.schema import build, resolve
+from framework.datasets.fields import Fields
+from framework.errors import ConfigError, DataError
+from plugins.data.tabular.data import Tabular
+from plugins.data.tabular.picture import HEIGHT, bars
+from plugins.data.tabular.table import fit_scaling, standardised
+
+SPLITS = ("train", "validation", "test")
+ROWS = 40
+
+
+def table(folder: Path, text: str | None = None, rows: int = ROWS) -> Path:
+    """Rows with a number, its square, a word, a constant, and three columns worth predicting."""
+    lines = ["number,square,word,same,class,real,angle"]
+    for row in range(rows):
+        label = ("cat", "dog", "emu")[row % 3]
+        lines.append(f"{row},{row * row},{'abc'[row % 3]},7,{label},{row / 2 - 3},{20 * row - 360}")
+    file = folder / "mine.csv"
+    file.write_text("\n".join(lines) if text is None else text, encoding="utf-8")
+    return file
+
+
+def unprepared(file: Path, **config: Any) -> Tabular:
+    return build("data", resolve("data", {"name": "tabular", "path": str(file), "target": "class", **config}))
+
+
+def prepared(file: Path, **config: Any) -> Tabular:
+    data = unprepared(file, **config)
+    data.prepare()
+    return data
+
+
+def fields(data: Tabular, split: str) -> Mapping[str, torch.Tensor]:
+    found = getattr(data, split)()
+    assert isinstance(found, Fields)
+    return found.fields
+
+
+def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) -> None:
+    data = prepared(table(tmp_path), columns=None, target="class")
+    assert data.input_shape == (5,)  # number, square, same, real, angle: the word is none
+    assert data.target.kind == "class"
+    assert data.target.names == ("cat", "dog", "emu")
+    assert data.groups == ("mine",)
+    assert not data.synthetic
+    assert data.skipped == 0
+    assert [len(fields(data, name)["index"]) for name in SPLITS] == [28, 6, 6]
+    rows = {name: fields(data, name)["line"].numpy() - 2 for name in SPLITS}
+    assert sorted(np.concatenate(list(rows.values())).tolist()) == list(range(ROWS))
+    columns = np.array([[row, row * row, 7, row / 2 - 3, 20 * row - 360] for row in range(ROWS)])
+    trained = columns[rows["train"]]
+    for name in SPLITS:
+        wanted = (columns[rows[name]] - trained.mean(0)) / np.where(trained.std(0) > 0, trained.std(0), 1)
+        np.testing.assert_allclose(fields(data, name)["input"], wanted, atol=1e-6)
+        assert fields(data, name)["target"].tolist() == (rows[name] % 3).tolist()
+        assert fields(data, name)["target"].dtype == torch.int64
+        assert torch.equal(fields(data, name)["index"], torch.arange(len(rows[name])))
+        assert fields(data, name)["group"].tolist() == [0] * len(rows[name])
+    assert data.fingerprint()["constant"] == "same"
+    assert data.fingerprint()["columns"] == "number, square, same, real, angle"
+    batch = data.train().__getitems__([0, 1])
+    assert data.augment(batch) is batch
+
+
+def test_the_random_split_is_a_function_of_the_data_seed(tmp_path: Path) -> None:
+    file = table(tmp_path)
+    lines = [fields(prepared(file, data_seed=seed), "test")["line"].tolist() for seed in (0, 0, 1)]
+    assert lines[0] == lines[1] != lines[2]
+    shares = prepared(file, validation=0.25, test=0.5)
+    assert [len(fields(shares, name)["index"]) for name in SPLITS] == [10, 10, 20]
+    assert prepared(file).fingerprint() == prepared(file).fingerprint()
+    assert prepared(file).fingerprint()["sha256"] != prepared(file, data_seed=1).fingerprint()["sha256"]
+
+
+def test_reals_keep_their_unit_and_degrees_become_radians(tmp_path: Path) -> None:
+    file = table(tmp_path)
+    real = prepared(file, target="real", kind="real")
+    assert (real.target.kind, real.target.names) == ("real", ("real",))
+    train = fields(real, "train")
+    np.testing.assert_array_equal(train["target"][:, 0], (train["line"] - 2) / 2 - 3)
+    angle = prepared(file, target="angle", kind="degrees")
+    assert (angle.target.kind, angle.target.names) == ("angle", ("angle",))
+    train = fields(angle, "train")
+    degrees = 20 * (train["line"].double() - 2) - 360
+    turn = train["target"][:, 0].double() - torch.deg2rad(degrees)
+    np.testing.assert_allclose(torch.remainder(turn + 1, 2 * math.pi) - 1, 0, atol=1e-6)
+    assert train["target"].abs().max() <= math.pi + 1e-6
+    several = prepared(file, target=["real", "number"], kind="real")
+    assert several.target.names == ("real", "number")
+    assert fields(several, "train")["target"].shape == (28, 2)
+    assert several.input_shape == (3,)
+
+
+def test_many_turns_cost_no_digits(tmp_path: Path) -> None:
+    text = "x,angle\n" + "\n".join(f"{row},{360 * 10**9 * (row - 20) + row}" for row in range(40))
+    angle = prepared(table(tmp_path, text), target="angle", kind="degrees")
+    for name in SPLITS:
+        wanted = torch.deg2rad((fields(angle, name)["line"] - 2).double())
+        np.testing.assert_allclose(fields(angle, name)["target"][:, 0], wanted, atol=1e-6)
+
+
+def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> None:
+    lines = ["split,group,x,class"]
+    lines += [f"{SPLITS[row % 3]},{(10, 9, 'b')[row % 5 % 3]},{row},{row // 3 % 2}" for row in range(60)]
+    data = prepared(table(tmp_path, "\n".join(lines)))
+    assert data.input_shape == (1,)
+    assert data.groups == ("9", "10", "b")  # numbers by size
+    for index, name in enumerate(SPLITS):
+        row = fields(data, name)["line"] - 2
+        assert (row % 3 == index).all()
+        wanted = [{"10": 1, "9": 0, "b": 2}[("10", "9", "b")[int(number) % 5 % 3]] for number in row]
+        assert fields(data, name)["group"].tolist() == wanted
+
+
+def test_labels_are_ordered_by_size_where_they_are_numbers(tmp_path: Path) -> None:
+    text = "x,class\n" + "\n".join(f"{row},{(10, 2, -1)[row % 3]}" for row in range(60))
+    data = prepared(table(tmp_path, text))
+    assert data.target.names == ("-1", "2", "10")
+    row = fields(data, "test")["line"] - 2
+    assert fields(data, "test")["target"].tolist() == [(2, 1, 0)[int(number) % 3] for number in row]
+
+
+def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
+    lines = [f"{row},{row + 1},{'ab'[row % 2]}" for row in range(ROWS)]
+    cells = lines[line - 2].split(",")
+    cells[column] = cell
+    lines[line - 2] = ",".join(cells)
+    return "\n".join(["x,y,class", *lines])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "mine.csv is empty"),
+        ("x,class", "has no row below its first line"),
+        ("x;class\n1;2", "is separated by semicolons"),
+        ("x,x,class\n1,2,a", "names the column 'x' twice"),
+        (
+            "x,klass\n1,a",
+            r"data\.target names 'class', which .*mine\.csv does not have\. Did you mean 'klass'\?",
+        ),
+        ("word,class\na,b\nc,d", "has no column of numbers to read beside class"),
+        (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc'; wanted a finite number"),
+        (
+            with_cell(""),
+            r"line 5, column 'x': ''; wanted .* Or set data\.missing=skip to leave such rows out",
+        ),
+        (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan'; wanted"),
+        (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf'; wanted"),
+        (with_cell("1,2"), r"line 5: 4 cells; wanted 3"),
+        (with_cell("", 9, 2), r"line 9, column 'class': no label\. Write it, or set data\.missing=skip"),
+        ("x,class\n" + "1,a\n" * 9, "every row is 'a'; wanted two classes or more"),
+        (with_cell("c", 4, 2), r"line 4, column 'class': no training row is 'c'"),
+        (
+            "x,class\n" + "\n".join(f"{row},{row / 7}" for row in range(50)),
+            r"50 different numbers in 50 rows are no classes\. Set data\.kind=real",
+        ),
+        ("x,class\n1,a\n2,b", r"the validation split is empty \(2 rows, 0 left out"),
+        ("split,x,class\ntrain,1,a\ntest,2,b", r"the validation split is empty .* column `split`"),
+        ("split,x,class\ntrain,1,a\ntset,2,b", r"line 3, column `split`: 'tset'; .* Did you mean 'test'\?"),
+        ("group,x,class\na,1,a\n,2,b", r"line 3, column `group`: no name"),
+        (with_cell("1e300", 3), r"line 3, column 'x': '1e300' lies beyond single precision"),
+    ],
+)
+def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    file = table(tmp_path, text)
+    # a seed that puts lines 3 and 4 into the test split
+    seed = next(
+        seed
+        for seed in count()
+        if {1, 2} <= set(np.random.default_rng(seed).permutation(ROWS)[6:12].tolist())
+    )
+    with pytest.raises(DataError, match=message):
+        prepared(file, data_seed=seed)
+
+
+def test_wrong_questions_are_refused(tmp_path: Path) -> None:
+    file = table(tmp_path)
+    with pytest.raises(DataError, match=r"data\.path is not set; wanted the CSV file"):
+        Tabular().prepare()
+    with pytest.raises(DataError, match=r"nowhere\.csv: no such file"):
+        prepared(tmp_path / "nowhere.csv")
+    with pytest.raises(DataError, match=r"data\.columns names 'nomber', .* Did you mean 'number'\?"):
+        prepared(file, columns=["nomber"])
+    with pytest.raises(DataError, match=r"data\.columns names 'class', which is what is to be predicted"):
+        prepared(file, columns=["number", "class"])
+    with pytest.raises(DataError, match=r"line 2, column 'word': 'a'; wanted a finite number"):
+        prepared(file, columns=["word"])
+    with pytest.raises(DataError, match=r"line 2, column 'class': 'cat'; wanted a finite number"):
+        prepared(file, kind="real")
+    with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] with data\.kind=class"):
+        prepared(file, target=["class", "word"])
+    with pytest.raises(DataError, match=r"data\.target = \[\]"):
+        prepared(file, target=[], kind="real")
+    with pytest.raises(DataError, match="wanted less than 1"):
+        prepared(file, validation=0.5, test=0.5)
+    with pytest.raises(DataError, match="has no column of numbers to read"):
+        prepared(file, columns=[])
+
+
+@pytest.mark.parametrize("cell", ["", "NA", "nan", "?"])
+def test_rows_without_a_number_are_left_out_where_asked(tmp_path: Path, cell: str) -> None:
+    lines = with_cell(cell).splitlines()
+    lines[10] = lines[10].replace(",a", ",").replace(",b", ",")
+    data = prepared(table(tmp_path, "\n".join(lines)), missing="skip")
+    assert data.skipped == 2
+    kept = torch.cat([fields(data, name)["line"] for name in SPLITS])
+    assert sorted(kept.tolist()) == [line for line in range(2, ROWS + 2) if line not in (5, 11)]
+    reals = prepared(table(tmp_path, with_cell(cell)), missing="skip", target="x", kind="real", columns=["y"])
+    assert reals.skipped == 1
+    with pytest.raises(DataError, match="line 5, column 'x': 'inf'"):
+        prepared(table(tmp_path, with_cell("inf")), missing="skip")
+    with pytest.raises(DataError, match="line 5, column 'x': 'abc'"):
+        prepared(table(tmp_path, with_cell("abc")), missing="skip")
+
+
+def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> None:
+    file = table(tmp_path)
+    data = prepared(file, columns=["square", "number"])
+    other = tmp_path / "other.csv"
+    test = fields(data, "test")
+    numbers = (test["line"] - 2).tolist()
+    other.write_text("number,note,square\n" + "\n".join(f"{n},hello,{n * n}" for n in numbers))
+    fresh = unprepared(file, columns=["square", "number"])
+    read = fresh.read([other, other])
+    assert isinstance(read, Fields)
+    assert read.fields.keys() == {"input", "index"}
+    assert torch.equal(read.fields["input"], torch.cat([test["input"], test["input"]]))
+    assert torch.equal(read.fields["index"], torch.arange(12))
+    other.write_text("number\n3\n")
+    with pytest.raises(
+        DataError, match=r"The trained model names 'square', which .*other\.csv does not have"
+    ):
+        fresh.read([other])
+    other.write_text("number,square\n3,9\n4,\n")
+    with pytest.raises(DataError, match=r"other\.csv line 3, column 'square': ''; wanted a finite number"):
+        fresh.read([other])
+    with pytest.raises(DataError, match="no such file"):
+        fresh.read([tmp_path / "none.csv"])
+
+
+@given(
+    st.lists(st.floats(-1e300, 1e300, allow_subnormal=False), min_size=2, max_size=30),
+    st.floats(-1e300, 1e300, allow_subnormal=False),
+)
+@settings(deadline=None, max_examples=200)
+def test_any_column_is_standardised_without_overflow(values: list[float], constant: float) -> None:
+    inputs = np.array([values, [constant] * len(values)]).T
+    scaling, same = fit_scaling(inputs)
+    found = standardised(inputs, scaling)
+    assert same.tolist() == [min(values) == max(values), True]
+    np.testing.assert_array_equal(found[:, 1], 0)
+    if not same[0]:
+        assert abs(found[:, 0].mean()) < 1e-6
+        assert found[:, 0].std() == pytest.approx(1, abs=1e-6)
+    else:
+        np.testing.assert_array_equal(found[:, 0], 0)
+
+
+def test_a_column_far_from_zero_keeps_its_digits() -> None:
+    inputs = 1e9 + np.array([[0.0], [1.0], [2.0], [3.0]])
+    found = standardised(inputs, fit_scaling(inputs)[0])
+    np.testing.assert_allclose(found[:, 0], (np.arange(4) - 1.5) / np.std(np.arange(4)), rtol=1e-6)
+
+
+def test_a_picture_has_a_bar_for_every_column(tmp_path: Path) -> None:
+    picture = bars(np.array([3.0, -1.5, 0.0, 99.0]))
+    assert picture.shape == (HEIGHT, 256, 3)
+    blue, red = ((picture == colour).all(-1).sum(0) for colour in ((31, 119, 180), (214, 39, 40)))
+    heights = [(int(blue[place]), int(red[place])) for place in (10, 74, 138, 202)]
+    assert heights == [(31, 0), (0, 15), (0, 0), (31, 0)]  # less the grey line in the middle
+    data = prepared(table(tmp_path))
+    assert data.picture(fields(data, "train")["input"][0]).dtype == np.uint8
+    assert bars(np.zeros(500)).shape == (HEIGHT, 1000, 3)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("kind", "radians"),
+        ("missing", "drop"),
+        ("validation", 0.0),
+        ("test", math.nan),
+        ("data_seed", -1),
+        ("rot", 1),
+    ],
+)
+def test_a_config_out_of_range_is_refused(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=rf"data\.{key}"):
+        resolve("data", {"name": "tabular", key: value})
+
+
+RUNS = {
+    "class": ("class", "categorical", "[log_likelihood]"),
+    "real": ("real", "gaussian", "[log_likelihood]"),
+    "degrees": ("angle", "von_mises", "[log_likelihood,angular_deviation]"),
+}
+COMMANDS = """
+import json
+import sys
+from framework.app import main
+for line in json.load(sys.stdin):
+    sys.argv = ["framework", *line, "logger=none", "threads=1"]
+    main()
+"""
+
+
+def test_tables_of_every_kind_are_trained_on_tested_and_predicted_for(tmp_path: Path) -> None:
+    file = table(tmp_path, rows=90)
+    (tmp_path / "one.csv").write_text("square,number\n25,5\n")
+    lines = []
+    for kind, (target, head, metric) in RUNS.items():
+        lines += [
+            [
+                "data=tabular",
+                f"data.path={file}",
+                f"data.target={target}",
+                f"data.kind={kind}",
+                "data.columns=[number,square]",
+                "encoder=[mlp]",
+                "encoder.mlp.widths=[8]",
+                f"density_head={head}",
+                f"metric={metric}",
+                "batch_size=16",
+                "trainer.max_epochs=2",
+                f"hydra.run.dir={tmp_path / kind}",
+            ],
+            [
+                "mode=predict",
+                f"checkpoint={tmp_path / kind}",
+                f"mode.files={tmp_path / 'one.csv'}",
+                f"hydra.run.dir={tmp_path / kind / 'predicted'}",
+            ],
+        ]
+    done = subprocess.run(
+        [sys.executable, "-c", COMMANDS],
+        input=json.dumps(lines),
+        cwd=tmp_path,
+        env={**os.environ, "FRAMEWORK_CACHE": str(tmp_path / "cache")},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    for kind in ("class", "real", "degrees"):
+        results = json.loads((tmp_path / kind / "results.json").read_text())
+        assert math.isfinite(results["log_likelihood"])
+        assert results["data"] == "mine"
+        assert not results["synthetic"]
+        with (tmp_path / kind / "predicted" / "predictions.csv").open(encoding="utf-8") as stream:
+            (row,) = csv.DictReader(stream)
+        wanted = {"class": "class", "real": "real", "degrees": "angle_deg"}[kind]
+        names, found = list(row), list(row.values())
+        assert names[:2] == ["sample", wanted]
+        if kind == "class":  # by name, then every class's probability
+            shares = {name: float(value) for name, value in row.items() if name.startswith("p_")}
+            assert sum(shares.values()) == pytest.approx(1, abs=1e-5)
+            assert max(shares, key=shares.__getitem__) == f"p_{row['class']}"
+            found = [value for name, value in row.items() if name not in ("sample", "class")]
+        else:
+            found = found[1:]
+        assert names[-1] == "entropy_nats"
+        assert all(math.isfinite(float(cell)) for cell in found)

@@ -1,0 +1,84 @@
+"""Class probabilities: any number of classes by softmax, two by a logistic."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Categorical
+
+from framework.density_head import DensityHead
+from framework.errors import ConfigError
+from framework.heads.parameters import require_finite
+from framework.target import Target
+
+
+class CategoricalHead(DensityHead):
+    """Class probabilities by softmax; trains by cross-entropy."""
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@incollection{bridle1990probabilistic,
+  title = {Probabilistic Interpretation of Feedforward Classification Network Outputs, with Relationships to Statistical Pattern Recognition},
+  author = {Bridle, John S.},
+  booktitle = {Neurocomputing},
+  publisher = {Springer},
+  year = {1990}
+}"""  # noqa: E501
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("class", by="density_head categorical")
+        self.size = len(target.names)
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Categorical:
+        return classes(require_finite(raw, self.size))
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        pass  # everything is trained
+
+
+class BernoulliHead(DensityHead):
+    """Two classes by a logistic (thesis eq. 2.9-2.11); trains by binary cross-entropy."""
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@article{cox1958regression,
+  title = {The Regression Analysis of Binary Sequences},
+  author = {Cox, David R.},
+  journal = {Journal of the Royal Statistical Society: Series B},
+  volume = {20},
+  number = {2},
+  pages = {215--242},
+  year = {1958}
+}"""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("class", by="density_head bernoulli")
+        if len(target.names) != 2:
+            raise ConfigError(
+                f"density_head bernoulli describes two classes; this data set has {len(target.names)}: "
+                f"{target.told}. Choose density_head=categorical."
+            )
+        self.size = 1
+
+    def forward(self, raw: Float[Tensor, "*batch 1"]) -> Categorical:
+        raw = require_finite(raw, self.size)
+        # the softmax of (0, r) is the logistic of r (eq. 2.11)
+        return classes(torch.cat([torch.zeros_like(raw), raw], -1))
+
+    def loss(self, raw: Float[Tensor, "*batch 1"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Float[Tensor, "batch 1"], target: Tensor) -> None:
+        pass  # everything is trained
+
+
+def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:
+    """Their softmax; logits so large that their differences overflow are cut off first."""
+    most = torch.finfo(logits.dtype).max / 4
+    # normalised here, the largest logit subtracted first: torch's own normalisation loses the digits of large logits
+    return Categorical(logits=logits.clamp(-most, most).log_softmax(-1), validate_args=False)

@@ -1,0 +1,129 @@
+"""Gaussians over any number of reals, by sequential regression."""
+
+import math
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.density import marginal, median, pick, take
+from framework.distributions.normals import Normals, mahalanobis, normals, one_normal
+from framework.distributions.tempering import tempered
+
+
+class Gaussian(Distribution):
+    """Gaussian with a full covariance, written as regressions of each number on those before it.
+
+    With d = y - μ, every e_i = d_i - Σ_{j<i} φ_ij d_j is an independent N(0, σ_i²): the modified Cholesky factors of
+    the inverse covariance (Pourahmadi 1999, eq. 2). Any φ and any σ > 0 give a covariance, the log-determinant is a
+    sum of logarithms, and neither a density nor a sample inverts a matrix.
+
+    Args:
+        mean: (*batch, number).
+        scale: (*batch, number), σ > 0; the standard deviations where there are no coefficients.
+        coefficients: (*batch, number, number), φ strictly below the diagonal, 0 elsewhere; None for all 0.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = True
+
+    def __init__(
+        self,
+        mean: Float[Tensor, "*batch number"],
+        scale: Float[Tensor, "*batch number"],
+        coefficients: Float[Tensor, "*batch number number"] | None = None,
+    ) -> None:
+        self.location = mean
+        self.scale = scale
+        self.coefficients = coefficients
+        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.real_vector
+
+    @property
+    def mean(self) -> Tensor:
+        return self.location
+
+    @property
+    def mode(self) -> Tensor:
+        return self.location
+
+    @property
+    def variance(self) -> Tensor:
+        """Of each number, (*batch, number)."""
+        if self.coefficients is None:
+            return self.scale.square()
+        return (self._mixing * self.scale.unsqueeze(-2)).square().sum(-1)
+
+    @cached_property
+    def _mixing(self) -> Tensor:
+        """(I - φ)⁻¹, unit lower triangular: d = (I - φ)⁻¹ e."""
+        assert self.coefficients is not None
+        identity = torch.eye(self.event_shape[0], dtype=self.scale.dtype, device=self.scale.device)
+        return torch.linalg.solve_triangular(
+            identity - self.coefficients,
+            identity.expand_as(self.coefficients),
+            upper=False,
+            unitriangular=True,
+        )
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        residual = value - self.location
+        if self.coefficients is not None:
+            residual = residual - (self.coefficients @ residual.unsqueeze(-1)).squeeze(-1)
+        standard = residual / self.scale
+        return -(standard.square() / 2 + self.scale.log() + math.log(2 * math.pi) / 2).sum(-1)
+
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = self._extended_shape(torch.Size(sample_shape))
+        noise = torch.randn(shape, dtype=self.scale.dtype, device=self.scale.device) * self.scale
+        if self.coefficients is not None:
+            noise = (self._mixing @ noise.unsqueeze(-1)).squeeze(-1)
+        return self.location + noise
+
+    def entropy(self) -> Tensor:
+        return (self.scale.log() + (1 + math.log(2 * math.pi)) / 2).sum(-1)
+
+
+@marginal.register
+def _(density: Gaussian, index: int) -> Gaussian:
+    here = slice(index, index + 1)
+    return Gaussian(density.location[..., here], density.variance[..., here].sqrt())
+
+
+@pick.register
+def _(density: Gaussian, index: Tensor) -> Gaussian:
+    coefficients = density.coefficients
+    if coefficients is not None:
+        size = coefficients.shape[-1]
+        coefficients = take(coefficients.flatten(-2), index).unflatten(-1, (size, size))
+    return Gaussian(take(density.location, index), take(density.scale, index), coefficients)
+
+
+@median.register
+def _(density: Gaussian, samples: int) -> Tensor:
+    # each number's marginal is symmetric about its mean
+    return density.location
+
+
+@normals.register
+def _(density: Gaussian) -> Normals | None:
+    return one_normal(density.location, density.scale) if tuple(density.event_shape) == (1,) else None
+
+
+@mahalanobis.register
+def _(density: Gaussian, value: Tensor) -> Tensor:
+    residual = value.double() - density.location.double()
+    if density.coefficients is not None:
+        residual = residual - (density.coefficients.double() @ residual.unsqueeze(-1)).squeeze(-1)
+    return (residual / density.scale.double()).square().sum(-1)
+
+
+@tempered.register
+def _(density: Gaussian, temperature: Tensor) -> Gaussian:
+    # every e_i is an independent N(0, σ_i²), and exp(-e²/2σ²)^(1/T) = exp(-e²/2σ²T)
+    return Gaussian(density.location, density.scale * temperature.sqrt(), density.coefficients)

@@ -1,0 +1,140 @@
+"""The Gaussian head: a mean, and how far off it may be."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import hardtanh, mse_loss
+
+from framework.density_head import DensityHead
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.density_head.gaussian.density import Gaussian
+
+LARGEST_MEAN = 1e8
+"""Means and residuals are cut off here: beyond it squares of standardised residuals overflow float32."""
+LARGEST_SCALE = 1e12
+LARGEST_COEFFICIENT = 1e3
+SMALLEST_SCALE = 1e-6
+
+
+class GaussianHead(DensityHead):
+    """Gaussian over one or more reals, heteroscedastic or not (thesis eq. 2.7-2.8).
+
+    With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With
+    "fixed" it trains by squared error, which is likelihood with σ = 1, and `calibrate` fits one covariance to the
+    validation residuals by maximum likelihood. Targets should be of the order of 1.
+
+    Args:
+        scale: where the spread comes from.
+        covariance: "diagonal": numbers independent of one another; "full": with regression coefficients of each
+            number on those before it.
+        floor: the least σ: no density can collapse onto a training value beyond it.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@inproceedings{nix1994estimating,
+  title = {Estimating the Mean and Variance of the Target Probability Distribution},
+  author = {Nix, David A. and Weigend, Andreas S.},
+  booktitle = {Proceedings of the IEEE International Conference on Neural Networks (ICNN)},
+  year = {1994}
+}"""
+
+    scale: Tensor
+    coefficients: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        scale: Literal["predicted", "fixed"] = "predicted",
+        covariance: Literal["diagonal", "full"] = "diagonal",
+        floor: Annotated[float, Field(ge=SMALLEST_SCALE, le=1.0)] = 1e-4,
+    ) -> None:
+        super().__init__()
+        target.require("real", by="density_head gaussian")
+        self.numbers = len(target.names)
+        self.floor = floor
+        self.predicted = scale == "predicted"
+        self.full = covariance == "full" and self.numbers > 1
+        pairs = self.numbers * (self.numbers - 1) // 2 if self.full else 0
+        self.size = 2 * self.numbers + pairs if self.predicted else self.numbers
+        if not self.predicted:
+            self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
+            side = self.numbers if self.full else 0  # of a diagonal covariance none: numbers may be very many
+            self.register_buffer("coefficients", torch.zeros(side, side, dtype=torch.float64))
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Gaussian:
+        raw = require_finite(raw, self.size)
+        mean = self._mean(raw)
+        if not self.predicted:
+            scale = self.scale.to(raw).expand_as(mean)
+            coefficients = self.coefficients.to(raw).expand(*mean.shape, self.numbers) if self.full else None
+            return Gaussian(mean, scale, coefficients)
+        scale = self.floor + scale_of_raw(raw[..., self.numbers : 2 * self.numbers])
+        return Gaussian(mean, scale, self._coefficients(raw[..., 2 * self.numbers :]) if self.full else None)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        if self.predicted:
+            return -self(raw).log_prob(target)
+        # σ = 1, whatever was calibrated; in few passes over the numbers, which may be very many
+        mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target.to(raw))
+        return mse_loss(mean, target, reduction="none").sum(-1) / 2 + self.numbers * math.log(2 * math.pi) / 2
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        if self.predicted:
+            return
+        if len(raw) == 0:
+            raise ValueError("a fixed covariance is calibrated on validation data, but got none of it.")
+        residual = target.double() - self(raw).location.double()
+        if not self.full:  # each σ by itself
+            self.scale.copy_(residual.square().mean(0).sqrt().clamp(min=self.floor))
+            return
+        scale, coefficients = fit(residual)
+        self.scale.copy_(scale.clamp(min=self.floor))
+        self.coefficients.copy_(coefficients)
+
+    def _mean(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch number"]:
+        # a clamp whose gradient takes one pass, not four
+        return hardtanh(raw[..., : self.numbers], -LARGEST_MEAN, LARGEST_MEAN)
+
+    def _coefficients(self, raw: Tensor) -> Tensor:
+        bounded = LARGEST_COEFFICIENT * torch.tanh(raw / LARGEST_COEFFICIENT)
+        row, column = torch.tril_indices(self.numbers, self.numbers, -1, device=raw.device)
+        found = raw.new_zeros(*raw.shape[:-1], self.numbers, self.numbers)
+        found[..., row, column] = bounded
+        return found
+
+
+def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_SCALE.
+
+    The Fisher information of log σ is constant, so a logarithmic map trains best; the power keeps an outlier from
+    exploding.
+    """
+    most = 4 * (LARGEST_SCALE**0.25 - 1)
+    high = (1 + raw.clamp(0, most) / 4).square().square()
+    return torch.where(raw < 0, torch.exp(raw.clamp(max=0)), high)
+
+
+def fit(
+    residual: Float[Tensor, "sample number"],
+) -> tuple[Float[Tensor, "number"], Float[Tensor, "number number"]]:
+    """Maximum-likelihood σ and φ of zero-mean residuals: least squares of each number on those before it."""
+    count = residual.shape[-1]
+    scale, coefficients = residual.new_zeros(count), residual.new_zeros(count, count)
+    for number in range(count):
+        left = residual[:, number]
+        if number:
+            before = residual[:, :number]
+            # the driver that copes with collinear residuals
+            solution = torch.linalg.lstsq(before, left[:, None], driver="gelsd").solution[:, 0]
+            coefficients[number, :number] = solution.clamp(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+            left = left - before @ coefficients[number, :number]
+        scale[number] = left.square().mean().sqrt()
+    return scale, coefficients

@@ -1,0 +1,127 @@
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.density import marginal, pick
+from framework.errors import ConfigError
+from framework.target import Target
+from plugins.density_head.gaussian.density import Gaussian
+from plugins.density_head.gaussian.head import scale_of_raw
+from plugins.density_head.gaussian.rows import ONE, THREE
+
+
+def head(config=None, target=THREE):
+    return build(
+        "density_head", resolve("density_head", {"name": "gaussian", **(config or {})}), target=target
+    )
+
+
+@pytest.fixture
+def full():
+    """A batch of full Gaussians in float64, and their covariances by inversion."""
+    torch.manual_seed(0)
+    density = head({"covariance": "full"}).double()(torch.randn(5, 9, dtype=torch.float64))
+    inverse = np.linalg.inv(np.eye(3) - density.coefficients.numpy())
+    return density, inverse @ (density.scale.numpy()[:, :, None] ** 2 * inverse.transpose(0, 2, 1))
+
+
+def test_full_covariance_agrees_with_scipy(full):
+    density, covariance = full
+    value = torch.randn(5, 3, dtype=torch.float64)
+    for row in range(5):
+        wanted = stats.multivariate_normal(density.mean[row].numpy(), covariance[row])
+        assert density.log_prob(value)[row].item() == pytest.approx(
+            wanted.logpdf(value[row].numpy()), rel=1e-10
+        )
+        assert density.entropy()[row].item() == pytest.approx(wanted.entropy(), rel=1e-10)
+    np.testing.assert_allclose(density.variance.numpy(), np.einsum("bii->bi", covariance), rtol=1e-12)
+
+
+def test_samples_have_the_covariance(full):
+    density, covariance = full
+    torch.manual_seed(1)
+    drawn = density.sample((40_000,)).numpy()
+    scale = np.sqrt(np.einsum("bii->bi", covariance))
+    for row in range(5):
+        found = np.cov(drawn[:, row].T) / np.outer(scale[row], scale[row])
+        np.testing.assert_allclose(found, covariance[row] / np.outer(scale[row], scale[row]), atol=0.04)
+
+
+def test_marginals_and_picked_components(full):
+    density, covariance = full
+    value = torch.linspace(-2, 2, 5, dtype=torch.float64)[:, None]
+    for index in range(3):
+        wanted = stats.norm(density.mean[:, index].numpy(), np.sqrt(covariance[:, index, index]))
+        found = marginal(density, index).log_prob(value).numpy()
+        np.testing.assert_allclose(found, wanted.logpdf(value[:, 0].numpy()), rtol=1e-10)
+    chosen = pick(density, torch.tensor([3, 0]))
+    whole = density.log_prob(value.expand(5, 3)[:, None])
+    torch.testing.assert_close(chosen.log_prob(value.expand(5, 3)[:, None]), whole[:, [3, 0]])
+
+
+@pytest.mark.parametrize("covariance", ["diagonal", "full"])
+def test_calibration_maximises_the_likelihood(covariance):
+    made = head({"scale": "fixed", "covariance": covariance}).double()
+    torch.manual_seed(2)
+    mixing = torch.tensor([[1.0, 0, 0], [0.8, 0.3, 0], [-2.0, 0.1, 0.5]], dtype=torch.float64)
+    raw = torch.randn(400, 3, dtype=torch.float64)
+    target = raw + torch.randn(400, 3, dtype=torch.float64) @ mixing.T
+    before = made.loss(raw, target)
+    made.calibrate(raw, target)
+    residual = (target - raw).numpy()
+    wanted = residual.T @ residual / 400  # maximum likelihood of a covariance about a known mean
+    wanted = wanted if covariance == "full" else np.diag(np.diag(wanted))
+    best = stats.multivariate_normal(np.zeros(3), wanted).logpdf(residual)
+    np.testing.assert_allclose(made(raw).log_prob(target).numpy(), best, rtol=1e-9)
+    assert torch.equal(made.loss(raw, target), before)  # squared error does not change with it
+
+
+def test_calibration_on_perfect_collinear_and_no_data():
+    made = head({"scale": "fixed", "covariance": "full"})
+    raw = torch.randn(20, 3)
+    made.calibrate(raw, raw)
+    assert torch.allclose(made.scale, torch.full((3,), 1e-4, dtype=torch.float64))
+    made.calibrate(raw, raw + torch.randn(20, 1))  # all three off by the same
+    assert made(raw).log_prob(raw).isfinite().all()
+    with pytest.raises(ValueError, match="got none"):
+        made.calibrate(raw[:0], raw[:0])
+
+
+def test_the_fixed_loss_is_half_the_squared_error_up_to_a_constant():
+    made = head({"scale": "fixed"}).double()
+    raw, target = torch.randn(7, 3).double(), torch.randn(7, 3).double()
+    constant = made.loss(raw, target) - (raw - target).square().sum(-1) / 2
+    torch.testing.assert_close(constant, constant[0].expand(7))
+
+
+def test_the_scale_is_smooth_and_bounded():
+    raw = torch.tensor([-1e-9, 0.0, 1e-9], dtype=torch.float64, requires_grad=True)
+    found = scale_of_raw(raw)
+    (slope,) = torch.autograd.grad(found.sum(), raw)
+    torch.testing.assert_close(found, torch.ones(3).double(), rtol=0, atol=2e-9)
+    torch.testing.assert_close(slope, torch.ones(3).double(), rtol=0, atol=2e-9)
+    assert scale_of_raw(torch.tensor(1e30)) == pytest.approx(1e12)
+
+
+def test_one_number_with_full_covariance_is_the_diagonal_head():
+    assert head({"covariance": "full"}, ONE).size == head({}, ONE).size == 2
+
+
+def test_reparametrised_samples_have_gradients():
+    mean = torch.zeros(1, 2, requires_grad=True)
+    Gaussian(mean, torch.ones(1, 2)).rsample((3,)).sum().backward()
+    assert torch.equal(mean.grad, torch.full((1, 2), 3.0))
+
+
+@pytest.mark.parametrize("kind", ["angle", "class"])
+def test_other_targets_are_refused(kind):
+    with pytest.raises(ConfigError, match="gaussian describes targets of kind 'real'"):
+        head({}, Target(kind, ("azimuth", "elevation")))
+
+
+@pytest.mark.parametrize("config", [{"floor": 0.0}, {"scale": "guess"}, {"covariance": "low_rank"}])
+def test_a_config_out_of_range_is_refused(config):
+    with pytest.raises(ConfigError, match=r"density_head\."):
+        head(config)

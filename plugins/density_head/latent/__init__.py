@@ -1,0 +1,1 @@
+"""Latent-variable densities: CVAE and simplified CVAE."""

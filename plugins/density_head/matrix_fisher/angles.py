@@ -1,0 +1,94 @@
+"""One angle of a viewpoint whose rotation is matrix Fisher: its log-density, from F = 0 to concentrations of 1e12."""
+
+import math
+from collections.abc import Callable, Iterable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from plugins.density_head.matrix_fisher import quadrature, quaternions
+from plugins.density_head.matrix_fisher.functions import Frame, log_height
+
+CHUNK = 2**10
+"""Angles at which the density is integrated at once: arrays of 2 MB stay in the cache."""
+
+
+@torch.no_grad()
+def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float[Tensor, "..."]:
+    """Log-density of azimuth (index 0), elevation (1) or tilt (2), radians: nats, float64; the frame's batch shape
+    broadcasts with `angle`.
+
+    With the aligned quaternion linear in (cos, sin) of half of each angle, the energy Σ λᵢqᵢ² is a quadratic form of
+    the first angle's pair. Its smaller and larger eigenvalue μ and ν give the integral over that angle, and the
+    second is left to quadrature:
+
+        p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de.
+    """
+    shape = torch.broadcast_shapes(angle.shape, frame.falls.shape[:-1])
+    parts = (quaternions.of_matrix(frame.left), quaternions.of_matrix(frame.right), frame.falls)
+    rows = [part.expand(*shape, part.shape[-1]).reshape(-1, part.shape[-1]).split(CHUNK) for part in parts]
+    angles = angle.double().expand(shape).reshape(-1).split(CHUNK)
+    found = [
+        _log_integral(one, left, right, falls, index)
+        for one, left, right, falls in zip(angles, *rows, strict=True)
+    ]
+    return torch.cat(found).reshape(shape) + log_height(frame.falls)
+
+
+def _log_integral(angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int) -> Tensor:
+    """The integral over both other angles, without 1/k(λ)."""
+    around = index == 1  # the azimuth is left to quadrature, otherwise the elevation
+    log_density = _log_density(angle, left, right, falls, index)
+    low, high = (-math.pi, math.pi) if around else (-math.pi / 2, math.pi / 2)
+    points, weights = quadrature.nodes(log_density, low, high, angle, periodic=around)
+    volume = torch.cos(angle[..., None] if around else points).abs() / (4 * math.pi)
+    return torch.logsumexp(log_density(points) + torch.log(weights * volume), -1)
+
+
+def _log_density(
+    angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int
+) -> Callable[[Tensor], Tensor]:
+    """Of a second angle, points (*batch, point), with the third integrated out."""
+    _, i, _, k = torch.eye(4, dtype=falls.dtype, device=falls.device)
+    product = quaternions.product
+    # the viewpoint's quaternion is (1, k)·(cos, sin)(t/2) (1, i)·(cos, sin)(e/2 - π/4) (1, -k)·(cos, sin)(a/2)
+    if index == 0:
+        turned = quaternions.about(3, -angle)
+        corners = turned, product(i, turned), product(k, turned), product(product(k, i), turned)
+    elif index == 1:
+        turned = quaternions.about(1, angle - math.pi / 2)
+        corners = turned, product(turned, -k), product(k, turned), product(product(k, turned), -k)
+    else:
+        turned = quaternions.about(3, angle)
+        corners = turned, product(turned, i), product(turned, k), product(turned, product(i, k))
+    corners = [product(product(quaternions.inverse(left), corner), right)[..., 1:] for corner in corners]
+    # per component (*batch, 1)
+    even, odd, even_turned, odd_turned = (corner.unsqueeze(-1).unbind(-2) for corner in corners)
+    fall = falls.unsqueeze(-1).unbind(-2)
+
+    def log_density(points: Tensor) -> Tensor:
+        half = points / 2 if index == 1 else points / 2 - math.pi / 4
+        cosine, sine = torch.cos(half), torch.sin(half)
+        first = [cosine * even[n] + sine * odd[n] for n in range(3)]
+        second = [cosine * even_turned[n] + sine * odd_turned[n] for n in range(3)]
+        scaled = [fall[n] * second[n] for n in range(3)]
+        one_one = _sum(fall[n] * first[n] * first[n] for n in range(3))
+        two_two = _sum(scaled[n] * second[n] for n in range(3))
+        one_two = _sum(scaled[n] * first[n] for n in range(3))
+        # of a Gram matrix (Cauchy and Binet): nothing cancels
+        determinant = _sum(
+            fall[n] * fall[m] * (first[n] * second[m] - first[m] * second[n]).square()
+            for n, m in ((0, 1), (0, 2), (1, 2))
+        )
+        spread = torch.hypot(one_one - two_two, 2 * one_two)
+        larger = (one_one + two_two + spread) / 2
+        smaller = determinant / larger.clamp(min=torch.finfo(larger.dtype).tiny)
+        return torch.log(torch.special.i0e(spread / 2)) - smaller
+
+    return log_density
+
+
+def _sum(terms: Iterable[Tensor]) -> Tensor:
+    first, second, third = terms
+    return first + second + third

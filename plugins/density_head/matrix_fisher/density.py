@@ -1,0 +1,168 @@
+"""The matrix Fisher density of a viewpoint as a torch distribution, and the densities of its single angles."""
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.circular import grid
+from framework.distributions.density import Circular, marginal, pick, take
+from framework.distributions.tempering import tempered
+from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
+
+VOLUME = 8 * math.pi**2
+"""∫ cos e da de dt over the chart."""
+CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
+"""Of azimuth, elevation and tilt."""
+
+
+class MatrixFisher(Distribution):
+    """Azimuth a, elevation e and tilt t of a rotation R with density exp(tr(FᵀR)) / c(F) (Downs 1972).
+
+    R is framework.geometry.rotation.viewpoint_rotation(a, e, t). Every rotation has one viewpoint in the chart
+    -π/2 ≤ e ≤ π/2 (the poles have many), and log_prob is with respect to da de dt there:
+
+        log p(a, e, t) = log p(R) + log(cos e / 8π²),
+
+    p(R) with respect to the rotation-invariant measure of total mass 1. It integrates to 1 over the chart, and
+    samples lie in it. An elevation outside is read as the same rotation's viewpoint inside, (a+π, π-e, t+π): over
+    the whole torus of three angles it would integrate to 2. Independent von Mises angles integrate to 1 over the
+    torus; the mass that they spend outside the chart is no viewpoint's, so that on data from the chart this density
+    starts with an advantage of up to log 2.
+
+    At the poles the density is 0 in da de dt. No floating-point number is exactly π/2, so that log_prob and its
+    gradients stay finite there.
+
+    Args:
+        parameter: F, (*batch, 3, 3); 0 is the uniform density of rotations.
+        dtype: of log_prob, samples and so on; the parameter's own where not given. Inside all is float64.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = False
+
+    def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
+        self.parameter = parameter
+        self.dtype = dtype or parameter.dtype
+        super().__init__(parameter.shape[:-2], torch.Size((3,)), validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return Circular(CHART)
+
+    @cached_property
+    def frame(self) -> functions.Frame:
+        """The proper singular value decomposition of F, without gradient."""
+        return functions.align(self.parameter)
+
+    @property
+    def mean_rotation(self) -> Float[Tensor, "*batch 3 3"]:
+        """E R, differentiable in F."""
+        return functions.mean_rotation(self.parameter).to(self.dtype)
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch 3"]:
+        """The likeliest rotation U Vᵀ: where log p(R), without the cos e of the chart, is highest."""
+        return quaternions.viewpoint(self.frame.mode).to(self.dtype)
+
+    def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
+        exact = value.double()
+        of_rotation = functions.log_prob(quaternions.of_viewpoint(exact), self.parameter)
+        return (of_rotation + _log_volume(exact[..., 1])).to(self.dtype)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = self._extended_shape(torch.Size(sample_shape))
+        aligned = functions.sample(self.frame.falls.expand(shape))
+        return quaternions.viewpoint(self.frame.turn(aligned)).to(self.dtype)
+
+    def entropy(self) -> Tensor:
+        """Nats, with respect to da de dt: that of the rotation in closed form, less E log(cos e / 8π²) by quadrature;
+        without gradient."""
+        elevation = Angle(self, 1)
+        log_volume = elevation.expectation(_log_volume)
+        return (functions.entropy(self.frame.falls) - log_volume).to(self.dtype)
+
+
+class Angle(Distribution):
+    """One angle of a matrix Fisher density, alone; no gradients.
+
+    A second angle integrates to a Bessel function in closed form, the third by quadrature whose nodes follow the
+    peaks (at most two for most F) from the uniform density to concentrations of 1e12. Elevations outside the chart
+    are read as those inside.
+
+    Args:
+        joint: of all three.
+        index: 0 azimuth, 1 elevation, 2 tilt.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = False
+
+    def __init__(self, joint: MatrixFisher, index: int) -> None:
+        self.joint = joint
+        self.index = index
+        super().__init__(joint.batch_shape, torch.Size((1,)), validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return Circular((CHART[self.index],))
+
+    def log_prob(self, value: Float[Tensor, "... 1"]) -> Float[Tensor, "..."]:
+        found = angles.log_marginal(value.double().squeeze(-1), self.joint.frame, self.index)
+        return found.to(self.joint.dtype)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        return self.joint.sample(sample_shape)[..., self.index : self.index + 1]
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch 1"]:
+        """The best of a grid and the joint mode's angle, polished."""
+        points = 90
+        around = grid(points, dtype=torch.float64, device=self.joint.parameter.device)
+        around = (around / 2 if self.index == 1 else around).expand(*self.batch_shape, points)
+        candidates = torch.cat([around, self.joint.mode.double()[..., self.index, None]], -1)
+        best = self._log_density(candidates).argmax(-1, keepdim=True)
+        start = candidates.gather(-1, best).squeeze(-1)
+        found = quadrature.maximum(self._log_density, start, 2 * math.pi / points)
+        return found.unsqueeze(-1).to(self.joint.dtype)
+
+    def entropy(self) -> Tensor:
+        """Nats, by quadrature."""
+        return -self.expectation(self._log_density).to(self.joint.dtype)
+
+    def expectation(self, function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*batch"]:
+        """E function(angle), float64; `function` takes and gives (*batch, point), radians in."""
+        most = math.pi / 2 if self.index == 1 else math.pi
+        like = self.joint.frame.falls[..., 0]
+        points, weights = quadrature.nodes(self._log_density, -most, most, like, periodic=self.index != 1)
+        mass = weights * self._log_density(points).exp()
+        return (mass * function(points)).sum(-1) / mass.sum(-1)
+
+    def _log_density(self, points: Float[Tensor, "*batch point"]) -> Float[Tensor, "*batch point"]:
+        return angles.log_marginal(points.movedim(-1, 0), self.joint.frame, self.index).movedim(0, -1)
+
+
+def _log_volume(elevation: Tensor) -> Tensor:
+    return torch.log(torch.cos(elevation).abs()) - math.log(VOLUME)
+
+
+@marginal.register
+def _(density: MatrixFisher, index: int) -> Angle:
+    return Angle(density, index)
+
+
+@pick.register
+def _(density: MatrixFisher, index: Tensor) -> MatrixFisher:
+    chosen = take(density.parameter.flatten(-2), index).unflatten(-1, (3, 3))
+    return MatrixFisher(chosen, density.dtype)
+
+
+@tempered.register
+def _(density: MatrixFisher, temperature: Tensor) -> MatrixFisher:
+    """The power of the density of rotations, exp(tr(FᵀR))^(1/T): with F/T. Its viewpoint's density keeps the factor
+    cos e of the chart as it is, which is no one's belief."""
+    return MatrixFisher(density.parameter / temperature, density.dtype)

@@ -1,0 +1,74 @@
+"""The matrix Fisher head: nine numbers, one density over viewpoints."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.density_head import DensityHead
+from framework.errors import ConfigError
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.density_head.matrix_fisher.density import MatrixFisher
+
+ANGLES = ("azimuth", "elevation", "tilt")
+LARGEST_PARAMETER = 1e12
+"""Largest |F|: standard deviations of a microradian; float32 angles resolve no more."""
+
+
+class MatrixFisherHead(DensityHead):
+    """One matrix Fisher density of the rotation, azimuth, elevation and tilt jointly.
+
+    The joint density that the thesis leaves to future work (§3.7), with a network as in Mohlin et al. 2020.
+
+    Reads the nine elements of a matrix X, row by row, of which F is a multiple that grows faster than X
+    (`parameter_of_raw`). F is the density's natural parameter, so that the uniform density of rotations, X = 0, is a
+    point like any other.
+
+    Raises:
+        ConfigError: the target is not azimuth, elevation and tilt, in this order.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@inproceedings{mohlin2020probabilistic,
+  title = {Probabilistic Orientation Estimation with Matrix Fisher Distributions},
+  author = {Mohlin, David and Sullivan, Josephine and Bianchi, G{\\'e}rald},
+  booktitle = {Advances in Neural Information Processing Systems (NeurIPS)},
+  year = {2020}
+}"""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("angle", by="density_head matrix_fisher")
+        if target.names != ANGLES:
+            raise ConfigError(
+                f"density_head matrix_fisher describes rotations by the three angles {', '.join(ANGLES)}, in this "
+                f"order; this data set's targets are {target.told}. Choose another density_head, or "
+                "other data; von_mises describes any angles."
+            )
+        self.size = 9
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> MatrixFisher:
+        raw = require_finite(raw, self.size)
+        return MatrixFisher(parameter_of_raw(raw.unflatten(-1, (3, 3))), raw.dtype)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        pass  # everything is trained
+
+
+def parameter_of_raw(raw: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """F = X (1 + |X|²/16)^(3/2), float64, at most LARGEST_PARAMETER in the Frobenius norm |F|.
+
+    F = X near 0, and |F| grows with the fourth power: a concentration of 1e4 is as near as |X| = 27, and no gradient
+    explodes. Smooth at 0, since only |X|² is read.
+    """
+    raw = raw.double().clamp(-1e100, 1e100)  # so that squares do not overflow
+    square = raw.square().sum((-2, -1), keepdim=True)
+    growth = (1 + square / 16) ** 1.5
+    # the norm is at least 1 where the bound is felt, and its root has no gradient at 0
+    return raw * torch.minimum(growth, LARGEST_PARAMETER / square.clamp(min=1).sqrt())

@@ -1,0 +1,97 @@
+"""Unit quaternions (…, 4), real part first: rotations of which the small ones lose no digits. q and -q are the same.
+
+A viewpoint's rotation is framework.geometry.rotation.viewpoint_rotation: Rz(tilt) Rx(elevation - π/2) Rz(-azimuth).
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Quaternions = Float[Tensor, "... 4"]
+"""Batch shapes broadcast."""
+
+
+def product(first: Quaternions, second: Quaternions) -> Quaternions:
+    """The quaternion of the rotation `first` after the rotation `second`; batch shapes broadcast."""
+    a, b, c, d = first.unbind(-1)
+    e, f, g, h = second.unbind(-1)
+    return torch.stack(
+        [
+            a * e - b * f - c * g - d * h,
+            a * f + b * e + c * h - d * g,
+            a * g - b * h + c * e + d * f,
+            a * h + b * g - c * f + d * e,
+        ],
+        -1,
+    )
+
+
+def inverse(turn: Quaternions) -> Quaternions:
+    """The quaternion of the inverse rotation."""
+    return torch.cat([turn[..., :1], -turn[..., 1:]], -1)
+
+
+def about(axis: int, angle: Float[Tensor, "..."]) -> Quaternions:
+    """The rotation by `angle`, radians, about the axis 1 (x), 2 (y) or 3 (z)."""
+    numbers = [torch.zeros_like(angle)] * 4
+    numbers[0], numbers[axis] = torch.cos(angle / 2), torch.sin(angle / 2)
+    return torch.stack(numbers, -1)
+
+
+def of_viewpoint(angles: Float[Tensor, "... 3"]) -> Quaternions:
+    """The rotation of azimuth, elevation and tilt, radians."""
+    azimuth, elevation, tilt = angles.unbind(-1)
+    half, sum_, difference = elevation / 2 - math.pi / 4, (tilt + azimuth) / 2, (tilt - azimuth) / 2
+    cosine, sine = torch.cos(half), torch.sin(half)
+    return torch.stack(
+        [
+            cosine * torch.cos(difference),
+            sine * torch.cos(sum_),
+            sine * torch.sin(sum_),
+            cosine * torch.sin(difference),
+        ],
+        -1,
+    )
+
+
+def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
+    """Azimuth and tilt in [-π, π], elevation in [-π/2, π/2], radians; at the poles one of the many."""
+    real, x, y, z = turn.unbind(-1)
+    elevation = math.pi / 2 - 2 * torch.atan2(torch.hypot(x, y), torch.hypot(real, z))
+    # of_viewpoint read backwards; in the chart its sine is never positive and its cosine never negative
+    difference, sum_ = torch.atan2(z, real), torch.atan2(-y, -x)
+    azimuth, tilt = sum_ - difference, sum_ + difference
+    turn_ = 2 * math.pi
+    azimuth, tilt = (angle - turn_ * torch.round(angle / turn_) for angle in (azimuth, tilt))
+    return torch.stack([azimuth, elevation, tilt], -1)
+
+
+def of_matrix(matrix: Float[Tensor, "... 3 3"]) -> Quaternions:
+    """The quaternion of a rotation matrix, to full precision at any angle."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
+    # 4 q qᵀ; its row of the largest diagonal element, at least 1, is q but for its length
+    rows = torch.stack(
+        [
+            torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
+            torch.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
+            torch.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
+            torch.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
+        ],
+        -2,
+    )
+    best = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = rows.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    return row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+
+
+def matrix_less_identity(turn: Quaternions) -> Float[Tensor, "... 3 3"]:
+    """R - I: of small rotations without cancellation."""
+    w, x, y, z = turn.unbind(-1)
+    rows = [
+        torch.stack([-2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), -2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), -2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)

@@ -1,0 +1,73 @@
+"""The finite mixture head."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.density_head import DensityHead
+from framework.distributions.density import Mixture
+from framework.heads.parameters import require_finite, require_trained
+from framework.target import Target
+
+MODERATE = {"name": "von_mises", "floor": 1.0}
+"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
+
+
+class MixtureHead(DensityHead):
+    """Finite mixture of any other head's densities, weights by softmax (thesis eq. 3.10-3.11).
+
+    Reads K logits, then K times what the component reads, then that once more, which is added to all K: what every
+    component must know is learnt by all at once, and none falls behind (README). A component that is fitted after
+    training (it keeps a buffer) is refused, because which data belongs to it is not known.
+
+    Args:
+        components: K. With 1 the density is the component, to the last bit.
+        component: the head whose densities are mixed.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@techreport{bishop1994mixture,
+  title = {Mixture Density Networks},
+  author = {Bishop, Christopher M.},
+  institution = {Aston University},
+  number = {NCRG/94/004},
+  year = {1994}
+}"""
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        components: Annotated[int, Field(ge=1)] = 5,
+        component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
+    ) -> None:
+        super().__init__()
+        self.components = components
+        self.component = require_trained(component)
+        self.size = components * (component.size + 1)
+        if components > 1:
+            # the numbers all components have in common, and what makes them differ from the first step
+            self.size += component.size
+            self.spread = nn.Parameter(torch.randn(components, component.size))
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Mixture:
+        raw = require_finite(raw, self.size)
+        own = self.components * self.component.size
+        logits, apart, common = raw.tensor_split([self.components, self.components + own], -1)
+        numbers = apart.unflatten(-1, (self.components, self.component.size))
+        if self.components > 1:
+            most = torch.finfo(raw.dtype).max / 4  # so that the sum does not overflow
+            numbers = (
+                numbers.clamp(-most, most) + common.clamp(-most, most).unsqueeze(-2) + self.spread.to(raw)
+            )
+        return Mixture(logits, self.component(numbers))
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        pass  # everything is trained

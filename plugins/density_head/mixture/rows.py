@@ -1,0 +1,68 @@
+"""Rows of the contract: finite mixtures, with log-densities summed in NumPy from the head's own numbers."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from scipy import special
+
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.rows import Case, HeadRow
+from plugins.density_head.mixture.head import MixtureHead
+
+ONE = Target("angle", ("azimuth",))
+TWO = Target("angle", ("azimuth", "elevation"))
+VIEWPOINT = Target("angle", ("azimuth", "elevation", "tilt"))
+CLASSES = Target("class", ("a", "b", "c"))
+NESTED = {"components": 2, "component": {"name": "mixture", "components": 3}}
+
+
+def component(head: MixtureHead, number: np.ndarray, value: np.ndarray) -> float:
+    """One component's log-density; its own rows check it."""
+    return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
+
+
+def by_hand(head: MixtureHead, raw: np.ndarray, value: np.ndarray) -> float:
+    """log Σ_k w_k p_k (eq. 3.10), the largest term taken out."""
+    count, each = head.components, head.component.size
+    numbers = raw[count : count + count * each].reshape(count, each)
+    if count > 1:
+        numbers = numbers + raw[-each:] + head.spread.detach().numpy()
+    terms = [component(head, number, value) for number in numbers]
+    return float(np.logaddexp.reduce(np.array(terms) + special.log_softmax(raw[:count])))
+
+
+def stiff(head: DensityHead) -> Iterator[Case]:
+    """Ordinary raw numbers, weights that vanish, components far narrower than their distance, far outliers."""
+    assert isinstance(head, MixtureHead)
+    generator = torch.Generator().manual_seed(7)
+    ordinary = torch.randn(6, head.size, generator=generator)
+    value = 3 * torch.randn(6, head.component.size // 3, generator=generator)
+    lopsided, narrow = ordinary.clone(), ordinary.clone()
+    lopsided[:, 0] += 1e4
+    narrow[:, head.components :] *= 30
+    for name, raw in {"ordinary": ordinary, "weights vanish": lopsided, "narrow": narrow}.items():
+        raw, target = raw.double(), value.double()
+        rows = zip(raw.numpy(), target.numpy(), strict=True)
+        log_prob = torch.tensor([by_hand(head, *row) for row in rows], dtype=torch.float64)
+        yield Case(name, raw, target, log_prob)
+
+
+ROWS = {
+    "mixture": (
+        HeadRow("five components", ONE, cases=stiff, scale=3.0),
+        HeadRow("one component", ONE, {"components": 1}, cases=stiff, scale=3.0),
+        HeadRow("two angles", TWO, {"components": 3}, cases=stiff),
+        HeadRow("mixture of mixtures", ONE, NESTED),
+        HeadRow(
+            "rotations",
+            VIEWPOINT,
+            {"components": 2, "component": {"name": "matrix_fisher"}},
+            leave_out={
+                "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles"
+            },
+        ),
+        HeadRow("classes", CLASSES, {"component": {"name": "categorical"}}),
+    )
+}

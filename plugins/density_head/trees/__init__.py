@@ -1,0 +1,1 @@
+"""Trees as density heads: extremely randomised and gradient boosted."""

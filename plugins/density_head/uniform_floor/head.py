@@ -1,0 +1,76 @@
+"""A declared uniform floor under any bounded density."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.density_head import DensityHead
+from framework.errors import ConfigError
+from framework.heads.parameters import require_trained
+from framework.target import Target
+from plugins.density_head.uniform_floor.density import Floored
+
+COMPONENT = {"name": "von_mises"}
+
+
+class UniformFloorHead(DensityHead):
+    """A declared uniform floor under a component's density: (1 - γ) p + γ u, so that no target is impossible.
+
+    No loss exceeds log(1/(γu)). The authors' original code adds such a floor to its mixtures without a word. Here it
+    is a head of its own: it stands in the config, in the run's parameters and in the method's name, and with γ = 0 it
+    is its component.
+
+    Args:
+        weight: γ.
+        component: the head under whose density the floor lies.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@inproceedings{prokudin2018deep,
+  title = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
+  author = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  booktitle = {European Conference on Computer Vision (ECCV)},
+  year = {2018}
+}"""
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        weight: Annotated[float, Field(ge=0, lt=1)] = 1e-3,
+        component: DensityHead = COMPONENT,  # pyright: ignore[reportArgumentType]  # built by the framework
+    ) -> None:
+        super().__init__()
+        if target.kind == "real":
+            raise ConfigError(
+                "density_head uniform_floor needs a bounded target; no density is uniform over the reals "
+                f"({target.told}). Choose the component itself, with its own floor."
+            )
+        self.weight = weight
+        self.component = require_trained(component)
+        self.size = component.size
+        # nats; the density of the uniform distribution over classes, or over angles
+        count = len(target.names)
+        self.log_uniform = -math.log(count) if target.kind == "class" else -count * math.log(2 * math.pi)
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        density = self.component(raw)
+        return Floored(density, self.weight, self.log_uniform) if self.weight > 0 else density
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        if self.weight == 0:
+            return self.component.loss(raw, target)
+        # a variational component's loss is a bound, under which the floor lies as under a density
+        return -torch.logaddexp(
+            math.log1p(-self.weight) - self.component.loss(raw, target),
+            torch.full((), math.log(self.weight) + self.log_uniform, dtype=raw.dtype, device=raw.device),
+        )
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        pass  # everything is trained

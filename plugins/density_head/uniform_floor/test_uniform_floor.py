@@ -1,0 +1,58 @@
+import math
+
+import pytest
+import torch
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError
+from framework.target import Target
+from plugins.density_head.uniform_floor.rows import CLASSES, ONE, THREE
+
+
+def head(config, target):
+    return build("density_head", resolve("density_head", {"name": "uniform_floor", **config}), target=target)
+
+
+@pytest.mark.parametrize("target, volume", [(ONE, 2 * math.pi), (THREE, (2 * math.pi) ** 3), (CLASSES, 3)])
+def test_log_prob_is_the_weighted_sum(target, volume):
+    component = {"name": "categorical"} if target is CLASSES else {"name": "von_mises"}
+    made = head({"weight": 0.2, "component": component}, target)
+    raw = torch.randn(50, made.size)
+    value = torch.randint(3, (50,)) if target is CLASSES else 3 * torch.randn(50, len(target.names))
+    wanted = (0.8 * made.component(raw).log_prob(value).exp() + 0.2 / volume).log()
+    torch.testing.assert_close(made(raw).log_prob(value), wanted)
+    torch.testing.assert_close(made.loss(raw, value), -wanted)
+
+
+def test_without_weight_it_is_its_component_to_the_last_bit():
+    made = head({"weight": 0.0}, THREE)
+    raw, value = torch.randn(8, made.size), torch.randn(8, 3)
+    assert torch.equal(made(raw).log_prob(value), made.component(raw).log_prob(value))
+    assert torch.equal(made.loss(raw, value), made.component.loss(raw, value))
+
+
+def test_an_outlier_costs_no_more_than_the_floor_and_pulls_at_nothing():
+    made = head({"weight": 1e-3}, ONE)
+    raw = torch.tensor([[1e12, 0.0, 1e3]], requires_grad=True)
+    loss = made.loss(raw, torch.tensor([[3.0]]))
+    loss.sum().backward()
+    assert loss.item() == pytest.approx(math.log(2 * math.pi / 1e-3))
+    assert torch.equal(raw.grad, torch.zeros(1, 3))
+
+
+def test_samples_of_classes_reach_every_class():
+    made = head({"weight": 0.3, "component": {"name": "categorical"}}, CLASSES)
+    torch.manual_seed(0)
+    drawn = made(torch.tensor([[100.0, 0.0, 0.0]])).sample((9000,))
+    assert (drawn == 2).double().mean().item() == pytest.approx(0.1, abs=4 * 0.3 / 9000**0.5)
+
+
+def test_reals_have_no_uniform_density():
+    with pytest.raises(ConfigError, match="no density is uniform over the reals"):
+        head({"component": {"name": "gaussian"}}, Target("real", ("x",)))
+
+
+@pytest.mark.parametrize("weight", [-0.1, 1.0, float("nan")])
+def test_a_weight_out_of_range_is_refused(weight):
+    with pytest.raises(ConfigError, match=r"density_head\.weight"):
+        head({"weight": weight}, ONE)

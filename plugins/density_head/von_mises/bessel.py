@@ -1,0 +1,89 @@
+"""The Bessel functions I0 and I1 as the von Mises density needs them, by the polynomials of coefficients.py."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from plugins.density_head.von_mises.coefficients import CHAINS, TABLES
+
+_TABLES = {
+    (getattr(torch, dtype), name): torch.tensor(rows, dtype=getattr(torch, dtype), device="cpu")
+    for dtype, functions in TABLES.items()
+    for name, rows in functions.items()
+}
+
+
+def log_height(concentration: Tensor) -> Tensor:
+    return torch.log(concentration + 2) / 2 - polynomial("log_peak", 2 / (concentration + 2))
+
+
+def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
+    """log_peak and its derivative 1 - A = v (1/4 + v G'(v)/2), G the polynomial, in one pass."""
+    v = 2 / (concentration + 2)
+    rows, piece, y, by_v = _place("log_peak", v)
+    total = _coefficient(rows[-1], piece, y)
+    slope = torch.zeros_like(total)
+    for row in range(len(rows) - 2, -1, -1):
+        slope = torch.addcmul(total, slope, y)
+        total = _fused(_coefficient(rows[row], piece, y), total, y)
+    return torch.log(concentration + 2) / 2 - total, v * (0.25 + v * (slope * (by_v / 2)))
+
+
+def deviation_of(concentration: Tensor) -> Tensor:
+    return height_and_deviation(concentration)[1]
+
+
+def polynomial(name: str, v: Tensor) -> Tensor:
+    """One of the smooth functions of v = 2/(κ+2) in fit_coefficients.py."""
+    rows, piece, y, _ = _place(name, v)
+    total = _coefficient(rows[-1], piece, y)
+    for row in range(len(rows) - 2, -1, -1):
+        total = _fused(_coefficient(rows[row], piece, y), total, y)
+    return total
+
+
+def _place(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
+    """A function's rows of coefficients, v's piece of [0, 1], its place y ∈ [-1, 1] there, and dy/dv.
+
+    Compiled, float32 has few pieces, among whose coefficients comparisons choose; otherwise there is a table.
+    """
+    if v.dtype == torch.float32 and torch.compiler.is_compiling():
+        borders, rows = CHAINS[name]
+        beyond = tuple(v >= border for border in borders[1:-1])
+        spans = list(pairwise(borders))
+        middle = _chosen([(low + high) / 2 for low, high in spans], beyond, v)
+        slope = _chosen([2 / (high - low) for low, high in spans], beyond, v)
+        return rows, beyond, (v - middle) * slope, slope
+    rows = _TABLES[v.dtype, name].to(v.device)
+    pieces = rows.shape[1]
+    place = v * pieces
+    # nan has no piece: it takes one, and stays nan in y
+    piece = place.detach().to(torch.int32).clamp_(0, pieces - 1)
+    return rows, piece, 2 * (place - piece) - 1, 2 * pieces
+
+
+def _chosen(values: Sequence[float], beyond: tuple[Tensor, ...], like: Tensor) -> Tensor:
+    """The value of the last border that is passed."""
+    found = torch.full_like(like, values[0])
+    for passed, value in zip(beyond, values[1:], strict=True):
+        found = torch.where(passed, value, found)
+    return found
+
+
+def _coefficient(row: Any, piece: Any, like: Tensor) -> Tensor:
+    if isinstance(piece, tuple):
+        return _chosen(row, piece, like)
+    if torch.compiler.is_compiling():
+        return row[piece]
+    # the same in a quarter of the time where nothing is compiled
+    return row.index_select(0, piece.reshape(-1)).view(piece.shape)
+
+
+def _fused(coefficient: Tensor, total: Tensor, y: Tensor) -> Tensor:
+    """coefficient + total y, in the coefficient's own place where nobody else reads it."""
+    if torch.compiler.is_compiling() or (torch.is_grad_enabled() and total.requires_grad | y.requires_grad):
+        return torch.addcmul(coefficient, total, y)
+    return coefficient.addcmul_(total, y)

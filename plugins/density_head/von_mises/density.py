@@ -1,0 +1,93 @@
+"""Independent von Mises angles as a torch distribution."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution, constraints, register_kl
+
+from framework.distributions.cdf import arc, turn
+from framework.distributions.density import circular, marginal, median, pick, take
+from framework.distributions.tempering import tempered
+from plugins.density_head.von_mises import functions, integrals
+
+
+class VonMises(Distribution):
+    """Angles, each von Mises, independent of one another given their parameters (thesis eq. 3.3).
+
+    Args:
+        mean: (*batch, angle), radians, read modulo 2π.
+        concentration: (*batch, angle), κ ≥ 0; 0 is the uniform density.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = False
+
+    def __init__(
+        self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]
+    ) -> None:
+        self.location = mean
+        self.concentration = concentration
+        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return circular
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean direction."""
+        return self.location
+
+    @property
+    def mode(self) -> Tensor:
+        return self.location
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return functions.log_prob(value, self.location, self.concentration).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = self._extended_shape(torch.Size(sample_shape))
+        return functions.sample(self.location.expand(shape), self.concentration.expand(shape))
+
+    def entropy(self) -> Tensor:
+        return functions.entropy(self.concentration).sum(-1)
+
+
+@marginal.register
+def _(density: VonMises, index: int) -> VonMises:
+    here = slice(index, index + 1)
+    return VonMises(density.location[..., here], density.concentration[..., here])
+
+
+@pick.register
+def _(density: VonMises, index: Tensor) -> VonMises:
+    return VonMises(take(density.location, index), take(density.concentration, index))
+
+
+@median.register
+def _(density: VonMises, samples: int) -> Tensor:
+    # symmetric about its mean and falling on both sides of it
+    return density.location
+
+
+@tempered.register
+def _(density: VonMises, temperature: Tensor) -> VonMises:
+    # exp(κ cos)^(1/T) = exp(κ/T cos)
+    return VonMises(density.location, density.concentration / temperature)
+
+
+@register_kl(VonMises, VonMises)
+def _(first: VonMises, second: VonMises) -> Tensor:
+    parts = integrals.kl_divergence(
+        first.location, first.concentration, second.location, second.concentration
+    )
+    return parts.sum(-1)
+
+
+@arc.register
+def _(density: VonMises, start: Tensor, end: Tensor) -> Tensor:
+    mean, concentration = density.location.double(), density.concentration.double()
+    first = start.double()
+    before = integrals.cdf(first, mean, concentration)
+    through = integrals.cdf(first + turn(start, end), mean, concentration)
+    return (through - before).squeeze(-1).clamp(0, 1)

@@ -1,0 +1,183 @@
+"""Writes coefficients.py: run by hand, `python -m plugins.density_head.von_mises.fit_coefficients`; needs mpmath.
+
+Every function below is smooth on κ ∈ [0, ∞] as a function of v = 2/(κ+2) ∈ [0, 1]. That interval is cut into
+equal pieces, as many as a power of two, so that v's piece and its place y ∈ [-1, 1] there are found without rounding.
+On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial in y; the
+tolerance holds for the polynomial's first derivative in v too, from which 1 - A(κ) is computed.
+"""
+
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import mpmath
+
+mpmath.mp.dps = 60
+Real = Any  # an mpmath number: the package declares no types
+NAMES = ("log_peak", "ratio", "ratio_slope")
+PIECES = {"float32": 32, "float64": 64}
+BORDERS = ("0", "0.125", "0.3125", "0.625", "1")
+CHAIN_TOLERANCE = mpmath.mpf("4e-8")
+"""Of the few pieces of compiled float32; near 0 they are shorter, since the singularities of log I0 gather there."""
+TOLERANCE = {"float32": mpmath.mpf("1e-8"), "float64": mpmath.mpf("2e-17")}
+NODES = 24
+QUADRATURES = (14, 40)
+
+
+def bessel(kappa: Real) -> tuple[Real, Real]:
+    """log(I0(κ) exp(-κ)) and 1 - I1(κ)/I0(κ); by asymptotic series (DLMF 10.40.1) where it has 60 digits."""
+    if kappa < 400:
+        zero, one = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
+        return mpmath.log(zero) - kappa, 1 - one / zero
+    zero, one = (_hankel_series(order, kappa) for order in (0, 1))
+    return mpmath.log(zero) - mpmath.log(2 * mpmath.pi * kappa) / 2, (zero - one) / zero
+
+
+def _hankel_series(order: int, kappa: Real) -> Real:
+    """√(2πκ) exp(-κ) I_order(κ)."""
+    total = term = mpmath.mpf(1)
+    for j in range(1, 400):
+        term *= -mpmath.mpf(4 * order**2 - (2 * j - 1) ** 2) / (8 * j * kappa)
+        total += term
+        if abs(term) < mpmath.mpf(10) ** -70:
+            break
+    return total
+
+
+@cache
+def smooth(v: Real) -> tuple[Real, ...]:
+    """The three functions at v, in the order of NAMES, with A = I1/I0:
+
+    log(2π I0(κ) exp(-κ)) + log(κ+2)/2;  A (κ+2)/κ;  A' (κ+2)²/2 with A' = 1 - A² - A/κ.
+    """
+    if v == 0:
+        return mpmath.log(2 * mpmath.pi) / 2, mpmath.mpf(1), mpmath.mpf(1) / 4
+    kappa = 2 / v - 2
+    if kappa == 0:
+        return mpmath.log(2 * mpmath.pi) + mpmath.log(2) / 2, mpmath.mpf(1), mpmath.mpf(1)
+    log_scaled, complement = bessel(kappa)
+    ratio = 1 - complement
+    slope = 1 - ratio**2 - ratio / kappa
+    return (
+        mpmath.log(2 * mpmath.pi) + log_scaled + mpmath.log(kappa + 2) / 2,
+        ratio * (kappa + 2) / kappa,
+        slope * (kappa + 2) ** 2 / 2,
+    )
+
+
+def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
+    """Of one function on [low, high] of v, by interpolation at NODES Chebyshev nodes."""
+    angles = [mpmath.pi * (2 * i + 1) / (2 * NODES) for i in range(NODES)]
+    values = [smooth((low + high) / 2 + (high - low) / 2 * mpmath.cos(angle))[which] for angle in angles]
+    return [
+        mpmath.mpf(2 if j else 1)
+        / NODES
+        * mpmath.fsum(value * mpmath.cos(j * angle) for value, angle in zip(values, angles, strict=True))
+        for j in range(NODES)
+    ]
+
+
+def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
+    """The least at which the rest is within the tolerance and its derivative in v within four times as much.
+
+    1 - A takes at most half of the derivative and is at least a quarter where it takes any.
+    """
+    return next(
+        d
+        for d in range(NODES)
+        if sum(abs(c) for c in series[d + 1 :]) < tolerance
+        and sum(2 * pieces * j * j * abs(series[j]) for j in range(d + 1, NODES)) < 4 * tolerance
+    )
+
+
+def powers(series: list[Real]) -> list[Real]:
+    """Coefficients of 1, y, y², … of a Chebyshev series in y."""
+    found = [mpmath.mpf(0)] * len(series)
+    before, current = [mpmath.mpf(1)], [mpmath.mpf(0), mpmath.mpf(1)]
+    for j, weight in enumerate(series):
+        if j >= 2:
+            following = [mpmath.mpf(0)] + [2 * c for c in current]
+            for i, c in enumerate(before):
+                following[i] -= c
+            before, current = current, following
+        for i, c in enumerate(before if j == 0 else current):
+            found[i] += weight * c
+    return found
+
+
+def table(dtype: str, which: int) -> list[tuple[float, ...]]:
+    """Row j: the coefficient of y^j on each piece, v ascending; all pieces have the degree of the hardest."""
+    count = PIECES[dtype]
+    edges = [mpmath.mpf(i) / count for i in range(count + 1)]
+    series = [chebyshev_series(low, high, which) for low, high in pairwise(edges)]
+    highest = max(degree(one, count, TOLERANCE[dtype]) for one in series)
+    columns = [powers(one[: highest + 1]) for one in series]
+    return [tuple(float(column[j]) for column in columns) for j in range(highest + 1)]
+
+
+def chain(which: int) -> list[tuple[float, ...]]:
+    """Row j: the coefficient of y^j on each piece between BORDERS, for float32; all have the degree of the hardest."""
+    spans = list(pairwise(mpmath.mpf(border) for border in BORDERS))
+    series = [chebyshev_series(low, high, which) for low, high in spans]
+    highest = max(
+        degree(one, 1 / (high - low), CHAIN_TOLERANCE) for one, (low, high) in zip(series, spans, strict=True)
+    )
+    columns = [powers(one[: highest + 1]) for one in series]
+    return [tuple(float(column[j]) for column in columns) for j in range(highest + 1)]
+
+
+def gauss_legendre(count: int) -> list[tuple[float, float]]:
+    """(place, weight) on [0, 1], by Newton's method in 60 digits: in float64 the outer weights lose two of theirs."""
+    found = []
+    for i in range(count):
+        x = mpmath.cos(mpmath.pi * (i + mpmath.mpf("0.75")) / (count + mpmath.mpf("0.5")))
+        slope = mpmath.mpf(1)
+        for _ in range(8):
+            before, here = mpmath.mpf(1), x  # Legendre polynomials (DLMF 18.9.1)
+            for n in range(1, count):
+                before, here = here, ((2 * n + 1) * x * here - n * before) / (n + 1)
+            slope = count * (x * here - before) / (x * x - 1)
+            x -= here / slope
+        found.append((float((1 - x) / 2), float(1 / ((1 - x * x) * slope**2))))
+    return found
+
+
+def main() -> None:
+    lines = [
+        '"""Written by fit_coefficients.py; do not edit.',
+        "",
+        "Per dtype and function: row j holds the coefficient of y^j on each piece of v, v ascending.",
+        "CHAINS: float32 on few unequal pieces, (borders of v, rows).",
+        "NODES: places and weights of Gauss-Legendre quadrature on [0, 1].",
+        '"""',
+        "",
+        "# fmt: off",
+        "TABLES: dict[str, dict[str, tuple[tuple[float, ...], ...]]] = {",
+    ]
+    for dtype in PIECES:
+        lines.append(f"    {dtype!r}: {{")
+        for which, name in enumerate(NAMES):
+            lines.append(f"        {name!r}: (")
+            for row in table(dtype, which):
+                cells = [f"{number!r}," for number in row]
+                lines.append("            (")
+                lines += [f"                {' '.join(cells[i : i + 3])}" for i in range(0, len(cells), 3)]
+                lines.append("            ),")
+            lines.append("        ),")
+        lines.append("    },")
+    lines += ["}", "CHAINS: dict[str, tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]] = {"]
+    for which, name in enumerate(NAMES):
+        borders = ", ".join(repr(float(border)) for border in BORDERS)
+        lines += [f"    {name!r}: (", f"        ({borders}),", "        ("]
+        lines += [f"            {row!r}," for row in chain(which)]
+        lines += ["        ),", "    ),"]
+    lines += ["}", "NODES: dict[int, tuple[tuple[float, float], ...]] = {"]
+    for count in QUADRATURES:
+        lines += [f"    {count}: (", *(f"        {pair!r}," for pair in gauss_legendre(count)), "    ),"]
+    lines.append("}")
+    Path(__file__).with_name("coefficients.py").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""The von Mises density p(φ) = exp(κ cos(φ-μ)) / (2π I0(κ)) (thesis eq. 3.3), accurate from κ = 0 to 1e30.
+
+Nothing here subtracts two large numbers that nearly agree: the density is written as its height at the mean
+times exp(-2κ sin²((φ-μ)/2)), and the Bessel functions come from polynomials (coefficients.py) of what stays
+smooth from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0.
+
+The density's value and slopes come from one pass, also under torch.compile; without a compiler the pass runs in
+blocks that fit a processor's cache. The difference of the angles is in angles.py, the Bessel functions in bessel.py,
+integrals of the density in integrals.py.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from plugins.density_head.von_mises.angles import half_angle, half_products, in_single, parts_in_single
+from plugins.density_head.von_mises.bessel import deviation_of, height_and_deviation, log_height, polynomial
+from plugins.density_head.von_mises.blocks import BLOCK, in_blocks
+
+SAMPLING_ROUNDS = 64
+"""At least 65.7 % of proposals are accepted: after 64 rounds fewer than one lane in 10^29 is left."""
+
+
+def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
+    """Log-density, nats, with accurate gradients in all three arguments, also the second ones.
+
+    The difference φ-μ is never rounded: angles of up to 4e8 radians are read modulo 2π exactly, beyond that to one
+    unit of their rounding.
+    """
+    dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
+    value, mean, concentration = value.to(dtype), mean.to(dtype), concentration.to(dtype)
+    if torch.is_grad_enabled() and (value.requires_grad or mean.requires_grad or concentration.requires_grad):
+        return _LogProb.apply(value, mean, concentration)[0]
+    return in_blocks(_value, value, mean, concentration)[0]
+
+
+def log_prob_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """log p, its derivative in the mean, κ sin(φ-μ), and in κ, 1 - A(κ) - 2 sin²((φ-μ)/2), in one pass.
+
+    For arguments of one number type, without gradient of its own: what `log_prob` computes under gradient. Compiled,
+    it is one loop, while a compiler splits the gradient of `log_prob` in two that compute much of the same.
+    """
+    return _value_and_slopes(value, mean, concentration)
+
+
+def log_peak(concentration: Tensor) -> Tensor:
+    """Log-density at the mean, κ - log(2π I0(κ)), nats."""
+    return _LogPeak.apply(concentration)
+
+
+def mean_resultant(concentration: Tensor) -> Tensor:
+    """A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision at both ends."""
+    return _Ratio.apply(concentration)
+
+
+def mean_deviation(concentration: Tensor) -> Tensor:
+    """1 - A(κ) = E 2 sin²((φ-μ)/2), to full relative precision at both ends."""
+    return _OneMinusRatio.apply(concentration)
+
+
+def entropy(concentration: Tensor) -> Tensor:
+    """κ(1 - A(κ)) - log_peak(κ), nats; its derivative is -κ A'(κ)."""
+    return _Entropy.apply(concentration)
+
+
+def mean_resultant_slope(concentration: Tensor) -> Tensor:
+    """A'(κ) = 1 - A² - A/κ (Mardia & Jupp 2000, A.14), the Fisher information of κ."""
+    part = 2 / (concentration + 2)
+    return polynomial("ratio_slope", part) * part * part / 2
+
+
+@torch.no_grad()
+def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
+    """κ with A(κ) = resultant: the maximum-likelihood κ of angles about a known mean (eq. 3.5), float64.
+
+    Args:
+        resultant: R, the mean of cos(φ-μ); below 0 it is answered with κ = 0.
+        deviation: V = 1 - R, the mean of 2 sin²((φ-μ)/2), given beside it because R carries no digits of a
+            large κ and V none of a small one. 0 is answered with infinity.
+    """
+    resultant, deviation = resultant.double().clamp(min=0), deviation.double()
+    spread_out = resultant < 0.5
+    # starts within 10 %: the series of the inverse at R = 0 and V = 0 (Mardia & Jupp 2000, 5.3.9-10)
+    small = resultant * (2 + resultant**2 + 5 / 6 * resultant**4)
+    concentration = torch.where(spread_out, small, 0.5 / deviation + 0.25)
+    tiny = torch.finfo(torch.float64).tiny
+    for _ in range(8):  # Newton on logarithms, where both branches are nearly straight: 4 steps suffice
+        wanted = torch.where(spread_out, resultant, deviation)
+        have = torch.where(spread_out, mean_resultant(concentration), mean_deviation(concentration))
+        error = torch.log1p((have - wanted) / wanted.clamp(min=tiny))
+        slope = concentration * mean_resultant_slope(concentration) / have
+        step = error / torch.where(spread_out, slope, -slope)
+        # the two ends have no logarithm: they are right already
+        step = torch.where((concentration > 0) & concentration.isfinite(), step, 0)
+        concentration = concentration * torch.exp(-step)
+    return concentration
+
+
+@torch.no_grad()
+def sample(mean: Tensor, concentration: Tensor) -> Tensor:
+    """One angle in [-π, π] per element, by rejection (Best & Fisher 1979), float64 inside.
+
+    Best and Fisher propose from a wrapped Cauchy of the same peak; with t = tan(θ/2) its proposal is
+    t = (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ.
+    Lanes that have not accepted after SAMPLING_ROUNDS keep their last proposal: no input can hang the loop.
+    """
+    mean, concentration = torch.broadcast_tensors(mean, concentration)
+    kappa = concentration.double().flatten()
+    block = BLOCK if kappa.device.type == "cpu" else max(1, kappa.numel())
+    half_tangent = torch.cat([_half_tangent(part) for part in kappa.split(block)])
+    angle = mean.double() + 2 * torch.atan(half_tangent).reshape(mean.shape)
+    wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+    # angles that need no wrapping keep their last digits
+    return torch.where(angle.abs() <= math.pi, angle, wrapped).to(mean.dtype)
+
+
+def _half_tangent(kappa: Tensor) -> Tensor:
+    """tan(θ/2) of one accepted proposal per lane."""
+    root = torch.hypot(torch.ones_like(kappa), 2 * kappa)
+    tau = 1 + root
+    span = tau + torch.sqrt(2 * tau)  # 2κ/ρ
+    gap = (1 + 1 / (root + 2 * kappa) + torch.sqrt(2 * tau)) / span  # 1 - ρ
+    scale = gap / (1 + 2 * kappa / span)
+    floor = gap * gap * span / 4  # κ(r-1) with r = (1+ρ²)/(2ρ)
+    half_tangent, rejected = _propose(kappa, scale, floor)
+    lanes = rejected.nonzero().flatten()
+    for _ in range(SAMPLING_ROUNDS - 1):
+        if lanes.numel() == 0:
+            break
+        half_tangent[lanes], rejected = _propose(kappa[lanes], scale[lanes], floor[lanes])
+        lanes = lanes[rejected]
+    return half_tangent
+
+
+def _propose(kappa: Tensor, scale: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
+    """tan(θ/2) of one wrapped Cauchy proposal per lane, and whether it is rejected."""
+    uniform, accept = torch.rand(2, kappa.numel(), dtype=kappa.dtype, device=kappa.device)
+    tangent = scale * torch.tan(math.pi * (uniform - 0.5))
+    square = tangent * tangent
+    cost = floor + kappa * (2 * square / (1 + square))
+    return tangent, ~(accept < cost * torch.exp(1 - cost))
+
+
+def _value(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor]:
+    if in_single(value, mean):
+        sine, cosine, small_sine, small_cosine = parts_in_single(value, mean)
+        square = (sine * small_cosine + cosine * small_sine).square()
+    else:
+        square, _ = half_products(value, mean)
+    return (log_height(concentration) - 2 * concentration * square,)
+
+
+def _value_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    square, product = half_products(value, mean)
+    height, deviation = height_and_deviation(concentration)
+    return height - 2 * concentration * square, 2 * concentration * product, deviation - 2 * square
+
+
+def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
+    """-2κ sin²((φ-μ)/2), which is κ(cos(φ-μ) - 1)."""
+    sine, _ = half_angle(value, mean)
+    return -2 * (concentration * sine) * sine
+
+
+class _LogProb(Function):
+    """Value and slopes come from one pass in `forward`; `backward` multiplies."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, value: Tensor, mean: Tensor, concentration: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        log_p, by_mean, by_concentration = in_blocks(_value_and_slopes, value, mean, concentration)
+        ctx.save_for_backward(value, mean, concentration, by_mean, by_concentration)
+        ctx.mark_non_differentiable(by_mean, by_concentration)
+        return log_p, by_mean, by_concentration
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        value, mean, concentration, by_mean, by_concentration = ctx.saved_tensors
+        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            # a second derivative is wanted: the same in operations that have one
+            sine, cosine = half_angle(value, mean)
+            by_mean = 2 * concentration * sine * cosine
+            by_concentration = mean_deviation(concentration) - 2 * sine * sine
+        turning = grad * by_mean
+        needed = ctx.needs_input_grad
+        return (
+            (-turning).sum_to_size(value.shape) if needed[0] else None,
+            turning.sum_to_size(mean.shape) if needed[1] else None,
+            (grad * by_concentration).sum_to_size(concentration.shape) if needed[2] else None,
+        )
+
+
+class _LogPeak(Function):
+    """Its derivative is 1 - A(κ)."""
+
+    @staticmethod
+    def forward(ctx: Any, concentration: Tensor) -> Tensor:
+        ctx.save_for_backward(concentration)
+        return log_height(concentration)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (concentration,) = ctx.saved_tensors
+        return grad * mean_deviation(concentration)
+
+
+class _OneMinusRatio(Function):
+    """Its derivative is -A'(κ)."""
+
+    @staticmethod
+    def forward(ctx: Any, concentration: Tensor) -> Tensor:
+        ctx.save_for_backward(concentration)
+        return deviation_of(concentration)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (concentration,) = ctx.saved_tensors
+        return -grad * mean_resultant_slope(concentration)
+
+
+class _Ratio(Function):
+    """A(κ); its derivative is A'(κ)."""
+
+    @staticmethod
+    def forward(ctx: Any, concentration: Tensor) -> Tensor:
+        ctx.save_for_backward(concentration)
+        part = 1 / (1 + 2 / concentration)  # κ/(κ+2), without overflow, 0 at κ = 0
+        return polynomial("ratio", 2 / (concentration + 2)) * part
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (concentration,) = ctx.saved_tensors
+        return grad * mean_resultant_slope(concentration)
+
+
+class _Entropy(Function):
+    @staticmethod
+    def forward(ctx: Any, concentration: Tensor) -> Tensor:
+        ctx.save_for_backward(concentration)
+        height, deviation = height_and_deviation(concentration)
+        # 0 · inf where κ is infinite: κ(1 - A) is 1/2 there
+        return torch.where(concentration.isinf(), 0.5, concentration * deviation) - height
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (concentration,) = ctx.saved_tensors
+        # -κ A'(κ), the product ordered so that nothing under- or overflows
+        part = 2 / (concentration + 2)
+        return grad * (-polynomial("ratio_slope", part) * (concentration * part) * part / 2)

@@ -1,0 +1,114 @@
+"""The von Mises head: one mean and one concentration per angle."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.density_head import DensityHead
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.density_head.von_mises import functions
+from plugins.density_head.von_mises.angles import half_angle
+from plugins.density_head.von_mises.density import VonMises
+
+LARGEST_CONCENTRATION = 1e12
+"""A standard deviation of a microradian; float32 angles resolve no more."""
+
+
+class VonMisesHead(DensityHead):
+    """One von Mises density per angle: biternion mean, predicted or one global concentration (thesis §3.4).
+
+    With `concentration="predicted"` it reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with
+    κ = |(cos, sin)| g(r): up to the scale g(r) the pair is the density's natural parameter, so that the uniform
+    density is a point like any other. Were the pair normalised, as in eq. 3.1, and κ = g(r), the gradients in
+    both would vanish with κ, and a network that begins by finding an angle unpredictable stays there (README).
+
+    With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to
+    constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on validation (eq. 3.5).
+
+    Args:
+        concentration: where κ comes from.
+        floor: the least κ.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    bibtex = """@inproceedings{prokudin2018deep,
+  title = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
+  author = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  booktitle = {European Conference on Computer Vision (ECCV)},
+  year = {2018}
+}"""
+
+    concentration: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        concentration: Literal["predicted", "fixed"] = "predicted",
+        floor: Annotated[float, Field(ge=0, le=LARGEST_CONCENTRATION)] = 0.0,
+    ) -> None:
+        super().__init__()
+        target.require("angle", by="density_head von_mises")
+        self.angles = len(target.names)
+        self.floor = floor
+        self.predicted = concentration == "predicted"
+        self.size = self.angles * (3 if self.predicted else 2)
+        if not self.predicted:
+            self.register_buffer("concentration", torch.ones(self.angles, dtype=torch.float64))
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> VonMises:
+        number = self._per_angle(raw)
+        mean, length = polar(number[..., 0], number[..., 1])
+        if self.predicted:
+            concentration = self.floor + length.clamp(max=1e24) * scale_of_raw(number[..., 2])
+            return VonMises(mean, concentration.clamp(max=LARGEST_CONCENTRATION))
+        return VonMises(mean, self.concentration.to(mean).expand_as(mean))
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        density = self(raw)
+        if not self.predicted:  # the cosine loss does not change with calibration
+            density = VonMises(density.mean, torch.ones_like(density.mean))
+        return -density.log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        if self.predicted:
+            return
+        if len(raw) == 0:
+            raise ValueError("a fixed concentration is calibrated on validation data, but got none of it.")
+        sine, _ = half_angle(target.double(), self(raw).mean.double())
+        deviation = 2 * sine.square()
+        found = functions.concentration_of_moments((1 - deviation).mean(0), deviation.mean(0))
+        self.concentration.copy_(found.clamp(self.floor, LARGEST_CONCENTRATION))
+
+    def _per_angle(self, raw: Tensor) -> Tensor:
+        return require_finite(raw, self.size).unflatten(-1, (self.angles, -1))
+
+
+def polar(
+    cosine: Float[Tensor, "*shape"], sine: Float[Tensor, "*shape"]
+) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+    """Angle, radians, and length of a pair (eq. 3.1), with finite gradients at any pair, also at zero."""
+    shortest = 1e-18
+    # pushed off zero, where the angle has no gradient; the gradient of length × cos(φ - angle) stays right there
+    cosine = torch.where((cosine.abs() < shortest) & (sine.abs() < shortest), cosine + 2 * shortest, cosine)
+    # the larger of the two is divided away so that no square over- or underflows
+    size = torch.maximum(cosine.detach().abs(), sine.detach().abs())
+    cosine, sine = cosine / size, sine / size
+    return torch.atan2(sine, cosine), size * (cosine.square() + sine.square()).sqrt()
+
+
+def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """g(r) = exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_CONCENTRATION.
+
+    The Fisher information of log κ is nearly constant (1/2 for large κ), so a logarithmic map trains best;
+    the power keeps that shape over the κ that occur, but lets neither κ nor an outlier's gradient explode.
+    """
+    most = 4 * (LARGEST_CONCENTRATION**0.25 - 1)
+    high = (1 + raw.clamp(0, most) / 4).square().square()
+    return torch.where(raw < 0, torch.exp(raw.clamp(max=0)), high)

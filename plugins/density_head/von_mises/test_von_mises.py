@@ -1,0 +1,481 @@
+import math
+import subprocess
+import sys
+from functools import cache
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import optimize, stats
+from torch.distributions import kl_divergence
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.density import marginal, median, pick
+from framework.errors import ConfigError
+from framework.target import Target
+from framework.testing.heads import values
+from plugins.density_head.von_mises import blocks, fit_coefficients, functions, integrals
+from plugins.density_head.von_mises.bessel import polynomial
+from plugins.density_head.von_mises.coefficients import NODES, TABLES
+from plugins.density_head.von_mises.density import VonMises
+
+mpmath.mp.dps = 90
+DTYPES = (torch.float32, torch.float64)
+CONCENTRATIONS = (
+    0,
+    1e-30,
+    1e-8,
+    1e-4,
+    1e-2,
+    0.1,
+    1,
+    3.75,
+    10,
+    14,
+    50,
+    100,
+    500,
+    1e3,
+    1e4,
+    1e6,
+    1e8,
+    1e12,
+    1e30,
+)
+OFFSETS = (0.0, 1e-8, 1e-4, 0.1, 1.0, math.pi / 2, 3.0, math.pi, 2 * math.pi - 1e-6, -2 * math.pi, 1e6, -1e6)
+LIMIT = 8  # units of machine epsilon; 16 is wanted
+
+
+@cache
+def bessel(concentration):
+    """log(I0(κ) exp(-κ)), A(κ), 1 - A(κ), A'(κ)."""
+    kappa = mpmath.mpf(concentration)
+    zero, one = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
+    ratio = one / zero
+    slope = 1 - ratio**2 - ratio / kappa if kappa else mpmath.mpf(1) / 2
+    return mpmath.log(zero) - kappa, ratio, 1 - ratio, slope
+
+
+def leaf(number, dtype):
+    return torch.tensor(number, dtype=dtype, requires_grad=True)
+
+
+def error(found, reference, scale, dtype):
+    """In machine epsilons of `scale`."""
+    return float(abs(mpmath.mpf(found.item()) - reference) / scale) / torch.finfo(dtype).eps
+
+
+def check_points(value, mean, concentration, found, slopes):
+    """log_prob and its three gradients against 90 digits."""
+    dtype = value.dtype
+    columns = (value, mean, concentration, found, *slopes)
+    for row in zip(*(column.detach().reshape(-1) for column in columns), strict=True):
+        at, centre, concentrated, log_p, by_value, by_mean, by_concentration = row
+        kappa = mpmath.mpf(concentrated.item())
+        scaled, _, complement, _ = bessel(concentrated.item())
+        difference = mpmath.mpf(at.item()) - mpmath.mpf(centre.item())
+        fall = 2 * mpmath.sin(difference / 2) ** 2
+        height = -mpmath.log(2 * mpmath.pi) - scaled
+        # log p is the difference of two terms, dlogp/dκ of two others: errors are relative to the terms
+        assert error(log_p, height - kappa * fall, max(1, abs(height), kappa * fall), dtype) < LIMIT, row
+        assert error(by_concentration, complement - fall, complement + fall, dtype) < LIMIT, row
+        turning = -kappa * mpmath.sin(difference)
+        # the last term: of a difference that nearly is a multiple of π only eps² is lost
+        scale = abs(turning) + kappa * torch.finfo(dtype).eps + torch.finfo(dtype).tiny
+        assert error(by_value, turning, scale, dtype) < LIMIT, row
+        assert by_mean == -by_value
+
+
+def check_point(value, mean, concentration):
+    found = functions.log_prob(value, mean, concentration)
+    slopes = torch.autograd.grad(found, (value, mean, concentration))
+    check_points(value, mean, concentration, found, slopes)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("mean", [0.0, 3.0, -1000.7])
+def test_log_prob_and_gradients_agree_with_90_digits(dtype, mean):
+    for concentration in CONCENTRATIONS:
+        for offset in OFFSETS:
+            check_point(leaf(mean + offset, dtype), leaf(mean, dtype), leaf(concentration, dtype))
+
+
+angles = st.floats(-1e6, 1e6, width=32)
+
+
+@settings(deadline=None, max_examples=150)
+@given(angles, angles, st.one_of(st.just(0.0), st.floats(-30, 30).map(lambda power: 10.0**power)))
+def test_log_prob_and_gradients_anywhere(value, mean, concentration):
+    for dtype in DTYPES:
+        check_point(leaf(value, dtype), leaf(mean, dtype), leaf(concentration, dtype))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("concentration", CONCENTRATIONS)
+def test_functions_of_the_concentration_agree_with_90_digits(concentration, dtype):
+    kappa = leaf(concentration, dtype)
+    exact = mpmath.mpf(kappa.item())
+    scaled, ratio, complement, slope = bessel(kappa.item())
+    tiny = mpmath.mpf(torch.finfo(dtype).tiny)
+    height = -mpmath.log(2 * mpmath.pi) - scaled
+    entropy = exact * complement - height
+    for found, reference, scale in (
+        (functions.log_peak(kappa), height, max(1, abs(height))),
+        (functions.entropy(kappa), entropy, max(1, abs(entropy))),
+        (functions.mean_resultant(kappa), ratio, ratio + tiny),
+        (functions.mean_deviation(kappa), complement, complement),
+        (functions.mean_resultant_slope(kappa), slope, slope + tiny),
+    ):
+        assert error(found, reference, scale, dtype) < LIMIT
+    for function, reference in (
+        (functions.log_peak, complement),
+        (functions.entropy, -exact * slope),
+        (functions.mean_resultant, slope),
+        (functions.mean_deviation, -slope),
+    ):
+        (found,) = torch.autograd.grad(function(kappa), kappa)
+        assert error(found, reference, abs(reference) + tiny, dtype) < LIMIT
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_no_seam_between_two_pieces(dtype):
+    """Over each border value and derivatives change by no more than their rounding, 40 floats to either side."""
+    pieces = fit_coefficients.PIECES[str(dtype).removeprefix("torch.")]
+    eps = torch.finfo(dtype).eps
+    edges = torch.tensor([[2 * pieces / i - 2] for i in range(1, pieces)], dtype=torch.float64)
+    near = (edges * (1 + eps * torch.arange(-40, 41))).to(dtype)
+    for name in fit_coefficients.NAMES:
+        found = polynomial(name, 2 / (near + 2))
+        assert (found.diff().abs() <= 4 * eps * found[:, 1:].abs()).all()
+    for function, size in (
+        (functions.log_peak, functions.log_peak(near).abs().clamp(min=1)),
+        (functions.mean_deviation, functions.mean_deviation(near)),
+        (functions.mean_resultant_slope, functions.mean_resultant_slope(near)),
+        (functions.mean_resultant, functions.mean_resultant(near)),
+    ):
+        assert (function(near).diff().abs() <= 10 * eps * size[:, 1:]).all()
+
+
+def test_entropy_agrees_with_scipy():
+    kappa = torch.logspace(-4, 3, 50, dtype=torch.float64)
+    np.testing.assert_allclose(functions.entropy(kappa), stats.vonmises.entropy(kappa.numpy()), rtol=1e-11)
+
+
+@pytest.mark.parametrize("which, name", list(enumerate(fit_coefficients.NAMES)))
+def test_the_coefficients_are_those_the_script_writes(which, name):
+    assert tuple(fit_coefficients.table("float32", which)) == TABLES["float32"][name]
+    assert all(tuple(fit_coefficients.gauss_legendre(count)) == pairs for count, pairs in NODES.items())
+
+
+@pytest.mark.parametrize("concentration", [0.0, 1e-6, 0.5, 3.75, 20.0, 1e3])
+def test_first_and_second_derivatives_agree_with_finite_differences(concentration):
+    arguments = [
+        torch.tensor(numbers, dtype=torch.float64, requires_grad=True)
+        for numbers in ([[0.3], [-2.0]], [0.1, 3.0], [concentration] * 2)
+    ]
+    assert torch.autograd.gradcheck(functions.log_prob, arguments)
+    assert torch.autograd.gradgradcheck(functions.log_prob, arguments)
+    for function in (functions.entropy, functions.mean_resultant, functions.mean_deviation):
+        assert torch.autograd.gradcheck(function, arguments[2:])
+        assert torch.autograd.gradgradcheck(function, arguments[2:])
+
+
+def test_gradients_reduce_over_broadcast_arguments():
+    value, mean, kappa = torch.randn(5, 1, 3), torch.zeros(4, 1, requires_grad=True), leaf(2.0, torch.float32)
+    functions.log_prob(value, mean, kappa).sum().backward()
+    spread = [tensor.detach().expand(5, 4, 3).clone().requires_grad_() for tensor in (mean, kappa)]
+    functions.log_prob(value, *spread).sum().backward()
+    torch.testing.assert_close(mean.grad, spread[0].grad.sum((0, 2))[:, None])
+    torch.testing.assert_close(kappa.grad, spread[1].grad.sum())
+
+
+# raised by the compiler itself
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_blocks_change_nothing(dtype):
+    count = blocks.BLOCK * 2 + 5
+    value, mean, kappa = torch.randn(count, dtype=dtype), torch.randn(count, dtype=dtype), torch.rand(count)
+    arguments = [value, mean.requires_grad_(), kappa.to(dtype).requires_grad_()]
+    whole = functions.log_prob(*arguments)
+    gradients = torch.autograd.grad(whole.sum(), arguments[1:])
+    for part in torch.arange(count).split(1000):
+        few = functions.log_prob(*(argument[part] for argument in arguments))
+        torch.testing.assert_close(
+            whole[part], few, rtol=16 * torch.finfo(dtype).eps, atol=4 * torch.finfo(dtype).eps
+        )
+    one = functions.log_prob(value[:, None], mean[:, None], kappa[:, None].to(dtype))
+    torch.testing.assert_close(whole, one[:, 0])
+    assert gradients[0].shape == gradients[1].shape == (count,)
+
+
+COMPILED = """
+import sys, torch
+from plugins.density_head.von_mises import functions
+grid, path = torch.load(sys.argv[1]), sys.argv[2]
+found = []
+for arguments in grid:
+    density = torch.compile(functions.log_prob, fullgraph=True, dynamic=False)(*arguments)
+    found.append((density.detach(), *torch.autograd.grad(density.sum(), arguments)))
+torch.save(found, path)
+"""
+
+
+def test_compiled_log_prob_and_gradients_agree_with_90_digits(tmp_path):
+    """In a process of its own: the type checks that tests switch on cannot be compiled."""
+    columns = list(
+        zip(*((3.0 + off, 3.0, kappa) for off in OFFSETS for kappa in CONCENTRATIONS), strict=True)
+    )
+    grid = [[leaf(column, dtype) for column in columns] for dtype in DTYPES]
+    torch.save(grid, tmp_path / "grid.pt")
+    command = [sys.executable, "-c", COMPILED, str(tmp_path / "grid.pt"), str(tmp_path / "found.pt")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    for arguments, (density, *slopes) in zip(grid, torch.load(tmp_path / "found.pt"), strict=True):
+        check_points(*arguments, density, slopes)
+
+
+many_digits = cache(fit_coefficients.bessel)
+KAPPAS = torch.tensor([0, 1e-30, 1e-8, 1e-3, 0.5, 1, 2, 7.0, 30, 1e3, 1e8, 1e12, 1e30], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_divergence_agrees_with_120_digits(dtype):
+    mpmath.mp.dps = 130
+    factors = torch.tensor([0, 1, 1 + 1e-6, 1.01, 2.7, 2.8], dtype=torch.float64)
+    second = torch.cat([KAPPAS, *(factors * kappa for kappa in KAPPAS[1::3])]).to(dtype)
+    first, second = (grid.flatten() for grid in torch.meshgrid(KAPPAS.to(dtype), second, indexing="ij"))
+    zero = torch.zeros((), dtype=dtype)
+    straight = integrals.kl_divergence(zero, first, zero, second)
+    turned = integrals.kl_divergence(zero, first, zero + 0.25, second)
+    assert (straight >= 0).all()
+    for row in zip(first, second, straight, turned, strict=True):
+        one, two = (mpmath.mpf(kappa.item()) for kappa in row[:2])
+        logs, complements = zip(*(many_digits(kappa) for kappa in (one, two)), strict=True)
+        bregman = logs[1] + two - logs[0] - one - (1 - complements[0]) * (two - one)
+        turning = (1 - complements[0]) * two * 2 * mpmath.sin(mpmath.mpf("0.125")) ** 2
+        for found, reference in ((row[2], bregman), (row[3], bregman + turning)):
+            assert error(found, reference, abs(reference) + torch.finfo(dtype).tiny, dtype) < 16, row
+    mpmath.mp.dps = 90
+
+
+def test_divergence_of_equals_is_exactly_0_and_of_the_joint_is_the_sum():
+    mean, kappa = torch.randn(13, 2), torch.stack([KAPPAS, KAPPAS], 1).float()
+    assert (integrals.kl_divergence(mean, kappa, mean, kappa) == 0).all()
+    first, second = VonMises(mean, kappa), VonMises(mean + 0.1, kappa + 1)
+    parts = integrals.kl_divergence(mean, kappa, mean + 0.1, kappa + 1)
+    torch.testing.assert_close(kl_divergence(first, second), parts.sum(-1))
+
+
+@pytest.mark.parametrize("second", [1.5, 1.6, 9.0])
+def test_divergence_has_first_and_second_derivatives(second):
+    arguments = [
+        torch.tensor([number], dtype=torch.float64, requires_grad=True) for number in (0.3, 1.5, -0.4, second)
+    ]
+    assert torch.autograd.gradcheck(integrals.kl_divergence, arguments)
+    assert torch.autograd.gradgradcheck(integrals.kl_divergence, arguments)
+
+
+def tail(offset, kappa):
+    """Mass beyond `offset` on one side, by quadrature of what is left above exp(-90) of its start."""
+    offset, kappa = mpmath.mpf(offset), mpmath.mpf(kappa)
+    ends = [mpmath.sin(offset / 2) ** 2 + step / (2 * kappa) if kappa else 2 for step in (1, 4, 12, 30, 90)]
+    ends = [2 * mpmath.asin(mpmath.sqrt(min(1, end))) for end in ends]
+    fall = 2 * kappa * mpmath.sin(offset / 2) ** 2
+    # quad stops at an absolute error: what it sees must not be small
+    rest = mpmath.quad(lambda x: mpmath.exp(fall - 2 * kappa * mpmath.sin(x / 2) ** 2), [offset, *ends])
+    return rest / (2 * mpmath.pi) * mpmath.exp(-fall - fit_coefficients.bessel(kappa)[0])
+
+
+@pytest.mark.parametrize("kappa", [0, 1e-30, 1e-3, 0.5, 3.0, 30.0, 1e4, 1e12, 1e30])
+def test_cdf_agrees_with_quadrature_in_both_tails(kappa):
+    mpmath.mp.dps = 40
+    zero, concentration = torch.zeros((), dtype=torch.float64), torch.tensor(kappa, dtype=torch.float64)
+    for deviations in (0.0, 1e-6, 0.3, 0.7, 1.5, 3.0, 8.0, 25.0):
+        offset = min(3.14, deviations / max(1.0, kappa) ** 0.5)
+        reference = tail(offset, kappa)
+        below = integrals.cdf(zero - offset, zero, concentration)
+        above = integrals.cdf(zero + offset, zero, concentration)
+        assert abs(below.item() - reference) <= 4e-15 * reference * max(1, -mpmath.log(reference))
+        assert abs(above.item() - (1 - reference)) <= 1e-14
+        turned = integrals.cdf(zero - offset + 4 * math.pi, zero, concentration)
+        assert abs(turned.item() - reference - 2) <= 1e-14 + 2e-15 * max(1.0, kappa) ** 0.5
+        single = integrals.cdf((zero - offset).float(), zero.float(), concentration.float())
+        wide = integrals.cdf((zero - offset).float().double(), zero, concentration.float().double())
+        assert single.dtype == torch.float32
+        assert single == wide.float()
+    mpmath.mp.dps = 90
+
+
+@pytest.mark.parametrize("kappa", [1e-3, 1.0, 12.0, 45.0])
+def test_cdf_agrees_with_scipy_and_rises(kappa):
+    value = torch.linspace(-7, 7, 2001, dtype=torch.float64)
+    found = integrals.cdf(value, torch.zeros(()), torch.tensor(kappa))
+    np.testing.assert_allclose(
+        found, stats.vonmises.cdf(value.numpy(), np.float32(kappa)), rtol=0, atol=1e-12
+    )
+    assert (found.diff() >= -1e-15).all()
+    assert found[0] < 0 < 1 < found[-1]
+
+
+@pytest.mark.parametrize("kappa", [0.1, 1.0, 20.0])
+def test_cdf_has_first_derivatives(kappa):
+    value = torch.tensor([-3.0, -1.0, -0.05, 0.2, 2.0], dtype=torch.float64, requires_grad=True)
+    mean, kappa = (
+        torch.full((5,), number, dtype=torch.float64, requires_grad=True) for number in (0.1, kappa)
+    )
+    assert torch.autograd.gradcheck(integrals.cdf, (value, mean, kappa))
+
+
+@pytest.mark.parametrize("kappa", [0, 1e-30, 1e-3, 0.3, 1, 3, 30, 1e4, 1e12, 1e30])
+def test_arc_holds_its_mass(kappa):
+    mass = torch.tensor(
+        [0, 1e-12, 1e-3, 0.3, 0.5, 0.500001, 0.9, 0.99, 1 - 1e-6, 1 - 1e-9, 1], dtype=torch.float64
+    )
+    zero, concentration = torch.zeros((), dtype=torch.float64), torch.tensor(kappa, dtype=torch.float64)
+    width = integrals.half_width(mass, concentration)
+    below = integrals.cdf(-width, zero, concentration)
+    np.testing.assert_allclose(integrals.cdf(width, zero, concentration) - below, mass, rtol=0, atol=2e-14)
+    # the mass outside keeps its digits down to that of a last digit of π
+    np.testing.assert_allclose(2 * below[5:-1], (1 - mass)[5:-1], rtol=1e-12, atol=4e-16)
+    assert (width.diff() > 0).all()
+    assert width[0] == 0
+    assert width[-1] == math.pi
+    low, high = integrals.interval(mass, zero + 2, concentration)
+    torch.testing.assert_close(high - 2, width, rtol=0, atol=1e-15)
+    torch.testing.assert_close(2 - low, width, rtol=0, atol=1e-15)
+
+
+def test_an_arc_of_more_than_all_is_refused():
+    with pytest.raises(ValueError, match=r"between 0 and 1, got 0.5 to 1.5"):
+        integrals.half_width(torch.tensor([0.5, 1.5]), torch.ones(2))
+
+
+@pytest.mark.parametrize("concentration", [10.0**power for power in range(-8, 13)] + [1.1, 1.2, 37.0])
+def test_concentration_of_moments_inverts_the_moments(concentration):
+    _, ratio, complement, _ = bessel(concentration)
+    moments = [torch.tensor(float(moment), dtype=torch.float64) for moment in (ratio, complement)]
+    assert functions.concentration_of_moments(*moments).item() == pytest.approx(concentration, rel=1e-12)
+
+
+def test_concentration_of_moments_at_its_ends():
+    found = functions.concentration_of_moments(torch.tensor([0.0, -0.4, 1.0]), torch.tensor([1.0, 1.4, 0.0]))
+    assert found.tolist() == [0.0, 0.0, math.inf]
+
+
+@pytest.mark.parametrize("concentration", [0, 1e-30, 1e-3, 0.5, 1, 3, 30, 1e3, 1e6, 1e12, 1e16, 1e30])
+def test_samples_follow_the_density(concentration):
+    torch.manual_seed(3)
+    count = 20_000
+    drawn = functions.sample(torch.zeros(count, dtype=torch.float64), torch.full((count,), concentration))
+    assert drawn.abs().max() <= math.pi
+    if concentration > 1e6:  # there the density is normal to 1/κ
+        law = stats.norm(scale=concentration**-0.5).cdf
+    else:
+        law = stats.vonmises(max(concentration, 1e-9)).cdf
+    assert stats.kstest(drawn.numpy(), law).pvalue > 1e-3
+    assert len(drawn.unique()) > 0.999 * count
+
+
+def test_sampling_ends_whatever_it_is_given():
+    drawn = functions.sample(torch.zeros(4), torch.tensor([math.nan, math.inf, 0.0, 1e38]))
+    assert drawn[0].isnan()
+    assert drawn[2:].isfinite().all()
+    assert functions.sample(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
+
+
+def test_sampling_shifts_by_the_mean():
+    torch.manual_seed(0)
+    drawn = functions.sample(torch.full((1000,), 1e4 + 1.0, dtype=torch.float64), torch.full((1000,), 1e8))
+    torch.testing.assert_close((drawn - 1e4 - 1.0).cos(), torch.ones(1000).double(), rtol=0, atol=1e-6)
+
+
+ONE, TWO, THREE = (Target("angle", ("azimuth", "elevation", "tilt")[:count]) for count in (1, 2, 3))
+PREDICTED, FIXED = "von_mises", {"name": "von_mises", "concentration": "fixed"}
+
+
+def head(config=PREDICTED, target=ONE):
+    return build("density_head", resolve("density_head", config), target=target)
+
+
+def test_independent_angles_add_up():
+    density = head(target=THREE)(torch.randn(2, 9))
+    value = values(THREE, (2,))
+    parts = [marginal(density, index).log_prob(value[:, index : index + 1]) for index in range(3)]
+    torch.testing.assert_close(density.log_prob(value), sum(parts))
+    torch.testing.assert_close(
+        density.entropy(), sum(marginal(density, index).entropy() for index in range(3))
+    )
+    assert torch.equal(median(density, 1), density.mode)
+
+
+def test_picked_components_are_those_at_the_index():
+    density = VonMises(torch.randn(2, 4, 3), torch.rand(2, 4, 3))
+    index = torch.tensor([[0, 3], [2, 1], [1, 1]])
+    picked = pick(density, index)
+    assert picked.batch_shape == (3, 2)
+    for sample, row in np.ndindex(3, 2):
+        assert torch.equal(picked.mean[sample, row], density.mean[row, index[sample, row]])
+        assert torch.equal(picked.concentration[sample, row], density.concentration[row, index[sample, row]])
+
+
+def test_fixed_loss_is_the_cosine_loss_up_to_a_constant():
+    made, target = head(FIXED), torch.randn(50, 1)
+    raw = torch.randn(50, 2)
+    unit = raw / raw.norm(dim=-1, keepdim=True)
+    cosine_loss = 1 - (unit * torch.cat([target.cos(), target.sin()], -1)).sum(-1)  # eq. 3.2
+    constant = made.loss(raw, target) - cosine_loss
+    torch.testing.assert_close(constant, constant[0].expand(50))
+
+
+def test_calibrated_concentration_maximises_the_likelihood():
+    made = head(FIXED, TWO).eval()
+    torch.manual_seed(1)
+    raw = torch.randn(400, 4)
+    target = functions.sample(made(raw).mean, torch.tensor([40.0, 0.3]))
+    before = made.loss(raw, target)
+    made.calibrate(raw, target)
+    density = made(raw)
+    for index in (0, 1):
+        alone = marginal(density, index)
+        offsets = (target[:, index] - alone.mean[:, 0]).double().numpy()
+        best = optimize.minimize_scalar(
+            lambda kappa, offsets=offsets: -stats.vonmises.logpdf(offsets, kappa).sum(),
+            bounds=(1e-3, 1e3),
+            method="bounded",
+            options={"xatol": 1e-6},
+        ).x
+        assert made.concentration[index].item() == pytest.approx(best, rel=1e-4)
+    assert torch.equal(made.loss(raw, target), before)
+
+
+def test_calibration_on_perfect_and_on_no_data():
+    made = head(FIXED).eval()
+    raw = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    made.calibrate(raw, made(raw).mean)
+    assert made.concentration.item() == 1e12
+    with pytest.raises(ValueError, match="got none"):
+        made.calibrate(raw[:0], raw[:0, :1])
+
+
+def test_the_zero_pair_has_the_gradient_of_the_natural_parameter():
+    # log p = η·(cos φ, sin φ) - log I0(|η|) with η the pair: at 0 the gradient is (cos φ, sin φ)
+    made, target = head().double(), torch.tensor([[2.0]], dtype=torch.float64)
+    for pair in ([0.0, 0.0], [1e-30, -1e-30], [-1e-12, 1e-13]):
+        raw = torch.tensor([[*pair, 0.0]], dtype=torch.float64, requires_grad=True)
+        (gradient,) = torch.autograd.grad(-made.loss(raw, target), raw)
+        np.testing.assert_allclose(gradient[0, :2], [math.cos(2.0), math.sin(2.0)], rtol=1e-9)
+
+
+def test_concentration_reaches_a_million_and_more():
+    density = head()(torch.tensor([[30.0, 40.0, 60.0], [1.0, 0.0, 130.0], [0.0, 1.0, 3e38]]))
+    assert density.concentration[:, 0].tolist() == pytest.approx([50 * 16.0**4, 33.5**4, 1e12])
+    assert density.mean[:, 0].tolist() == pytest.approx([math.atan2(4, 3), 0, math.pi / 2])
+
+
+@pytest.mark.parametrize("kind", ["real", "class"])
+def test_other_targets_are_refused(kind):
+    with pytest.raises(ConfigError, match=f"von_mises.*'{kind}'"):
+        head(target=Target(kind, ("a", "b")))

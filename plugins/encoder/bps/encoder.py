@@ -1,0 +1,96 @@
+"""Basis point sets: a cloud as what a fixed set of points sees of it."""
+
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+from framework.geometry.clouds import Normalisation, require_clouds
+from plugins.encoder.bps import basis as sets
+from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, prepared, width
+
+
+class BPS(Encoder):
+    """Features of the point of a cloud that is nearest to each point of a fixed basis (thesis eq. 6.1-6.5).
+
+    Args:
+        input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
+        input_columns: names of the columns, where features are attributes.
+        basis: how basis points are chosen (`plugins.encoder.bps.basis`).
+        points: how many, k; of a "grid" a cube, side³.
+        radius: of the ball the basis points are in; of a "grid" half its edge. In units of the normalised cloud.
+        features: what is computed for each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5),
+            and of the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
+        normalise: as `framework.geometry.clouds.normalised`.
+        basis_seed: of "ball_uniform"; the run's seed has no part in it.
+        rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
+
+    With the basis "grid" features are (channels, side, side, side), x slowest, else (channels × points,): all of the
+    first channel, then all of the second. The basis is stored in the checkpoint.
+
+    Raises:
+        ConfigError: an input that is no cloud, no feature or one twice, a feature that the clouds do not have, a "grid"
+            whose `points` are no cube.
+    """
+
+    fixed = True
+    bibtex = """@inproceedings{prokudin2019efficient,
+  title = {Efficient Learning on Point Clouds with Basis Point Sets},
+  author = {Prokudin, Sergey and Lassner, Christoph and Romero, Javier},
+  booktitle = {IEEE/CVF International Conference on Computer Vision (ICCV)},
+  year = {2019}
+}"""
+
+    basis: Tensor
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        input_columns: tuple[str, ...] = (),
+        *,
+        basis: sets.Strategy = "ball_uniform",
+        points: Annotated[int, Field(gt=0, le=10_000_000)] = 512,
+        radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+        features: Annotated[list[str], Field(min_length=1)] = ["distance"],  # noqa: B006 - never written
+        normalise: Normalisation = "unit_ball",
+        basis_seed: Annotated[int, Field(ge=0, lt=2**32)] = 13,
+        rotation_invariant: bool = False,
+    ) -> None:
+        super().__init__()
+        require_clouds(input_shape, by="encoder bps")
+        if len(set(features)) < len(features):
+            raise ConfigError(f"encoder bps: features={features} names one twice; wanted each once.")
+        for feature in features:
+            columns_of(feature, input_columns)
+        self.columns = input_columns
+        self.features = features
+        self.normalise: Normalisation = normalise
+        self.rotation_invariant = rotation_invariant
+        made = sets.basis(basis, points, radius, basis_seed).to(torch.get_default_dtype())
+        self.register_buffer("basis", made)
+        self._prepared: tuple[Tensor, int, Basis] | None = None
+        total = sum(width(feature) for feature in features)
+        self.output_shape = (total, *[sets.side(points)] * 3) if basis == "grid" else (total * points,)
+
+    def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        found = encode(
+            inputs,
+            self.prepared(),
+            self.features,
+            self.normalise,
+            self.columns,
+            rotation_invariant=self.rotation_invariant,
+        )
+        return channels(found).reshape(-1, *self.output_shape)
+
+    def prepared(self) -> Basis:
+        """The basis, prepared again only where it was moved, cast or loaded since."""
+        version = 0 if self.basis.is_inference() else self.basis._version
+        known = self._prepared
+        if known is None or known[0] is not self.basis or known[1] != version:
+            known = self._prepared = (self.basis, version, prepared(self.basis))
+        return known[2]

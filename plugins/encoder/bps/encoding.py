@@ -1,0 +1,206 @@
+"""From clouds to features of basis points, and back (thesis eq. 6.1-6.5)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from framework.errors import ConfigError, UserError, did_you_mean
+from framework.geometry.clouds import Normalisation, denormalised, normalised, pad, require_normalised, sizes
+from framework.geometry.nearest import Queries, nearest, prepare
+from plugins.encoder.bps.frame import frame
+
+COLOR = ("red", "green", "blue")
+NORMAL = ("normal_x", "normal_y", "normal_z")
+GROUPS = {"color": COLOR, "normal": NORMAL}
+
+
+class Basis(NamedTuple):
+    """Basis points, and what searching for many clouds' nearest points of them needs to do but once."""
+
+    points: Float[Tensor, "k 3"]
+    queries: Queries
+
+
+class Encoding(NamedTuple):
+    """Features of a batch of clouds, and all that leads back to them.
+
+    Attributes:
+        features: (batch, k) or (batch, k, 3), by name.
+        index: the point of each cloud that is nearest to each basis point, the first of equally near ones.
+        basis: the basis points.
+        centre, scale: of each cloud (framework.geometry.clouds.Normalised).
+        frame: each cloud's own axes as columns, where the encoding does not turn with the clouds; else None.
+    """
+
+    features: dict[str, Tensor]
+    index: Int[Tensor, "batch k"]
+    basis: Float[Tensor, "k 3"]
+    centre: Float[Tensor, "batch 3"]
+    scale: Float[Tensor, "batch"]
+    frame: Float[Tensor, "batch 3 3"] | None
+
+
+def prepared(points: Float[Tensor, "k 3"]) -> Basis:
+    """A basis for `encode`."""
+    return Basis(points, prepare(points))
+
+
+def width(feature: str) -> int:
+    """Numbers a feature has for each basis point."""
+    return 3 if feature == "delta" or feature in GROUPS else 1
+
+
+def columns_of(feature: str, columns: Sequence[str]) -> list[int]:
+    """Where the attributes of a feature stand in a cloud; none of "distance" and "delta".
+
+    Args:
+        columns: names of a cloud's columns (`Data.columns`).
+
+    Raises:
+        ConfigError: the clouds have no such column.
+    """
+    if feature in ("distance", "delta"):
+        return []
+    wanted = GROUPS.get(feature, (feature,))
+    missing = [name for name in wanted if name not in columns]
+    if missing:
+        known = ["distance", "delta", *GROUPS, *columns]
+        raise ConfigError(
+            f"encoder bps: feature {feature!r} wants a column {missing[0]!r} of the clouds, whose columns are "
+            f"{', '.join(columns) or 'not named'}.{did_you_mean(feature, known)} Leave the feature out, or choose data "
+            "whose `columns` name it."
+        )
+    return [columns.index(name) for name in wanted]
+
+
+def encode(
+    clouds: Float[Tensor, "batch points columns"],
+    basis: Basis,
+    features: Sequence[str] = ("distance",),
+    normalise: Normalisation = "unit_ball",
+    columns: Sequence[str] = (),
+    *,
+    rotation_invariant: bool = False,
+) -> Encoding:
+    """Features of the point of each cloud that is nearest to each basis point; only those that are asked for.
+
+    "distance": its distance from the basis point (eq. 6.4). "delta": the vector from the basis point to it (eq. 6.5).
+    "color", "normal", or the name of any column: its attributes, as they came ("x", "y", "z" normalised). Distances and
+    deltas are in units of the normalised cloud; all is of the basis's dtype, and differentiable in the clouds but where
+    another point becomes the nearest.
+
+    Args:
+        columns: names of the clouds' columns, where a feature is an attribute.
+        rotation_invariant: encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals turn with it.
+
+    Raises:
+        ConfigError: a feature wants a column that is not there.
+        DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
+    """
+    wanted = {feature: columns_of(feature, columns) for feature in features}
+    counts = sizes(clouds)
+    local, centre, scale = normalised(clouds, normalise, counts)
+    if normalise == "none":
+        reach = max(1.0, float(basis.points.abs().max()))
+        require_normalised(local[..., :3], reach, counts, by="encoder bps")
+    axes = frame(local[..., :3]) if rotation_invariant else None
+    if axes is not None:
+        local = _turned(local, axes, columns, {place for places in wanted.values() for place in places})
+    coordinates = local[..., :3].to(basis.points.dtype)
+    found = nearest(coordinates.detach(), basis.queries, counts)
+    delta = None
+    if "delta" in wanted or ("distance" in wanted and coordinates.requires_grad):
+        delta = _taken(coordinates, found.index) - basis.points  # eq. 6.5
+    made: dict[str, Tensor] = {}
+    for feature, places in wanted.items():
+        if feature == "distance":
+            made[feature] = found.distance  # eq. 6.4
+            if delta is not None and delta.requires_grad:
+                length = torch.linalg.vector_norm(delta, dim=-1)
+                made[feature] = found.distance + (length - length.detach())  # the same bits, and a gradient
+        elif feature == "delta" and delta is not None:
+            made[feature] = delta
+        else:
+            attribute = _taken(local[..., places], found.index).to(basis.points.dtype)
+            made[feature] = attribute if width(feature) == 3 else attribute[..., 0]
+    return Encoding(made, found.index, basis.points, centre, scale, axes)
+
+
+def channels(encoding: Encoding) -> Float[Tensor, "batch channels k"]:
+    """All features in the order they were asked for, the components of vectors one after the other."""
+    parts = [part[:, None] if part.dim() == 2 else part.mT for part in encoding.features.values()]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def decode(encoding: Encoding, *, unique: bool = False) -> Float[Tensor, "batch points 3"]:
+    """The points of the clouds that are nearest to basis points, in the clouds' own units (§6.4.1), from "delta".
+
+    As many as basis points and in their order, so that a point may occur several times; with `unique` each once, in the
+    order of the cloud, and padded as clouds are.
+
+    Raises:
+        UserError: the deltas were not encoded.
+    """
+    if "delta" not in encoding.features:
+        raise UserError(
+            f"An encoding of {', '.join(encoding.features)} does not lead back to points; wanted the feature 'delta'. "
+            "Encode with features=[delta]."
+        )
+    points = encoding.features["delta"] + encoding.basis
+    if encoding.frame is not None:
+        points = (points.double() @ encoding.frame.mT).to(points.dtype)
+    points = denormalised(points, encoding.centre, encoding.scale)
+    if not unique or len(points) == 0:
+        return points
+    places = [_first_of_each(index) for index in encoding.index]
+    return pad([cloud[place] for cloud, place in zip(points, places, strict=True)])
+
+
+def per_point(
+    encoding: Encoding, points: Float[Tensor, "batch points 3"]
+) -> Float[Tensor, "batch points features"]:
+    """What a network reads that predicts something of single points, a segment say (§8.2): the features of their whole
+    cloud, as many as `channels` has, before the point's normalised coordinates. Padding stays NaN.
+
+    Args:
+        points: in the clouds' own units, of the same clouds in the same order.
+    """
+    local = (points.double() - encoding.centre[:, None]) / encoding.scale[:, None, None]
+    if encoding.frame is not None:
+        local = local @ encoding.frame
+    whole = channels(encoding).flatten(1)
+    return torch.cat([whole[:, None].expand(-1, points.shape[1], -1), local.to(whole.dtype)], -1)
+
+
+def _taken(numbers: Float[Tensor, "batch points columns"], index: Int[Tensor, "batch k"]) -> Tensor:
+    """The rows of each cloud that an index names, (batch, k, columns)."""
+    return numbers.gather(1, index[..., None].expand(-1, -1, numbers.shape[2]))
+
+
+def _turned(
+    local: Float[Tensor, "batch points columns"], axes: Tensor, columns: Sequence[str], read: set[int]
+) -> Float[Tensor, "batch points columns"]:
+    """Coordinates, and normals where any of them is read, along each cloud's own axes."""
+    parts = list(local.unbind(-1))
+    vectors = [[0, 1, 2]]
+    if read & {columns.index(name) for name in NORMAL if name in columns}:
+        vectors.append(columns_of("normal", columns))
+    for places in vectors:
+        vector = local[..., places].double()
+        padding = vector.isnan()  # is no summand of the axes' gradient
+        along = (vector.where(~padding, 0) @ axes).where(~padding, torch.nan).to(local.dtype)
+        for place, part in zip(places, along.unbind(-1), strict=True):
+            parts[place] = part
+    return torch.stack(parts, -1)
+
+
+def _first_of_each(index: Int[Tensor, "k"]) -> Int[Tensor, "different"]:
+    """Where each different number of an index stands first, numbers ascending."""
+    order = index.argsort(stable=True)
+    ordered = index[order]
+    first = torch.ones_like(ordered, dtype=torch.bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return order[first]

@@ -1,0 +1,448 @@
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError, UserError
+from framework.geometry.clouds import normalised, pad, sizes
+from plugins.encoder.bps import encoding
+from plugins.encoder.bps.basis import basis
+from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepared
+from plugins.encoder.bps.rows import COLUMNS
+
+STRATEGIES = ("ball_uniform", "grid", "ball_grid", "hexagonal")
+DTYPES = [torch.float32, torch.float64]
+
+
+def numbers(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def batch_of(lengths, columns=3, dtype=torch.float64):
+    return pad([numbers(length, columns, seed=seed).to(dtype) * 2 + 5 for seed, length in enumerate(lengths)])
+
+
+def by_hand(cloud, points):
+    """Distance, delta and index of the nearest point of one normalised cloud, a loop over everything (eq. 6.4-6.5)."""
+    found = []
+    for place in points:
+        best, index = math.inf, -1
+        for number, point in enumerate(cloud[:, :3]):
+            distance = math.dist(place, point)
+            if distance < best:  # so that the first of equally near ones stays
+                best, index = distance, number
+        found.append((best, cloud[index, :3] - place, index))
+    distances, deltas, indices = zip(*found, strict=True)
+    return np.array(distances), np.array(deltas), np.array(indices)
+
+
+def encoder(shape=(40, 3), columns=(), **config):
+    return build(
+        "encoder",
+        resolve("encoder", {"name": "bps", **config}),
+        input_shape=shape,
+        input_columns=tuple(columns),
+    )
+
+
+# The basis
+
+
+def test_random_points_are_uniform_over_the_ball():
+    points = basis("ball_uniform", 20_000, 2.0, 13).numpy() / 2
+    norm = np.linalg.norm(points, axis=1)
+    assert norm.max() <= 1
+    assert stats.kstest(norm**3, "uniform").pvalue > 0.01  # the volume within a radius grows with its cube
+    for axis in range(3):  # Archimedes: the height of a uniform direction is uniform
+        assert stats.kstest(points[:, axis] / norm, stats.uniform(-1, 2).cdf).pvalue > 0.01
+    assert np.abs(np.corrcoef(np.c_[points, norm].T)[~np.eye(4, dtype=bool)]).max() < 0.03
+
+
+def test_random_points_follow_from_their_seed_alone():
+    torch.manual_seed(1)
+    first = basis("ball_uniform", 100, 1.0, 13)
+    torch.manual_seed(2)
+    assert torch.equal(basis("ball_uniform", 100, 1.0, 13), first)
+    assert torch.equal(basis("ball_uniform", 40, 1.0, 13), first[:40])
+    assert not torch.equal(basis("ball_uniform", 100, 1.0, 14), first)
+
+
+def test_a_grid_is_that_of_three_loops():
+    axis = [-1.5, -0.5, 0.5, 1.5]
+    wanted = [[x, y, z] for x in axis for y in axis for z in axis]
+    np.testing.assert_allclose(basis("grid", 64, 1.5, 13).numpy(), wanted, rtol=0, atol=1e-15)
+    assert basis("grid", 1, 1.0, 13).tolist() == [[0, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    "count, near", [(500, r"343 \(7³\) or points=512 \(8³\)"), (2, r"1 \(1³\) or points=8")]
+)
+def test_a_grid_that_is_no_cube_names_the_nearest_ones(count, near):
+    with pytest.raises(ConfigError, match=f"got points={count}; write points={near}"):
+        basis("grid", count, 1.0, 13)
+    with pytest.raises(ConfigError, match="as many points as a cube"):
+        encoder(basis="grid", points=count)
+
+
+ROW = math.sqrt(3) / 2
+MOVES = {
+    "ball_grid": [(1, 0, 0), (0, 1, 0), (0, 0, 1)],
+    # within a layer, and to the next layer but one, which lies straight above
+    "hexagonal": [(1, 0, 0), (0.5, ROW, 0), (-0.5, ROW, 0), (0, 0, 2 * math.sqrt(2 / 3))],
+}
+NEIGHBOURS = {"ball_grid": 6, "hexagonal": 12}
+VOLUME = {"ball_grid": 1.0, "hexagonal": 1 / math.sqrt(2)}
+
+
+@pytest.mark.parametrize("count", [*range(1, 40), 512, 1000])
+@pytest.mark.parametrize("strategy", MOVES)
+def test_exactly_as_many_points_of_a_lattice_lie_in_the_ball(strategy, count):
+    points = basis(strategy, count, 3.0, 13).numpy() / 3
+    assert points.shape == (count, 3)
+    assert np.linalg.norm(points, axis=1).max() < 1
+    if count == 1:
+        return
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    distance[np.diag_indices(count)] = math.inf
+    edge = distance.min()
+    # whoever is a step away in the ball is there too, so that none was left out
+    for move in MOVES[strategy]:
+        for sign in (1, -1):
+            for other in points + sign * edge * np.array(move):
+                there = np.linalg.norm(points - other, axis=1).min() < 1e-9
+                assert there or np.linalg.norm(other) >= 1 - 1e-9
+    if count >= 512:
+        assert count * VOLUME[strategy] * edge**3 == pytest.approx(4 / 3 * math.pi, rel=0.05)
+        inner = np.linalg.norm(points, axis=1) < 1 - 1.001 * edge
+        assert set((np.abs(distance - edge) < 1e-9).sum(1)[inner]) == {NEIGHBOURS[strategy]}
+
+
+# The features
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("normalise", ["unit_ball", "robust"])
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_features_agree_with_loops(strategy, normalise, dtype):
+    lengths = [30, 1, 7]
+    clouds = batch_of(lengths, len(COLUMNS), dtype)
+    points = basis(strategy, 27, 1.0, 13).to(dtype)
+    wanted = ["normal", "distance", "echo", "delta", "color", "z"]
+    found = encode(clouds, prepared(points), wanted, normalise, COLUMNS)
+    assert list(found.features) == wanted
+    local = normalised(clouds, normalise).clouds
+    for number, length in enumerate(lengths):
+        cloud = local[number, :length].double().numpy()
+        distance, delta, index = by_hand(cloud, points.double().numpy())
+        np.testing.assert_array_equal(found.index[number].numpy(), index)
+        limit = 2.5e-7 if dtype == torch.float32 else 1e-14
+        np.testing.assert_allclose(found.features["distance"][number].numpy(), distance, rtol=0, atol=limit)
+        np.testing.assert_allclose(found.features["delta"][number].numpy(), delta, rtol=0, atol=limit)
+        for feature, places in {"color": [3, 4, 5], "normal": [6, 7, 8], "echo": 9, "z": 2}.items():
+            np.testing.assert_array_equal(found.features[feature][number].numpy(), cloud[index][:, places])
+    assert all(feature.dtype == dtype for feature in found.features.values())
+
+
+coordinate = st.floats(-1, 1, width=32)
+WILD = st.one_of(
+    st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=20),
+    st.integers(1, 20).map(lambda count: [(0.3, -0.2, 0.7)] * count),  # all in one place
+    st.lists(coordinate, min_size=1, max_size=20).map(
+        lambda along: [(t, 2 * t, -t) for t in along]
+    ),  # on a line
+    st.integers(1, 20).map(lambda count: [(1e6, 0.0, 0.0), *[(t / count, 0.5, -0.1) for t in range(count)]]),
+    st.lists(st.tuples(*[st.sampled_from([-1.0, 0.0, 1.0])] * 3), min_size=1, max_size=40),  # duplicates
+)
+
+
+@given(
+    WILD,
+    st.sampled_from([1e-8, 1.0, 1e8]),
+    st.sampled_from([0.0, 1e3]),
+    st.sampled_from(STRATEGIES),
+    st.sampled_from([1, 8, 64]),
+    st.sampled_from(["unit_ball", "robust"]),
+    st.sampled_from(DTYPES),
+)
+@settings(max_examples=150, deadline=None)
+def test_wild_clouds(cloud, scale, offset, strategy, count, normalise, dtype):
+    clouds = ((torch.tensor(cloud, dtype=torch.float64) + offset) * scale).to(dtype)[None]
+    points = basis(strategy, count, 1.0, 13).to(dtype)
+    found = encode(clouds, prepared(points), ["distance", "delta"], normalise)
+    local = normalised(clouds, normalise).clouds[0].double().numpy()
+    distance, _, _ = by_hand(local, points.double().numpy())
+    size = max(1.0, np.abs(local).max())  # of far outliers
+    limit = 2.5e-7 if dtype == torch.float32 else 1e-14
+    np.testing.assert_allclose(found.features["distance"][0].numpy(), distance, rtol=0, atol=limit * size)
+    length = found.features["delta"][0].double().norm(dim=-1).numpy()
+    np.testing.assert_allclose(length, distance, rtol=0, atol=limit * size)
+    back = decode(found)[0].double()
+    index = found.index[0]
+    place = limit * float(found.scale[0]) * size + 4e-16 * float(clouds.abs().max())
+    assert (back - clouds[0, index].double()).abs().max() <= max(place, 1e-7 * float(clouds.abs().max()))
+
+
+def test_equally_near_points_give_the_first():
+    clouds = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, 1, 0]]])
+    found = encode(clouds, prepared(torch.zeros(1, 3)), ["delta"], "none")
+    assert found.index.tolist() == [[0]]
+    assert found.features["delta"].tolist() == [[[1, 0, 0]]]
+
+
+def test_only_what_is_asked_for_is_computed(monkeypatch):
+    clouds, made = batch_of([9, 12]), prepared(basis("ball_uniform", 8, 1.0, 13))
+    gathered = []
+    taken = encoding._taken
+    monkeypatch.setattr(
+        encoding, "_taken", lambda rows, index: gathered.append(rows.shape[2]) or taken(rows, index)
+    )
+    assert list(encode(clouds, made).features) == ["distance"]
+    assert gathered == []
+    assert list(encode(clouds, made, ["delta"]).features) == ["delta"]
+    assert gathered == [3]
+
+
+def test_a_gradient_changes_no_bit_of_the_features():
+    clouds, made = batch_of([9, 12]), prepared(basis("ball_uniform", 30, 1.0, 13))
+    plain = encode(clouds, made, ["distance", "delta"])
+    traced = encode(clouds.clone().requires_grad_(), made, ["distance", "delta"])
+    for feature in plain.features:
+        assert traced.features[feature].requires_grad
+        assert torch.equal(plain.features[feature], traced.features[feature])
+
+
+@pytest.mark.parametrize("rotation_invariant", [False, True])
+@pytest.mark.parametrize("normalise", ["unit_ball", "robust"])
+def test_gradients_agree_with_finite_differences(normalise, rotation_invariant):
+    made = prepared(basis("ball_uniform", 6, 1.0, 13))
+
+    def features(clouds):
+        wanted = ["distance", "delta", "color", "normal"]
+        found = encode(clouds, made, wanted, normalise, COLUMNS, rotation_invariant=rotation_invariant)
+        return channels(found)
+
+    clouds = pad([numbers(7, 10, seed=3), numbers(7, 10, seed=4)]).requires_grad_()
+    assert torch.autograd.gradcheck(features, (clouds,), eps=1e-7, atol=1e-5)
+
+
+@pytest.mark.parametrize("cloud", [torch.ones(1, 5, 3), torch.tensor([[[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]])])
+def test_gradients_of_degenerate_clouds_are_finite(cloud):
+    made = prepared(torch.zeros(1, 3))  # a basis point on a point, besides
+    clouds = cloud.clone().requires_grad_()
+    found = encode(clouds, made, ["distance", "delta"], rotation_invariant=True)
+    channels(found).sum().backward()
+    assert clouds.grad is not None
+    assert clouds.grad.isfinite().all()
+
+
+# The way back
+
+
+@pytest.mark.parametrize("rotation_invariant", [False, True])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_deltas_lead_back_to_points_of_the_cloud(dtype, rotation_invariant):
+    clouds = batch_of([30, 3], dtype=dtype) * 100
+    made = prepared(basis("ball_uniform", 40, 1.0, 13).to(dtype))
+    found = encode(clouds, made, ["delta"], rotation_invariant=rotation_invariant)
+    points = decode(found)
+    assert points.dtype == dtype
+    limit = 20 * torch.finfo(dtype).eps * float(clouds.nan_to_num().abs().max())
+    wanted = torch.stack([cloud[index] for cloud, index in zip(clouds, found.index, strict=True)])
+    torch.testing.assert_close(points, wanted, rtol=0, atol=limit)
+    once = decode(found, unique=True)
+    for number, cloud in enumerate(clouds):
+        places = np.unique(found.index[number].numpy())
+        assert sizes(once)[number] == len(places)
+        torch.testing.assert_close(once[number, : len(places)], cloud[places], rtol=0, atol=limit)
+
+
+def test_distances_alone_do_not_lead_back():
+    found = encode(batch_of([5]), prepared(basis("grid", 8, 1.0, 13)))
+    with pytest.raises(UserError, match=r"encoding of distance .* features=\[delta\]"):
+        decode(found)
+
+
+def test_single_points_are_joined_with_their_cloud_and_do_not_depend_on_its_place():
+    clouds = batch_of([30, 12])
+    made = prepared(basis("ball_uniform", 16, 1.0, 13))
+    points = clouds[:, :12]
+    found = encode(clouds, made, ["distance", "delta"])
+    joined = per_point(found, points)
+    assert joined.shape == (2, 12, 4 * 16 + 3)
+    torch.testing.assert_close(joined[..., -3:], normalised(clouds, "unit_ball").clouds[:, :12])
+    assert torch.equal(joined[:, 5, :-3], channels(found).flatten(1))
+    moved = per_point(encode(clouds * 7 - 3, made, ["distance", "delta"]), points * 7 - 3)
+    torch.testing.assert_close(moved, joined, rtol=0, atol=1e-12)
+    turn = torch.from_numpy(Rotation.random(rng=5).as_matrix())
+    one = per_point(encode(clouds, made, rotation_invariant=True), points)
+    other = per_point(encode(clouds @ turn, made, rotation_invariant=True), points @ turn)
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-10)
+
+
+# Rotations
+
+
+def turned(cloud, seed):
+    """A rotation of coordinates and normals."""
+    turn = torch.from_numpy(Rotation.random(rng=seed).as_matrix()).to(cloud.dtype)
+    return torch.cat([cloud[..., :3] @ turn, cloud[..., 3:6], cloud[..., 6:9] @ turn, cloud[..., 9:]], -1)
+
+
+def invariant(clouds, made):
+    features = ["distance", "delta", "normal", "color"]
+    return channels(encode(clouds, made, features, "unit_ball", COLUMNS, rotation_invariant=True))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_rotation_changes_nothing_where_that_is_asked_for(dtype):
+    stretch = torch.tensor([3.0, 2, 1, *[1] * 7], dtype=dtype)
+    clouds = (numbers(8, 500, 10).to(dtype).abs() - 0.3) * stretch
+    made = prepared(basis("ball_uniform", 64, 1.0, 13).to(dtype))
+    wanted = invariant(clouds, made)
+    for seed in range(5):
+        found = invariant(turned(clouds, seed), made)
+        # where another point has become the nearest, by rounding, all but the distance jumps
+        same = (found - wanted).abs().amax(1) <= (1e-5 if dtype == torch.float32 else 1e-12)
+        assert same.double().mean() > (0.995 if dtype == torch.float32 else 1 - 1e-9)
+        torch.testing.assert_close(
+            found[:, 0], wanted[:, 0], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-12
+        )
+    plain = channels(encode(clouds, made)) - channels(encode(turned(clouds, 0), made))
+    assert plain.abs().max() > 0.1
+
+
+@pytest.mark.parametrize("planes", [1, 2, 3])
+def test_mirror_planes_do_no_harm(planes):
+    cloud = (numbers(200, 10).abs() - 0.3) * torch.tensor([3.0, 2, 1, *[1] * 7], dtype=torch.float64)
+    for axis in range(planes):
+        mirror = torch.ones(10, dtype=torch.float64)
+        mirror[[axis, 6 + axis]] = -1
+        cloud = torch.cat([cloud, cloud * mirror])
+    made = prepared(basis("ball_uniform", 64, 1.0, 13))
+    wanted = invariant(cloud[None], made)[:, 0]
+    for seed in range(10):
+        found = invariant(turned(cloud[None], seed), made)[:, 0]
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-10)
+
+
+def test_a_mirrored_cloud_is_another():
+    cloud = numbers(1, 300, 10).abs() * torch.tensor([3.0, 2, 1, *[1] * 7], dtype=torch.float64)
+    made = prepared(basis("ball_uniform", 64, 1.0, 13))
+    mirrored = cloud * torch.tensor([-1.0, *[1] * 9], dtype=torch.float64)
+    assert (invariant(mirrored, made) - invariant(cloud, made))[:, 0].abs().max() > 0.05
+
+
+def test_outliers_turn_no_frame_of_a_robust_encoding():
+    cloud = numbers(1, 300, 3).abs() * torch.tensor([3.0, 2, 1], dtype=torch.float64)
+    cloud = cloud / cloud.norm(dim=-1).median()
+    cloud = cloud[:, cloud[0].norm(dim=-1) < 1.5]
+    far = torch.cat([cloud, torch.tensor([[[1e3, -2e3, 5e3]] * 20], dtype=torch.float64)], 1)
+    made = prepared(basis("ball_uniform", 64, 1.0, 13))
+    frames = [encode(some, made, normalise="robust", rotation_invariant=True).frame for some in (cloud, far)]
+    torch.testing.assert_close(frames[0], frames[1], rtol=0, atol=1e-12)
+
+
+# The encoder
+
+
+def test_channels_come_one_after_the_other_and_x_is_slowest():
+    clouds = batch_of([30, 12])
+    made = encoder(basis="grid", points=8, features=["delta", "distance"]).double()
+    grid = made(clouds)
+    assert grid.shape == (2, *made.output_shape) == (2, 4, 2, 2, 2)
+    found = encode(clouds, made.prepared(), ["delta", "distance"])
+    for number in range(8):
+        x, y, z = number // 4, number // 2 % 2, number % 2
+        assert made.basis[number].tolist() == [2 * x - 1, 2 * y - 1, 2 * z - 1]
+        assert torch.equal(grid[:, :3, x, y, z], found.features["delta"][:, number])
+        assert torch.equal(grid[:, 3, x, y, z], found.features["distance"][:, number])
+    flat = encoder(points=8, features=["distance", "delta"]).double()
+    assert flat.output_shape == (32,)
+    wanted = encode(clouds, flat.prepared(), ["distance", "delta"]).features
+    assert torch.equal(flat(clouds)[:, :8], wanted["distance"])
+    assert torch.equal(flat(clouds)[:, 8:].unflatten(1, (3, 8)), wanted["delta"].mT)
+
+
+def test_the_basis_is_stored_and_followed_when_it_is_loaded_cast_or_copied():
+    clouds = batch_of([30, 12], dtype=torch.float32)
+    made, other = encoder(points=16), encoder(points=16, basis_seed=14)
+    assert set(made.state_dict()) == {"basis"}
+    assert made.fixed
+    assert not list(made.parameters())
+    before = other(clouds)
+    other.load_state_dict(made.state_dict())
+    assert not torch.equal(other(clouds), before)
+    assert torch.equal(other(clouds), made(clouds))
+    assert torch.equal(copy.deepcopy(other)(clouds), made(clouds))
+    double = made.double()(clouds.double())
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double, other(clouds).double(), rtol=0, atol=5e-7)
+    with torch.inference_mode():
+        assert torch.equal(encoder(points=16)(clouds), other(clouds))
+
+
+def test_the_runs_seed_has_no_part_in_it():
+    clouds = batch_of([30])
+    torch.manual_seed(1)
+    first = encoder()(clouds)
+    torch.manual_seed(2)
+    assert torch.equal(encoder()(clouds), first)
+
+
+def test_features_that_are_not_there_are_refused():
+    with pytest.raises(
+        ConfigError, match=r"'color' wants a column 'red' of the clouds, whose columns are not named"
+    ):
+        encoder(features=["color"])
+    with pytest.raises(ConfigError, match=r"'nromal' wants .* are x, y, z, red.* Did you mean 'normal'\?"):
+        encoder((40, 10), COLUMNS, features=["nromal"])
+    with pytest.raises(ConfigError, match="names one twice"):
+        encoder(features=["distance", "distance"])
+    with pytest.raises(ConfigError, match="wants a column 'normal_y'"):
+        encode(
+            batch_of([5], 4),
+            prepared(basis("grid", 8, 1.0, 13)),
+            ["normal_x"],
+            columns=("x", "y", "z", "normal_x"),
+            rotation_invariant=True,
+        )
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"points": 0},
+        {"radius": 0},
+        {"radius": math.inf},
+        {"features": []},
+        {"basis": "cube"},
+        {"basis_seed": -1},
+    ],
+)
+def test_a_config_out_of_range_is_refused(config):
+    with pytest.raises(ConfigError, match=r"encoder\."):
+        encoder(**config)
+
+
+@pytest.mark.parametrize("factor", [1e8, 1e-8])
+def test_clouds_that_were_not_normalised_are_refused_by_none(factor):
+    clouds = normalised(batch_of([30, 12]), "unit_ball").clouds
+    made = encoder(normalise="none").double()
+    torch.testing.assert_close(made(clouds), encoder().double()(clouds), rtol=0, atol=1e-6)
+    with pytest.raises(DataError, match=r"Cloud 0 of the batch reaches .* encoder bps with normalise=none"):
+        made(clouds * factor)
+
+
+@pytest.mark.parametrize("rotation_invariant", [False, True])
+def test_an_empty_batch_has_no_features(rotation_invariant):
+    made = encoder(
+        basis="grid", points=27, features=["distance", "delta"], rotation_invariant=rotation_invariant
+    )
+    assert made(torch.zeros(0, 40, 3)).shape == (0, 4, 3, 3, 3)

@@ -1,0 +1,1 @@
+"""Point clouds on grids: occupancy, truncated distances, and a 3D network."""

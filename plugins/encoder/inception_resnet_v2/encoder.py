@@ -1,0 +1,99 @@
+"""Inception-ResNet-v2 up to its global average pooling, as the thesis uses it for PASCAL3D+ (§3.6.1)."""
+
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+from plugins.encoder.inception_resnet_v2.layers import (
+    ConvNorm,
+    block8,
+    block17,
+    block35,
+    mixed_5b,
+    mixed_6a,
+    mixed_7a,
+)
+from plugins.encoder.inception_resnet_v2.weights import fill_from_file
+
+SMALLEST = 75
+
+
+class InceptionResNetV2(Encoder):
+    """Inception-ResNet-v2 for large images: 54.3 million parameters, random or from a local weight file.
+
+    The names and shapes of its weights are those of timm's `inception_resnet_v2`, so that such a file loads
+    name by name; the classifier's are left out. Images are scaled to [-1, 1], as that file wants them; one
+    channel is repeated to three.
+
+    Args:
+        input_shape: (channels, height, width), 1 or 3 channels, at least 75 × 75 pixels; the published
+            network reads 299 × 299.
+        weights: a local file (`weights.read_weights`), or None to start from random weights.
+        dropout: probability of dropping a feature.
+
+    Raises:
+        ConfigError: the input is not an image, or too small; there is no such weight file.
+        CheckpointError: the weights do not fit, or are damaged.
+    """
+
+    bibtex = """@inproceedings{szegedy2017inception,
+  author    = {Szegedy, Christian and Ioffe, Sergey and Vanhoucke, Vincent and Alemi, Alexander A.},
+  title     = {Inception-v4, Inception-ResNet and the Impact of Residual Connections on Learning},
+  booktitle = {AAAI Conference on Artificial Intelligence},
+  pages     = {4278--4284},
+  year      = {2017}
+}"""
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        weights: str | None = None,
+        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.2,
+    ) -> None:
+        super().__init__()
+        if len(input_shape) != 3 or input_shape[0] not in (1, 3):
+            raise ConfigError(
+                "inception_resnet_v2 reads images of shape (1 or 3 channels, height, width), this input has "
+                f"the shape {input_shape}. Choose another encoder for it, such as `mlp`."
+            )
+        if min(input_shape[1:]) < SMALLEST:
+            raise ConfigError(
+                f"inception_resnet_v2 needs images of at least {SMALLEST} × {SMALLEST} pixels, these have "
+                f"{input_shape[1]} × {input_shape[2]}. Make the images larger, or choose `biternion_vgg`."
+            )
+        self.conv2d_1a = ConvNorm(3, 32, 3, stride=2, padding="valid")
+        self.conv2d_2a = ConvNorm(32, 32, 3, padding="valid")
+        self.conv2d_2b = ConvNorm(32, 64, 3)
+        self.maxpool_3a = nn.MaxPool2d(3, stride=2)
+        self.conv2d_3b = ConvNorm(64, 80)
+        self.conv2d_4a = ConvNorm(80, 192, 3, padding="valid")
+        self.maxpool_5a = nn.MaxPool2d(3, stride=2)
+        self.mixed_5b = mixed_5b()
+        self.repeat = nn.Sequential(*(block35() for _ in range(10)))
+        self.mixed_6a = mixed_6a()
+        self.repeat_1 = nn.Sequential(*(block17() for _ in range(20)))
+        self.mixed_7a = mixed_7a()
+        self.repeat_2 = nn.Sequential(*(block8() for _ in range(9)))
+        self.block8 = block8(scale=1.0, relu=False)
+        self.conv2d_7b = ConvNorm(2080, 1536)
+        self.dropout = nn.Dropout(dropout)
+        self.output_shape = (1536,)
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        if weights is not None:
+            fill_from_file(self, weights, ignored=("classif.", "classifier."))
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch 1536"]:
+        images = inputs.to(self.conv2d_7b.conv.weight.dtype, memory_format=torch.channels_last)
+        if not inputs.is_floating_point():
+            images = images / 255
+        maps = (images * 2 - 1).expand(-1, 3, -1, -1)  # (x - mean 0.5) / deviation 0.5
+        *layers, dropout = self.children()  # in the order of the constructor
+        for layer in layers:
+            maps = layer(maps)
+        return dropout(maps.mean((2, 3)))

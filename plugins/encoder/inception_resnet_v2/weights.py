@@ -1,0 +1,140 @@
+"""Weights trained elsewhere: fills a network from a local file of named tensors, or says what differs."""
+
+import json
+import logging
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from torch import Tensor, nn
+
+from framework.errors import CheckpointError, ConfigError
+from framework.training.checkpoint import describe_mismatch
+
+_log = logging.getLogger(__name__)
+
+# of the safetensors format, https://github.com/huggingface/safetensors#format
+_DTYPES = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "I64": torch.int64,
+    "I32": torch.int32,
+}
+
+
+def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...]) -> None:
+    """Copy the weights of `file` into `network`, name by name.
+
+    Args:
+        network: whose `state_dict` names the weights.
+        file: what `read_weights` reads.
+        ignored: beginnings of names the network has no use for, such as the classifier's; they may be absent.
+
+    Raises:
+        ConfigError: there is no such file.
+        CheckpointError: it cannot be read, or its names or shapes are not the network's.
+    """
+    found = read_weights(file)
+    kept = {name: tensor for name, tensor in found.items() if not name.startswith(ignored)}
+    if len(kept) < len(found):
+        names = ", ".join(sorted(found.keys() - kept.keys()))
+        _log.info("%s: ignored %s, not used here.", file, names)
+    wanted = network.state_dict()
+    # Batch norm counts its batches since torch 0.4.1 only; older files lack the count, and nothing reads it.
+    counters = {name: tensor for name, tensor in wanted.items() if name.endswith(".num_batches_tracked")}
+    kept = counters | kept
+    mismatch = describe_mismatch(wanted, kept)
+    if mismatch:
+        raise CheckpointError(
+            f"{file} does not fit {type(network).__name__}: {mismatch} Give a file with its names and shapes."
+        )
+    network.load_state_dict(kept)
+
+
+def read_weights(file: str) -> dict[str, Shaped[Tensor, "..."]]:
+    """Named tensors, on the CPU, from a `.safetensors` file or from what `torch.save` wrote (`.pth`, `.pt`).
+
+    The tensors of a torch file may lie under the key "state_dict" or "model", and their names may begin with
+    "module.", as training scripts write them. Damage is found by the checksums of torch's format;
+    `.safetensors` and files older than torch 1.6 have none, so there only damage to the structure shows.
+
+    Raises:
+        ConfigError: there is no such file.
+        CheckpointError: it is damaged, holds more than plain values, or no named tensors.
+    """
+    path = Path(file).expanduser()
+    if not path.is_file():
+        raise ConfigError(
+            f"There is no weight file {path}. Nothing is downloaded: fetch the weights yourself and give "
+            "their path."
+        )
+    content = _safetensors(path) if path.suffix == ".safetensors" else _torch(path)
+    for key in ("state_dict", "model"):
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            content = content[key]
+    if not isinstance(content, Mapping) or not content or not all(map(torch.is_tensor, content.values())):
+        raise CheckpointError(
+            f"{path} holds no named tensors; wanted what `torch.save(network.state_dict(), ...)` writes."
+        )
+    return {str(name).removeprefix("module."): tensor for name, tensor in content.items()}
+
+
+def _torch(path: Path) -> Any:
+    try:
+        # torch does not check the checksums in its own zip: a flipped bit would load as another number
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                # nor does it read a part marked as a folder (attribute 0x10): its tensor stays uninitialised
+                folders = [part.filename for part in archive.infolist() if part.external_attr & 0x10]
+                failed = archive.testzip() or next(iter(folders), None)
+            if failed:
+                raise ValueError(f"its part {failed} fails its checksum")
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except UnpicklingError as error:
+        raise CheckpointError(
+            f"{path} is no file of plain tensors ({_first_line(error)}). Reading anything else could run "
+            "code: save it again where it comes from, with `torch.save(network.state_dict(), ...)`."
+        ) from None
+    except Exception as error:  # on damaged bytes zipfile and torch raise a dozen kinds, AssertionError too
+        raise _damaged(path, _first_line(error)) from None
+
+
+def _safetensors(path: Path) -> dict[str, Tensor]:
+    """Eight bytes: length of the header; the header, JSON: type, shape and place by name; the numbers."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or 8 + length > len(data):
+        raise _damaged(path, "it is cut short")
+    try:
+        header = json.loads(data[8 : 8 + length])
+        header.pop("__metadata__", None)
+        body = bytearray(data[8 + length :])
+        return {name: _tensor(body, **entry) for name, entry in header.items()}
+    except (ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise _damaged(path, _first_line(error)) from None
+
+
+def _tensor(body: bytearray, dtype: str, shape: list[int], data_offsets: list[int]) -> Tensor:
+    if dtype not in _DTYPES:
+        raise ValueError(f"numbers of type {dtype} are not read, only {', '.join(_DTYPES)}")
+    kind, (start, end), count = _DTYPES[dtype], data_offsets, math.prod(shape)
+    if not 0 <= start <= end <= len(body) or end - start != count * kind.itemsize:
+        raise ValueError(f"bytes {start} to {end} of {len(body)} do not hold {shape} of {dtype}")
+    if count == 0:
+        return torch.empty(shape, dtype=kind)
+    return torch.frombuffer(body, dtype=kind, count=count, offset=start).reshape(shape)
+
+
+def _damaged(path: Path, why: str) -> CheckpointError:
+    return CheckpointError(f"The weight file {path} is damaged: {why}. Fetch it again.")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+import torch
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError
+from plugins.encoder.mlp.encoder import MLP
+
+
+def by_hand(encoder, inputs):
+    """The layers in NumPy: linear, (x - mean) / √(var + ε) with the running moments, ReLU."""
+    state = {name: value.double().numpy() for name, value in encoder.state_dict().items()}
+    numbers = inputs.reshape(len(inputs), -1).astype(np.float64)
+    for index, layer in enumerate(encoder.layers):
+        if isinstance(layer, torch.nn.Linear):
+            numbers = numbers @ state[f"layers.{index}.weight"].T + state.get(f"layers.{index}.bias", 0)
+        elif isinstance(layer, torch.nn.BatchNorm1d):
+            mean, variance = state[f"layers.{index}.running_mean"], state[f"layers.{index}.running_var"]
+            numbers = (numbers - mean) / np.sqrt(variance + layer.eps)
+            numbers = numbers * state[f"layers.{index}.weight"] + state[f"layers.{index}.bias"]
+        elif isinstance(layer, torch.nn.ReLU):
+            numbers = np.maximum(numbers, 0)
+    return numbers
+
+
+@pytest.mark.parametrize("batch_norm", [False, True])
+@pytest.mark.parametrize("shape, widths", [((7,), [5]), ((3, 4, 2), [16, 8, 4]), ((1,), [1]), ((2, 3), [])])
+def test_agrees_with_numpy(shape, widths, batch_norm):
+    torch.manual_seed(0)
+    config = resolve("encoder", {"name": "mlp", "widths": widths, "batch_norm": batch_norm, "dropout": 0.3})
+    encoder = build("encoder", config, input_shape=shape)
+    encoder(torch.randn(50, *shape) * 3 + 1)  # gives the running moments something to hold
+    inputs = torch.randn(6, *shape)
+    found = encoder.eval()(inputs)
+    assert found.shape == (6, *encoder.output_shape)
+    assert found.dtype == torch.float32
+    np.testing.assert_allclose(found.detach().numpy(), by_hand(encoder, inputs.numpy()), rtol=1e-4, atol=1e-5)
+
+
+def test_bytes_are_read_as_0_to_1():
+    torch.manual_seed(0)
+    encoder = MLP((1, 4, 4), widths=[3]).eval()
+    pixels = torch.randint(0, 256, (5, 1, 4, 4), dtype=torch.uint8)
+    torch.testing.assert_close(encoder(pixels), encoder(pixels.float() / 255))
+
+
+def test_float64_stays_float64():
+    encoder = MLP((4,), widths=[3]).double()
+    assert encoder(torch.randn(2, 4, dtype=torch.float64)).dtype == torch.float64
+
+
+@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("batch_norm", [False, True])
+def test_an_empty_batch_gives_no_features(training, batch_norm):
+    encoder = MLP((4,), widths=[3, 2], batch_norm=batch_norm).train(training)
+    assert encoder(torch.randn(0, 4)).shape == (0, 2)
+
+
+def test_dropout_acts_in_training_alone():
+    torch.manual_seed(0)
+    encoder = MLP((4,), widths=[1000], dropout=0.25)
+    inputs = torch.ones(1, 4)
+    kept = encoder.eval()(inputs)
+    dropped = encoder.train()(inputs)
+    alive = kept > 0
+    share = (dropped[alive] == 0).double().mean().item()
+    assert share == pytest.approx(0.25, abs=0.1)  # about 500 units: five standard errors
+    still = alive & (dropped > 0)
+    torch.testing.assert_close(dropped[still], kept[still] / 0.75)
+
+
+def test_a_gradient_reaches_every_parameter():
+    torch.manual_seed(0)
+    encoder = MLP((4,), widths=[8, 8], batch_norm=True)
+    encoder(torch.randn(16, 4)).square().sum().backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in encoder.parameters())
+
+
+def test_refuses_samples_without_numbers():
+    with pytest.raises(ConfigError, match="hold no numbers"):
+        MLP((3, 0, 4))
+
+
+@pytest.mark.parametrize(
+    "config", [{"widths": [0]}, {"dropout": 1.0}, {"dropout": float("nan")}, {"width": [3]}]
+)
+def test_refuses_a_config_out_of_range(config):
+    with pytest.raises(ConfigError, match=r"encoder\."):
+        resolve("encoder", {"name": "mlp", **config})

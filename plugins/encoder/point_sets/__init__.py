@@ -1,0 +1,1 @@
+"""Networks that read point sets: PointNet and DeepSets."""

@@ -1,0 +1,88 @@
+"""Deep Sets (Zaheer et al. 2017), as for point clouds."""
+
+from typing import Annotated, Literal
+
+from jaxtyping import Float, Int
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.encoder import Encoder
+from framework.geometry.clouds import Normalisation
+from plugins.encoder.point_sets.point_sets import Reading, columns_read, largest, over_points, to_points
+
+Width = Annotated[int, Field(gt=0)]
+ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
+
+
+class DeepSets(Encoder):
+    """Equivariant layers: each point's numbers relative to the largest over its cloud; then the maximum over the cloud.
+
+    x ↦ σ(β + (x - 1 max x) Γ), the layer that the paper uses on clouds. Neither the order of the points nor padding
+    changes the features; nor does what all points have in common, so that a shift of the cloud does not either.
+
+    Args:
+        input_shape: (points, columns).
+        channels: of the equivariant layers.
+        widths: of the layers after the maximum; the last is the length of the features.
+        activation: σ.
+        dropout: before and after the layers that follow the maximum.
+        points: of each cloud at most so many are read, the first; None for all. 100 is the thesis's "micro".
+        normalise: as of framework.geometry.clouds.normalised.
+        attributes: whether columns after x, y, z are read too.
+
+    Raises:
+        ConfigError: the input is no cloud, or has no attributes to read.
+    """
+
+    bibtex = """@inproceedings{zaheer2017deep,
+  author    = {Zaheer, Manzil and Kottur, Satwik and Ravanbakhsh, Siamak and P{\\'o}czos, Barnab{\\'a}s and Salakhutdinov, Ruslan and Smola, Alexander J.},
+  title     = {Deep Sets},
+  booktitle = {Advances in Neural Information Processing Systems},
+  year      = {2017}
+}"""  # noqa: E501
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        channels: Annotated[list[Width], Field(min_length=1)] = [256, 256, 256],  # noqa: B006 - never written
+        widths: Annotated[list[Width], Field(min_length=1)] = [256],  # noqa: B006
+        activation: Literal["tanh", "elu"] = "tanh",
+        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.5,
+        points: Annotated[int, Field(gt=0)] | None = None,
+        normalise: Normalisation = "unit_ball",
+        attributes: bool = False,
+    ) -> None:
+        super().__init__()
+        columns = columns_read(input_shape, "encoder deepsets", attributes)
+        self.reading = Reading(columns, points, normalise)
+        lengths = [columns, *channels]
+        self.equivariant = nn.ModuleList(
+            nn.Linear(before, after) for before, after in zip(lengths, channels, strict=False)
+        )
+        self.activation = ACTIVATION[activation]()
+        after: list[nn.Module] = [nn.Dropout(dropout)]
+        length = channels[-1]
+        for width in widths:
+            after += [nn.Linear(length, width), ACTIVATION[activation](), nn.Dropout(dropout)]
+            length = width
+        self.whole = nn.Sequential(*after)
+        self.output_shape = (length,)
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        dtype = next(self.parameters()).dtype
+        return over_points(self._described, inputs, self.reading, dtype, training=self.training)
+
+    def _described(
+        self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "batch length"]:
+        for layer in self.equivariant:
+            values = self.activation(layer(below_largest(values, counts)))  # Zaheer et al. 2017, §4.2
+        return self.whole(largest(values, counts))
+
+
+def below_largest(
+    values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
+) -> Float[Tensor, "point channels"]:
+    """x - 1 max x, over each cloud."""
+    return values - to_points(largest(values, counts), counts)

@@ -1,0 +1,134 @@
+"""PointNet (Qi et al. 2017), for classification."""
+
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float, Int
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.encoder import Encoder
+from framework.geometry.clouds import Normalisation
+from plugins.encoder.point_sets.point_sets import Reading, columns_read, largest, over_points
+
+Width = Annotated[int, Field(gt=0)]
+LOCAL = 2
+"""Layers that every point passes before its features are transformed."""
+
+
+class PointNet(Encoder):
+    """Every point passes the same layers; the largest number of each channel over the cloud describes it.
+
+    "full" also predicts from the cloud a 3 × 3 matrix that every point is multiplied by, and one that the features of
+    every point are multiplied by after two layers. The paper adds a term to the loss that keeps the latter near a
+    rotation; an encoder has no loss, so it is left out here. "vanilla" has no such matrices. Every layer has batch norm
+    and ReLU. Neither the order of the points nor padding changes the features.
+
+    Args:
+        input_shape: (points, columns).
+        variant: which of the two.
+        point_widths: of the layers that every point passes; the matrices are predicted by those after the second.
+        widths: of the layers after the maximum; the last is the length of the features.
+        dropout: after the last layer.
+        points: of each cloud at most so many are read, the first; None for all.
+        normalise: as of framework.geometry.clouds.normalised.
+        attributes: whether columns after x, y, z are read too; the first matrix leaves them alone.
+
+    Raises:
+        ConfigError: the input is no cloud, or has no attributes to read.
+    """
+
+    bibtex = """@inproceedings{qi2017pointnet,
+  author    = {Qi, Charles R. and Su, Hao and Mo, Kaichun and Guibas, Leonidas J.},
+  title     = {{PointNet}: Deep Learning on Point Sets for {3D} Classification and Segmentation},
+  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
+  pages     = {652--660},
+  year      = {2017}
+}"""
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        variant: Literal["full", "vanilla"] = "full",
+        point_widths: Annotated[list[Width], Field(min_length=LOCAL + 1)] = [64, 64, 64, 128, 1024],  # noqa: B006 - never written
+        widths: Annotated[list[Width], Field(min_length=1)] = [512, 256],  # noqa: B006
+        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.3,
+        points: Annotated[int, Field(gt=0)] | None = None,
+        normalise: Normalisation = "unit_ball",
+        attributes: bool = False,
+    ) -> None:
+        super().__init__()
+        columns = columns_read(input_shape, "encoder pointnet", attributes)
+        self.reading = Reading(columns, points, normalise)
+        after = point_widths[LOCAL:]
+        full = variant == "full"
+        self.input_matrix = Matrix(3, after, widths) if full else None
+        self.local = layers(columns, point_widths[:LOCAL])
+        self.feature_matrix = Matrix(point_widths[LOCAL - 1], after, widths) if full else None
+        self.deep = layers(point_widths[LOCAL - 1], after)
+        self.whole = layers(after[-1], widths)
+        self.dropout = nn.Dropout(dropout)
+        self.output_shape = (widths[-1],)
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        dtype = next(self.parameters()).dtype
+        return over_points(self._described, inputs, self.reading, dtype, training=self.training)
+
+    def _described(
+        self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "batch length"]:
+        if self.input_matrix is not None:
+            turned = multiplied(values[:, :3], self.input_matrix(values[:, :3], counts), counts)
+            values = torch.cat([turned, values[:, 3:]], 1)
+        values = self.local(values)
+        if self.feature_matrix is not None:
+            values = multiplied(values, self.feature_matrix(values, counts), counts)
+        return self.dropout(self.whole(largest(self.deep(values), counts)))
+
+
+class Matrix(nn.Module):
+    """A square matrix predicted from a cloud by a small PointNet; near the identity before training.
+
+    Args:
+        size: rows and columns; also the numbers of a point.
+        point_widths: of the layers that every point passes.
+        widths: of the layers after the maximum.
+    """
+
+    def __init__(self, size: int, point_widths: list[int], widths: list[int]) -> None:
+        super().__init__()
+        self.size = size
+        self.each = layers(size, point_widths)
+        self.whole = layers(point_widths[-1], widths)
+        self.entries = nn.Linear(widths[-1], size * size)
+        with (
+            torch.no_grad()
+        ):  # small, not 0 as in the paper: so gradient reaches the layers before it at once
+            self.entries.weight.mul_(0.01)
+            self.entries.bias.copy_(torch.eye(size).flatten())
+
+    def forward(
+        self, values: Float[Tensor, "point size"], counts: Int[Tensor, "batch"]
+    ) -> Float[Tensor, "batch size size"]:
+        entries = self.entries(self.whole(largest(self.each(values), counts)))
+        return entries.unflatten(1, (self.size, self.size))
+
+
+def multiplied(
+    values: Float[Tensor, "point size"],
+    matrices: Float[Tensor, "batch size size"],
+    counts: Int[Tensor, "batch"],
+) -> Float[Tensor, "point size"]:
+    """Every point times the matrix of its cloud."""
+    parts = zip(values.split(counts.tolist()), matrices, strict=True)
+    return torch.cat([values[:0], *(part @ matrix for part, matrix in parts)])
+
+
+def layers(length: int, widths: list[int]) -> nn.Sequential:
+    """Linear, batch norm, ReLU for each width; batch norm has the bias."""
+    found: list[nn.Module] = []
+    for width in widths:
+        found += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
+        length = width
+    return nn.Sequential(*found)

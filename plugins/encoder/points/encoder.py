@@ -1,0 +1,62 @@
+"""The points themselves, as many of each cloud."""
+
+from typing import Annotated
+
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.encoder import Encoder
+from framework.geometry.clouds import Normalisation, normalised, require_clouds, sizes
+from plugins.encoder.points.subset import Choice, chosen
+
+
+class Points(Encoder):
+    """A fixed number of points of each normalised cloud, with their attributes: what networks on point sets read.
+
+    Args:
+        input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
+        points: how many; smaller clouds repeat theirs.
+        choice: "random", or "farthest" from those chosen before (`plugins.encoder.points.subset`).
+        normalise: as `framework.geometry.clouds.normalised`, of the whole cloud.
+        seed: of "random"; the run's seed has no part in it.
+
+    Features are (points, columns), of the clouds' dtype.
+
+    Raises:
+        ConfigError: an input that is no cloud.
+    """
+
+    fixed = True
+    bibtex = """@article{eldar1997farthest,
+  title = {The Farthest Point Strategy for Progressive Image Sampling},
+  author = {Eldar, Yuval and Lindenbaum, Michael and Porat, Moshe and Zeevi, Yehoshua Y.},
+  journal = {IEEE Transactions on Image Processing},
+  volume = {6},
+  number = {9},
+  pages = {1305--1315},
+  year = {1997}
+}"""
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        points: Annotated[int, Field(gt=0, le=10_000_000)] = 1024,
+        choice: Choice = "random",
+        normalise: Normalisation = "unit_ball",
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 13,
+    ) -> None:
+        super().__init__()
+        require_clouds(input_shape, by="encoder points")
+        self.points = points
+        self.choice: Choice = choice
+        self.normalise: Normalisation = normalise
+        self.seed = seed
+        self.output_shape = (points, input_shape[1])
+
+    def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        counts = sizes(inputs)
+        clouds = normalised(inputs, self.normalise, counts).clouds
+        index = chosen(clouds, counts, self.points, self.choice, self.seed)
+        return clouds.gather(1, index[..., None].expand(-1, -1, clouds.shape[2]))

@@ -1,0 +1,110 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError
+from framework.geometry.clouds import normalised, pad
+from plugins.encoder.points.farthest import farthest
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def encoder(shape=(40, 3), **config):
+    return build("encoder", resolve("encoder", {"name": "points", **config}), input_shape=shape)
+
+
+def batch_of(lengths, columns=3, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(0)
+    clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
+    return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])
+
+
+def by_hand(cloud, count):
+    """Farthest-point sampling, all distances anew at each step, no point twice before all were chosen."""
+    start = np.linalg.norm(cloud - cloud.mean(0), axis=1)
+    chosen = [int(start.argmax())]
+    while len(chosen) < min(count, len(cloud)):
+        distance = np.linalg.norm(cloud[:, None] - cloud[chosen], axis=-1).min(1)
+        distance[chosen] = -1
+        chosen.append(int(distance.argmax()))
+    return [chosen[number % len(cloud)] for number in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 5, 30, 77])
+def test_farthest_points_agree_with_a_loop(count):
+    lengths = [30, 1, 12]
+    clouds = batch_of(lengths)
+    found = farthest(clouds.numpy(), np.array(lengths), count)
+    for number, length in enumerate(lengths):
+        assert found[number].tolist() == by_hand(clouds[number, :length].numpy(), count)
+
+
+@given(
+    st.lists(st.tuples(*[st.sampled_from([-1.0, 0.0, 1.0])] * 3), min_size=1, max_size=20), st.integers(1, 30)
+)
+@settings(max_examples=60, deadline=None)
+def test_of_duplicates_each_is_taken_once_before_any_is_twice(points, count):
+    cloud = np.array(points)
+    found = farthest(cloud[None], np.array([len(cloud)]), count)[0]
+    assert len(set(found[: len(cloud)])) == min(count, len(cloud))
+    # no later point is farther from those before it than an earlier one was, but for the first
+    gaps = [
+        np.linalg.norm(cloud[found[:step]] - cloud[found[step]], axis=1).min()
+        for step in range(1, len(found))
+    ]
+    assert all(after <= before + 1e-12 for before, after in itertools.pairwise(gaps))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("choice", ["random", "farthest"])
+@pytest.mark.parametrize("normalise", ["unit_ball", "robust", "none"])
+def test_points_are_those_of_the_normalised_cloud_with_their_attributes(normalise, choice, dtype):
+    lengths, count = [40, 3, 16], 16
+    clouds = batch_of(lengths, 5, dtype)
+    found = encoder((40, 5), points=count, choice=choice, normalise=normalise)(clouds)
+    assert found.dtype == dtype
+    local = normalised(clouds, normalise).clouds
+    for number, length in enumerate(lengths):
+        rows = [local[number, :length].tolist().index(row) for row in found[number].tolist()]
+        if length >= count:
+            assert len(set(rows)) == count  # none twice
+        else:
+            assert rows == rows[:length] * (count // length) + rows[: count % length]
+            assert sorted(rows[:length]) == list(range(length))  # all of them, in turn
+
+
+def test_random_points_follow_from_the_seed_and_the_size_alone():
+    clouds = batch_of([40, 40, 7])
+    torch.manual_seed(1)
+    first = encoder(points=8)(clouds)
+    torch.manual_seed(2)
+    assert torch.equal(encoder(points=8)(clouds), first)
+    assert torch.equal(encoder(points=8)(clouds[1:2])[0], first[1])
+    assert not torch.equal(encoder(points=8, seed=14)(clouds), first)
+    assert torch.equal(encoder(points=8)(clouds.flip(0)).flip(0), first)
+
+
+def test_the_gradient_reaches_the_points_that_were_taken():
+    clouds = batch_of([9, 9], 4).requires_grad_()
+    assert torch.autograd.gradcheck(
+        encoder((9, 4), points=4, choice="farthest"), (clouds,), eps=1e-6, atol=1e-6
+    )
+
+
+def test_the_features_are_fixed_and_nothing_is_learned():
+    for choice in ("random", "farthest"):
+        made = encoder((40, 4), points=8, choice=choice)
+        assert made.fixed
+        assert not made.state_dict()
+        assert made(torch.zeros(0, 40, 4)).shape == made(torch.zeros(0, 0, 4)).shape == (0, 8, 4)
+
+
+@pytest.mark.parametrize("config", [{"points": 0}, {"choice": "first"}, {"seed": -1}, {"normalise": "ball"}])
+def test_a_config_out_of_range_is_refused(config):
+    with pytest.raises(ConfigError, match=r"encoder\."):
+        encoder(**config)

@@ -1,0 +1,54 @@
+"""Accuracy and its standard error, from two counts."""
+
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from framework.distributions.class_probabilities import require_labels
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+
+
+class Accuracy(Metric):
+    """Share of samples whose likeliest class is the true one (thesis Table 2.1), with its standard error.
+
+    Of classes that are equally likely the first is taken.
+
+    Raises:
+        ConfigError: the target is no class.
+        UserError: a density without class probabilities, or with NaN among them.
+        DataError: a label that is no class.
+    """
+
+    bibtex = """@book{hastie2009elements,
+  author    = {Hastie, Trevor and Tibshirani, Robert and Friedman, Jerome},
+  title     = {The Elements of Statistical Learning},
+  edition   = {2nd},
+  publisher = {Springer},
+  year      = {2009}
+}"""
+    columns: ClassVar[dict[str, str]] = {"accuracy": "accuracy"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"accuracy": "higher"}
+    count: Tensor
+    right: Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("class", by="metric accuracy")
+        zero = torch.zeros((), dtype=torch.float64)
+        self.add_state("count", zero, dist_reduce_fx="sum")
+        self.add_state("right", zero.clone(), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        probability = prediction.class_probabilities
+        label = require_labels(prediction.target, probability.shape[-1])
+        self.count += len(label)
+        self.right += (probability.argmax(-1) == label).sum()
+
+    def compute(self) -> dict[str, Tensor]:
+        share = self.right / self.count
+        # the sample variance of zeros and ones is n a (1 - a) / (n - 1); one sample has none: 0/0
+        error = (share * (1 - share) / (self.count - 1).clamp(min=0)).sqrt()
+        return {"accuracy": share, "accuracy_sem": error}

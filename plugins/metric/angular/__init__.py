@@ -1,0 +1,1 @@
+"""Angular deviations: mean and median."""

@@ -1,0 +1,70 @@
+"""Brier score: squared error of class probabilities, and its standard error."""
+
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float64, Int
+from torch import Tensor
+
+from framework.distributions.class_probabilities import require_labels
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+
+
+class Brier(Metric):
+    """Mean Brier score, a proper scoring rule of class probabilities (thesis eq. 2.26), with its standard error.
+
+    Of two classes the squared error of the second's probability, in [0, 1]: eq. 2.26 as a mean. Of more, the sum of
+    the squared errors of all probabilities, in [0, 2] (Brier 1950). Of two classes that sum would be twice as large.
+
+    Raises:
+        ConfigError: the target is no class.
+        UserError: a density without class probabilities, or with NaN among them.
+        DataError: a label that is no class.
+    """
+
+    bibtex = """@article{brier1950verification,
+  author  = {Brier, Glenn W.},
+  title   = {Verification of Forecasts Expressed in Terms of Probability},
+  journal = {Monthly Weather Review},
+  volume  = {78},
+  number  = {1},
+  pages   = {1--3},
+  year    = {1950}
+}"""
+    columns: ClassVar[dict[str, str]] = {"brier": "Brier"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"brier": "lower"}
+    count: Tensor
+    total: Tensor
+    squares: Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("class", by="metric brier")
+        zero = torch.zeros((), dtype=torch.float64)
+        self.add_state("count", zero, dist_reduce_fx="sum")
+        self.add_state("total", zero.clone(), dist_reduce_fx="sum")
+        # A sum of squares will do: of scores in [0, 2] float64 resolves a spread of 1e-8.
+        self.add_state("squares", zero.clone(), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        probability = prediction.class_probabilities
+        score = brier(probability, require_labels(prediction.target, probability.shape[-1]))
+        self.count += len(score)
+        self.total += score.sum()
+        self.squares += score.square().sum()
+
+    def compute(self) -> dict[str, Tensor]:
+        mean = self.total / self.count
+        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
+        return {"brier": mean, "brier_sem": (spread / (self.count - 1).clamp(min=0)).sqrt()}
+
+
+def brier(
+    probability: Float64[Tensor, "batch class"], label: Int[Tensor, "batch"]
+) -> Float64[Tensor, "batch"]:
+    """Of each sample (y - p(y = 1))² for two classes (eq. 2.26), Σ_k (p_k - 1[y = k])² for more (Brier 1950, eq. 2)."""
+    classes = probability.shape[-1]
+    error = probability - torch.nn.functional.one_hot(label, classes)
+    return error[:, 1].square() if classes == 2 else error.square().sum(-1)

@@ -1,0 +1,204 @@
+"""Expected calibration error in bins of equal width and of equal mass, and its sampling bias."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import torch
+from jaxtyping import Float64, Int
+from pydantic import Field
+from torch import Tensor
+from torchmetrics.utilities.data import dim_zero_cat
+
+from framework.distributions.class_probabilities import require_labels
+from framework.errors import ConfigError
+from framework.metric import Metric, Pictured
+from framework.prediction import Prediction
+from framework.target import Target
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class CalibrationError(Metric, Pictured):
+    """How far stated confidence is from the share that is right, over bins of confidence (thesis eq. 2.28-2.31).
+
+    - `ece`: expected calibration error in bins of equal width.
+    - `ece_equal_mass`: in bins of equally many samples; equal confidences share a bin, whatever their order.
+    - `mce`: the largest gap of a bin of equal width that is not empty.
+    - `squared_ce_debiased`: the squared calibration error in bins of equal mass less the part that chance adds to it,
+      which may leave it negative. Bins of one sample tell nothing of chance and are left out; NaN where all are.
+    - `ece_debiased`: its root, 0 where it is negative.
+
+    Each is NaN where nothing was seen. A confidence of 1 belongs to the last bin, which the half-open intervals of
+    eq. 2.28 would leave out.
+
+    Args:
+        bins: L of eq. 2.31, of either kind.
+        probability: what is binned. "predicted": the largest class probability, against whether that class is right,
+            the first of equally likely ones (Guo et al. 2017); "positive": p(y = 1) of two classes against y = 1, as
+            eq. 2.28-2.29 have it.
+
+    Raises:
+        ConfigError: the target is no class, or "positive" of more than two.
+        UserError: a density without class probabilities, or with NaN among them.
+        DataError: a label that is no class.
+    """
+
+    bibtex = """@inproceedings{guo2017calibration,
+  author    = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
+  title     = {On Calibration of Modern Neural Networks},
+  booktitle = {International Conference on Machine Learning},
+  pages     = {1321--1330},
+  year      = {2017}
+}
+@inproceedings{kumar2019verified,
+  author    = {Kumar, Ananya and Liang, Percy and Ma, Tengyu},
+  title     = {Verified Uncertainty Calibration},
+  booktitle = {Advances in Neural Information Processing Systems},
+  year      = {2019}
+}"""
+    columns: ClassVar[dict[str, str]] = {"ece": "ECE", "ece_equal_mass": "ECE (equal mass)"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"ece": "lower", "ece_equal_mass": "lower"}
+    picture = "reliability"
+    samples: list[Tensor] | Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        bins: Annotated[int, Field(ge=1, le=1000)] = 15,
+        probability: Literal["predicted", "positive"] = "predicted",
+    ) -> None:
+        super().__init__()
+        target.require("class", by="metric calibration_error")
+        if probability == "positive" and len(target.names) != 2:
+            raise ConfigError(
+                "metric calibration_error with probability=positive reads p(y = 1) of two classes; this data set has "
+                f"{len(target.names)}: {target.told}. Choose probability=predicted."
+            )
+        self.names = target.names
+        self.bins = bins
+        self.positive = probability == "positive"
+        # (confidence, right) of each sample: bins of equal mass are not known before all are seen
+        self.add_state("samples", [], dist_reduce_fx="cat")
+
+    def update(self, prediction: Prediction) -> None:
+        probability = prediction.class_probabilities
+        label = require_labels(prediction.target, probability.shape[-1])
+        if self.positive:
+            confidence, right = probability[:, 1], label == 1
+        else:
+            confidence, predicted = probability.max(-1)
+            right = predicted == label
+        assert isinstance(self.samples, list)
+        self.samples.append(torch.stack([confidence, right.double()], -1))
+
+    def compute(self) -> dict[str, Tensor]:
+        confidence, right = self._seen()
+        width = in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
+        mass = in_bins(confidence, right, equal_mass(confidence, self.bins), self.bins)
+        squared = squared_error_debiased(mass)
+        return {
+            "ece": expected_error(width),
+            "ece_equal_mass": expected_error(mass),
+            "mce": largest_error(width),
+            "ece_debiased": squared.clamp(min=0).sqrt(),
+            "squared_ce_debiased": squared,
+        }
+
+    def figure(self, title: str, *, synthetic: bool) -> "Figure":
+        from plugins.metric.calibration_error.picture import reliability
+
+        confidence, right = self._seen()
+        bins = in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
+        return reliability(
+            bins.count.cpu().numpy(),
+            bins.confidence.cpu().numpy(),
+            bins.right.cpu().numpy(),
+            confidence_label=f"p({self.names[1]})" if self.positive else "confidence in the predicted class",
+            accuracy_label=f"share of {self.names[1]}" if self.positive else "accuracy",
+            title=title,
+            synthetic=synthetic,
+        )
+
+    def _seen(self) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
+        """Confidences, ascending, so that no sum depends on the order in which they came; and which are right."""
+        samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 2, dtype=torch.float64)
+        confidence, order = samples[:, 0].contiguous().sort()
+        return confidence, samples[order, 1]
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Of each bin how many samples it has (|B_l|), and the sums of their confidences and of those right; float64."""
+
+    count: Float64[Tensor, "bin"]
+    confidence: Float64[Tensor, "bin"]
+    right: Float64[Tensor, "bin"]
+
+    @property
+    def seen(self) -> "Bins":
+        """Those that are not empty."""
+        return self.with_at_least(1)
+
+    def with_at_least(self, samples: int) -> "Bins":
+        kept = self.count >= samples
+        return Bins(self.count[kept], self.confidence[kept], self.right[kept])
+
+
+def equal_width(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
+    """Bin l - 1 where (l - 1)/L ≤ confidence < l/L (eq. 2.28); the last for a confidence of 1."""
+    edges = torch.arange(1, bins, dtype=torch.float64, device=confidence.device) / bins
+    return torch.bucketize(confidence, edges, right=True)
+
+
+def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
+    """Bins of as equal numbers of samples as can be (Nguyen & O'Connor 2015) where equal confidences stay together.
+
+    Of n samples in order of confidence the one of rank r = 0, 1, ... belongs to bin ⌊L (r + ½) / n⌋, and equal ones to
+    that of their middle.
+
+    Args:
+        confidence: in any order.
+    """
+    ordered = confidence.sort().values
+    first = torch.searchsorted(ordered, confidence)
+    after = torch.searchsorted(ordered, confidence, right=True)
+    # their middle is (first + after - 1) / 2, and with ½ more (first + after) / 2: in integers, so that nothing rounds
+    return bins * (first + after) // (2 * max(1, len(confidence)))
+
+
+def in_bins(
+    confidence: Float64[Tensor, "sample"],
+    right: Float64[Tensor, "sample"],
+    index: Int[Tensor, "sample"],
+    bins: int,
+) -> Bins:
+    """Counts and sums by bin, `index` being that of each sample."""
+    columns = torch.stack([torch.ones_like(right), confidence, right], -1)
+    return Bins(*columns.new_zeros(bins, 3).index_add_(0, index, columns).unbind(-1))
+
+
+def expected_error(bins: Bins) -> Float64[Tensor, ""]:
+    """Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31) = Σ_l |Σ conf - Σ right| / Q: empty bins add 0. NaN of nothing."""
+    return (bins.confidence - bins.right).abs().sum() / bins.count.sum()
+
+
+def largest_error(bins: Bins) -> Float64[Tensor, ""]:
+    """max_l |conf(B_l) - acc(B_l)| over bins that are not empty (Guo et al. 2017, eq. 5); NaN of nothing."""
+    seen = bins.seen
+    gaps = (seen.confidence - seen.right).abs() / seen.count
+    return gaps.max() if len(gaps) else gaps.new_tensor(torch.nan)
+
+
+def squared_error_debiased(bins: Bins) -> Float64[Tensor, ""]:
+    """Σ_l |B_l|/Q [(conf - acc)² - acc (1 - acc) / (|B_l| - 1)], over bins of two samples or more.
+
+    The plug-in squared error less an unbiased estimate of the variance of acc, which it contains (Bröcker 2012;
+    Kumar et al. 2019, §5). Unbiased where the confidences of a bin are equal; where they spread it is low by about
+    their variance over |B_l|.
+    """
+    several = bins.with_at_least(2)
+    confidence, right = several.confidence / several.count, several.right / several.count
+    squared = (confidence - right).square() - right * (1 - right) / (several.count - 1)
+    return (several.count * squared).sum() / several.count.sum()

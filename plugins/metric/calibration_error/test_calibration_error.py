@@ -1,0 +1,288 @@
+import itertools
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.patches import Rectangle
+from scipy import special
+from scipy.stats import binomtest
+from torch.distributions import Categorical
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.class_probabilities import class_probabilities
+from framework.errors import ConfigError, DataError, UserError
+from framework.metric import Pictured
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.calibration_error.metric import CalibrationError, equal_mass, equal_width
+from plugins.metric.calibration_error.picture import reliability, wilson
+
+TWO = Target("class", ("off", "on"))
+
+
+def predicted(probability, label, dtype=torch.float64):
+    """A batch with these class probabilities."""
+    logits = torch.as_tensor(np.asarray(probability), dtype=dtype).log()
+    return Prediction(Categorical(logits=logits, validate_args=False), {"target": torch.as_tensor(label)})
+
+
+def positive(probability):
+    """Both classes' probabilities from the second's."""
+    probability = np.asarray(probability, dtype=float)
+    return np.stack([1 - probability, probability], -1)
+
+
+def measured(*batches, target=TWO, **config):
+    metric = build("metric", resolve("metric", {"name": "calibration_error", **config}), target=target)
+    for batch in batches:
+        metric.update(batch)
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+def loop_width(confidence, right, bins):
+    """[(count, mean confidence, accuracy)] of the bins of eq. 2.28, one by one; the last one closed."""
+    found = []
+    for number in range(bins):
+        last = number == bins - 1
+        inside = [
+            (c, r)
+            for c, r in zip(confidence, right, strict=True)
+            if number / bins <= c and (last or c < (number + 1) / bins)
+        ]
+        if inside:
+            found.append((len(inside), np.mean([c for c, _ in inside]), np.mean([r for _, r in inside])))
+    return found
+
+
+def loop_mass(confidence, right, bins):
+    """The same of equally many samples; a group of equal confidences goes where its middle lies."""
+    groups = itertools.groupby(sorted(zip(confidence, right, strict=True)), key=lambda pair: pair[0])
+    inside = [[] for _ in range(bins)]
+    before = 0
+    for _, group in groups:
+        pairs = list(group)
+        middle = before + Fraction(len(pairs), 2)
+        inside[math.floor(bins * middle / len(confidence))] += pairs
+        before += len(pairs)
+    return [(len(p), np.mean([c for c, _ in p]), np.mean([r for _, r in p])) for p in inside if p]
+
+
+def expected(found):
+    total = sum(count for count, *_ in found)
+    return sum(count / total * abs(confidence - accuracy) for count, confidence, accuracy in found)
+
+
+def debiased(found):
+    several = [row for row in found if row[0] > 1]
+    total = sum(count for count, *_ in several)
+    if not several:
+        return math.nan
+    return sum(n / total * ((c - a) ** 2 - a * (1 - a) / (n - 1)) for n, c, a in several)
+
+
+def agree(found, confidence, right, bins, tolerance):
+    width, mass = loop_width(confidence, right, bins), loop_mass(confidence, right, bins)
+    assert found["ece"] == pytest.approx(expected(width), abs=tolerance)
+    assert found["ece_equal_mass"] == pytest.approx(expected(mass), abs=tolerance)
+    assert found["mce"] == pytest.approx(max(abs(c - a) for _, c, a in width), abs=tolerance)
+    squared = debiased(mass)
+    assert found["squared_ce_debiased"] == pytest.approx(squared, abs=tolerance, nan_ok=True)
+    root = math.nan if math.isnan(squared) else math.sqrt(max(0, found["squared_ce_debiased"]))
+    assert found["ece_debiased"] == pytest.approx(root, abs=1e-12, nan_ok=True)
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.data(), st.integers(1, 40), st.integers(1, 20))
+def test_positive_agrees_with_loops(data, samples, bins):
+    # edges of bins, both ends, ties and anything between
+    number = st.integers(0, bins).map(lambda k: k / bins) | st.sampled_from([0.0, 0.5, 1.0]) | st.floats(0, 1)
+    probability = np.array(data.draw(st.lists(number, min_size=samples, max_size=samples)))
+    label = np.array(data.draw(st.lists(st.integers(0, 1), min_size=samples, max_size=samples)))
+    cut = data.draw(st.integers(0, samples))
+    batch = [predicted(positive(probability[part]), label[part]) for part in (slice(cut), slice(cut, None))]
+    found = measured(*batch, bins=bins, probability="positive")
+    # what the density gives back: log and exp move a number off the edge of a bin by one rounding
+    seen = class_probabilities(predicted(positive(probability), label).density)[:, 1]
+    np.testing.assert_allclose(seen, probability, atol=1e-15)
+    agree(found, seen.tolist(), label.tolist(), bins, 1e-12)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.data(), st.integers(2, 10), st.integers(1, 40), st.sampled_from([torch.float32, torch.float64]))
+def test_predicted_agrees_with_loops(data, count, samples, dtype):
+    logit = st.sampled_from([0.0, 1.0, -2.0, 1e4, -1e4])
+    row = st.lists(logit, min_size=count, max_size=count)
+    logits = torch.tensor(data.draw(st.lists(row, min_size=samples, max_size=samples)), dtype=dtype)
+    label = data.draw(st.lists(st.integers(0, count - 1), min_size=samples, max_size=samples))
+    target = Target("class", tuple(str(k) for k in range(count)))
+    density = Categorical(logits=logits.log_softmax(-1), validate_args=False)
+    found = measured(Prediction(density, {"target": torch.tensor(label)}), target=target, bins=7)
+    probability = class_probabilities(density).numpy()
+    np.testing.assert_allclose(probability, special.softmax(logits.double().numpy(), -1), atol=1e-6)
+    right = probability.argmax(-1) == np.array(label)  # NumPy's first of equally likely ones
+    agree(found, probability.max(-1).tolist(), right.tolist(), 7, 1e-12)
+
+
+@pytest.mark.parametrize("bins", [*range(1, 31), 100, 1000])
+def test_edges_belong_to_the_bin_above_and_one_to_the_last(bins):
+    edges = torch.tensor([k / bins for k in range(bins + 1)], dtype=torch.float64)
+    assert equal_width(edges, bins).tolist() == [*range(bins), bins - 1]
+    below = torch.nextafter(edges[1:], edges[:1])
+    assert equal_width(below, bins).tolist() == list(range(bins))
+
+
+@pytest.mark.parametrize("bins", [1, 3, 15])
+def test_bins_of_equal_mass_differ_by_one_sample_at_most(bins):
+    for samples in (bins, 50, 1001):
+        order = torch.randperm(samples, generator=torch.Generator().manual_seed(0))
+        confidence = torch.linspace(0, 1, samples, dtype=torch.float64)
+        index = equal_mass(confidence[order], bins)
+        sizes = torch.bincount(index, minlength=bins)
+        assert sizes.max() - sizes.min() <= 1
+        assert torch.equal(index[order.argsort()], index.sort().values)  # a higher confidence, no lower bin
+
+
+def test_equal_confidences_share_a_bin_in_any_order():
+    generator = np.random.default_rng(0)
+    probability = generator.choice([0.2, 0.4, 0.4000001, 0.9], 60)
+    label = generator.integers(2, size=60)
+    wanted = measured(predicted(positive(probability), label), bins=4, probability="positive")
+    for seed in range(20):
+        order = np.random.default_rng(seed).permutation(60)
+        batches = [predicted(positive(probability[part]), label[part]) for part in np.array_split(order, 7)]
+        assert measured(*batches, bins=4, probability="positive") == pytest.approx(wanted, abs=1e-13)
+
+
+def test_a_model_that_is_right_as_often_as_it_says_has_no_error():
+    probability = np.repeat([0.25, 0.5, 0.75], 40)
+    label = np.concatenate([np.arange(40) < 10, np.arange(40) < 20, np.arange(40) < 30]).astype(int)
+    found = measured(predicted(positive(probability), label), probability="positive", bins=4)
+    assert found["ece"] == pytest.approx(0, abs=1e-15) and found["mce"] == pytest.approx(0, abs=1e-15)
+    assert found["squared_ce_debiased"] < 0 and found["ece_debiased"] == 0
+
+
+def test_debiased_is_unbiased_over_every_outcome_where_the_plain_one_is_not():
+    stated, true = np.array([0.3] * 4 + [0.8] * 4), np.array([0.3] * 4 + [0.6] * 4)
+    mean = plain = 0.0
+    for outcome in itertools.product([0, 1], repeat=8):
+        label = np.array(outcome)
+        chance = np.where(label == 1, true, 1 - true).prod()
+        found = measured(predicted(positive(stated), label), bins=2, probability="positive")
+        mean += chance * found["squared_ce_debiased"]
+        plain += chance * np.mean(
+            [
+                (s.mean() - y.mean()) ** 2
+                for s, y in zip(stated.reshape(2, 4), label.reshape(2, 4), strict=True)
+            ]
+        )
+    assert mean == pytest.approx(0.5 * 0.2**2, abs=1e-12)
+    assert plain > 0.5 * 0.2**2 + 0.05
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_certainty_falls_into_the_last_bin(dtype):
+    logits = torch.tensor([[1e4, -1e4]] * 4, dtype=dtype)
+    batch = Prediction(Categorical(logits=logits), {"target": torch.tensor([0, 0, 0, 1])})
+    found = measured(batch)
+    assert found["ece"] == found["ece_equal_mass"] == found["mce"] == 0.25
+    assert found["squared_ce_debiased"] == pytest.approx(0.0625 - 0.75 * 0.25 / 3)
+    found = measured(batch, probability="positive")
+    assert found["ece"] == 0.25
+
+
+def test_one_sample_and_none():
+    one = measured(predicted([[0.25, 0.75]], [0]))
+    assert one["ece"] == one["ece_equal_mass"] == one["mce"] == pytest.approx(0.75)
+    assert math.isnan(one["ece_debiased"]) and math.isnan(one["squared_ce_debiased"])
+    assert all(
+        math.isnan(value) for value in measured(predicted(np.zeros((0, 2)), np.zeros(0, int))).values()
+    )
+
+
+def test_two_processes_are_the_whole():
+    generator = np.random.default_rng(0)
+    probability, label = positive(generator.uniform(size=30)), generator.integers(2, size=30)
+    first, second = CalibrationError(TWO), CalibrationError(TWO)
+    first.update(predicted(probability[:11], label[:11]))
+    first.update(predicted(probability[11:15], label[11:15]))
+    second.update(predicted(probability[15:], label[15:]))
+    first.dist_sync_fn = lambda state, group=None: [state, second.samples[0]]
+    first.distributed_available_fn = lambda: True
+    found = {name: value.item() for name, value in first.compute().items()}
+    assert found == pytest.approx(measured(predicted(probability, label)), abs=1e-14)
+
+
+def test_what_cannot_be_judged_is_refused():
+    with pytest.raises(ConfigError, match=r"has 3: a, b, c\. Choose probability=predicted"):
+        CalibrationError(Target("class", ("a", "b", "c")), probability="positive")
+    with pytest.raises(ConfigError, match="metric calibration_error describes targets of kind 'class'"):
+        CalibrationError(Target("angle", ("azimuth",)))
+    with pytest.raises(ConfigError, match="bins = 0"):
+        resolve("metric", {"name": "calibration_error", "bins": 0})
+    with pytest.raises(UserError, match="1 of 1 predicted distributions over classes"):
+        measured(predicted([[np.nan, 0.5]], [0]))
+    with pytest.raises(DataError, match="row 0 is 2"):
+        measured(predicted([[0.5, 0.5]], [2]))
+
+
+def bars(axes):
+    return [patch for patch in axes.patches if isinstance(patch, Rectangle) and patch.get_height() > 0]
+
+
+def test_the_picture_shows_what_was_seen():
+    metric = CalibrationError(TWO, bins=10)
+    # 30 at 0.62 of which 12 are right, 10 at 0.98 all right
+    metric.update(predicted([[0.38, 0.62]] * 30 + [[0.98, 0.02]] * 10, [1] * 12 + [0] * 28))
+    assert isinstance(metric, Pictured)
+    figure = metric.figure("moons/$nothing$", synthetic=True)
+    figure.draw_without_rendering()
+    above, below = figure.axes
+    assert figure.get_suptitle() == "moons/$nothing$ (synthetic data)"
+    shown = [(round(bar.get_x(), 9), bar.get_height()) for bar in bars(above)]
+    assert shown == [(0.6, 0.75), (0.9, 0.25)]
+    labels = [text.get_text() for text in above.get_legend().get_texts()]
+    assert labels == ["mean confidence 0.710", "accuracy 0.550"]
+    found = sorted((round(bar.get_x(), 9), round(bar.get_y(), 9), bar.get_height()) for bar in bars(below))
+    # up to the lower of accuracy and confidence, and the gap on it
+    assert [(x, y) for x, y, _ in found] == [(0.6, 0.0), (0.6, 0.4), (0.9, 0.0), (0.9, 0.98)]
+    assert [height for *_, height in found] == pytest.approx([0.4, 0.22, 0.98, 0.02])
+    assert "ECE 0.170 in 10 bins\n40 samples" in [text.get_text() for text in below.texts]
+    assert below.get_xlabel() == "confidence in the predicted class"
+
+
+def test_the_picture_of_the_positive_class_names_it():
+    metric = CalibrationError(Target("class", ("off", "on_$")), probability="positive")
+    metric.update(predicted([[0.3, 0.7]], [1]))
+    figure = metric.figure("real", synthetic=False)
+    figure.draw_without_rendering()
+    assert (figure.axes[1].get_xlabel(), figure.axes[1].get_ylabel()) == ("p(on_$)", "share of on_$")
+    assert figure.get_suptitle() == "real"
+
+
+def test_the_picture_of_nothing_says_so():
+    figure = CalibrationError(TWO).figure("empty", synthetic=False)
+    figure.draw_without_rendering()
+    assert [text.get_text() for text in figure.axes[1].texts] == ["no sample seen"]
+    assert not bars(figure.axes[0])
+
+
+def test_every_bin_full_or_none_right_can_be_drawn():
+    count = np.full(15, 3.0)
+    for right in (np.zeros(15), count):
+        figure = reliability(
+            count, count, right, confidence_label="c", accuracy_label="a", title="t", synthetic=False
+        )
+        figure.draw_without_rendering()
+        assert len(bars(figure.axes[0])) == 15
+
+
+@pytest.mark.parametrize("right, count", [(0, 1), (1, 1), (3, 7), (40, 40), (0, 1000), (123, 4567)])
+def test_wilson_is_scipys(right, count):
+    low, high = wilson(np.array([float(right)]), np.array([float(count)]))
+    wanted = binomtest(right, count).proportion_ci(0.95, "wilson")
+    assert low[0] == pytest.approx(wanted.low, abs=1e-12)
+    assert high[0] == pytest.approx(wanted.high, abs=1e-12)

@@ -1,0 +1,105 @@
+"""Mean continuous ranked probability score, of all numbers of the target and of each apart."""
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from framework.distributions.checks import refuse_nan
+from framework.errors import ConfigError
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.crps.score import REPLICATES, crps
+
+
+class CRPS(Metric):
+    """Continuous ranked probability score (CRPS): a proper scoring rule in the unit of the target; lower is better.
+
+    `crps` of reals, `crps_deg` of angles in degrees: the mean over the numbers of a sample, each by its marginal
+    density, then over samples, with a standard error; `crps_<name>` of one number where there are several. Of a
+    density that is a point it is the absolute deviation of that point.
+
+    Where a score had to be estimated from draws (`score.py`) also `crps_mc_error`, the standard error that the
+    sampling alone gives `crps`.
+
+    Args:
+        samples: draws for a density that has no exact score.
+
+    Raises:
+        ConfigError: the target is made of classes.
+        UserError: scores that are NaN; says how many.
+    """
+
+    bibtex = """@article{grimit2006continuous,
+  author  = {Grimit, Eric P. and Gneiting, Tilmann and Berrocal, Veronica J. and Johnson, Nicholas A.},
+  title   = {The Continuous Ranked Probability Score for Circular Variables and its Application to Mesoscale Forecast
+             Ensemble Verification},
+  journal = {Quarterly Journal of the Royal Meteorological Society},
+  volume  = {132},
+  number  = {621C},
+  pages   = {2925--2942},
+  year    = {2006}
+}"""
+    columns: ClassVar[dict[str, str]] = {"crps": "CRPS"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"crps": "lower"}
+    count: Tensor
+    total: Tensor
+    squares: Tensor
+    variance: Tensor
+
+    def __init__(
+        self, target: Target, *, samples: Annotated[int, Field(ge=2 * REPLICATES, le=10**6)] = 1000
+    ) -> None:
+        super().__init__()
+        if target.kind == "class":
+            raise ConfigError(
+                "crps measures distances, and classes have none between them (this data set's: "
+                f"{target.told}). Leave this metric out; `brier` is the like of it for classes."
+            )
+        self.samples = samples
+        self.unit = "_deg" if target.kind == "angle" else ""
+        self.factor = 180 / math.pi if target.kind == "angle" else 1.0
+        if target.kind == "angle":
+            self.columns = {"crps_deg": "CRPS °"}  # pyright: ignore[reportAttributeAccessIssue]
+            self.better = {"crps_deg": "lower"}  # pyright: ignore[reportAttributeAccessIssue]
+        self.names = target.names
+        zeros = torch.zeros(len(self.names) + 1, dtype=torch.float64)
+        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("total", zeros, dist_reduce_fx="sum")
+        # A sum of squares will do: scores are not negative, so that no large mean hides a small spread for long.
+        self.add_state("squares", zeros.clone(), dist_reduce_fx="sum")
+        self.add_state("variance", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        target = prediction.target
+        if len(target) == 0:
+            return
+        scores = [
+            crps(prediction.marginal(index), target[:, index : index + 1], self.samples)
+            for index in range(len(self.names))
+        ]
+        each = self.factor * torch.stack([score.mean for score in scores], -1)
+        error = self.factor * torch.stack([score.error for score in scores], -1)
+        score = torch.cat([each.mean(-1, keepdim=True), each], -1)
+        refuse_nan(score[:, 0], "scores")
+        self.count += len(score)
+        self.total += score.sum(0)
+        self.squares += score.square().sum(0)
+        # each marginal is drawn from anew: variances add
+        self.variance += error.square().sum() / len(self.names) ** 2
+
+    def compute(self) -> dict[str, Tensor]:
+        mean = self.total / self.count
+        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
+        error = (spread / (self.count - 1).clamp(min=0)).sqrt()
+        found = {f"crps{self.unit}": mean[0], f"crps{self.unit}_sem": error[0]}
+        if len(self.names) > 1:
+            for index, name in enumerate(self.names, start=1):
+                found[f"crps_{name}{self.unit}"] = mean[index]
+                found[f"crps_{name}{self.unit}_sem"] = error[index]
+        if self.variance > 0:
+            found[f"crps{self.unit}_mc_error"] = self.variance.sqrt() / self.count
+        return found

@@ -1,0 +1,160 @@
+"""Mean log-likelihood, of either sign, and its standard error: a running mean and sum of squared deviations."""
+
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.distributions.checks import refuse_nan
+from framework.distributions.monte_carlo import Estimate
+from framework.metric import Metric
+from framework.prediction import Prediction
+
+
+class LogLikelihood(Metric):
+    """Mean log-likelihood of the targets, nats, with its standard error (thesis Tables 3.1 to 3.3).
+
+    A target the density rules out has log-likelihood -inf; the mean is then -inf and the error NaN.
+
+    Of densities whose log_prob is a Monte Carlo estimate also: the mean without its first-order bias, the standard
+    error that the sampling alone gives it, the samples an item took (mean and most), and how many items did not reach
+    the tolerance asked for. Where a single replicate says nothing of its error, both are NaN.
+    """
+
+    bibtex = """@article{gneiting2007strictly,
+  author  = {Gneiting, Tilmann and Raftery, Adrian E.},
+  title   = {Strictly Proper Scoring Rules, Prediction, and Estimation},
+  journal = {Journal of the American Statistical Association},
+  volume  = {102},
+  number  = {477},
+  pages   = {359--378},
+  year    = {2007}
+}"""
+    columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
+    moments: Tensor
+    sampling: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        # One state, not three: count, mean and squared deviations can only be merged together.
+        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
+        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
+
+    def update(self, prediction: Prediction) -> None:
+        self.moments = merged_moments(torch.stack([self.moments, moments_of(prediction.log_prob)]))
+        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
+
+    def compute(self) -> dict[str, Tensor]:
+        return summary("log_likelihood", self.moments, self.sampling)
+
+
+class NegativeLogLikelihood(Metric):
+    """Mean negative log-likelihood of the targets, nats, with its standard error (thesis eq. 2.25 as a mean).
+
+    The negative of `log_likelihood`, for tables in which lower is better, with the same further numbers of densities
+    whose log_prob is an estimate. A target the density rules out makes the mean infinite and the error NaN.
+
+    Raises:
+        UserError: log-likelihoods that are NaN; says how many.
+    """
+
+    bibtex = """@article{good1952rational,
+  author  = {Good, Irving John},
+  title   = {Rational Decisions},
+  journal = {Journal of the Royal Statistical Society: Series B},
+  volume  = {14},
+  number  = {1},
+  pages   = {107--114},
+  year    = {1952}
+}"""
+    columns: ClassVar[dict[str, str]] = {"nll": "NLL"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"nll": "lower"}
+    moments: Tensor
+    sampling: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
+        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
+
+    def update(self, prediction: Prediction) -> None:
+        log_prob = refuse_nan(prediction.log_prob, "log-likelihoods of the targets")
+        self.moments = merged_moments(torch.stack([self.moments, moments_of(log_prob)]))
+        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
+
+    def compute(self) -> dict[str, Tensor]:
+        found = summary("nll", self.moments, self.sampling)
+        # from 0, so that the NLL of certain and right predictions is no -0
+        return found | {name: 0 - found[name] for name in ("nll", "nll_debiased") if name in found}
+
+
+def summary(
+    name: str, moments: Float[Tensor, "3"], sampling: Float[Tensor, "5"]
+) -> dict[str, Float[Tensor, ""]]:
+    """Mean and standard error called `name`; where something was estimated, also what that did to them."""
+    count, mean, squares = moments
+    seen = count > 0
+    found = {
+        name: torch.where(seen, mean, torch.nan),
+        # σ/√n with the sample deviation σ² = Σ(x - x̄)² / (n - 1); one sample has none: 0/0
+        f"{name}_sem": torch.where(seen, (squares / (count - 1) / count).sqrt(), torch.nan),
+    }
+    debiased, variance, samples, above, most = sampling
+    if samples == 0:
+        return found
+    return found | {
+        f"{name}_debiased": debiased / count,
+        # the items' points are independent: the variance of a mean
+        f"{name}_mc_error": variance.sqrt() / count,
+        "samples_mean": samples / count,
+        "samples_max": most,
+        "items_above_tolerance": above,
+    }
+
+
+def moments_of(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
+    """(n, mean, Σ(x - mean)²) in float64; zeros of nothing."""
+    values = values.detach().double()
+    count = values.new_tensor(len(values))
+    if len(values) == 0:
+        return values.new_zeros(3)
+    mean = values.mean()
+    return torch.stack([count, mean, (values - mean).square().sum()])
+
+
+def sampling_of(found: Estimate) -> Float[Tensor, "5"]:
+    """Σ debiased log-likelihoods, Σ squared errors, Σ samples, items above tolerance, most samples; float64."""
+    if found.samples.numel() == 0:
+        return torch.zeros(5, dtype=torch.float64, device=found.samples.device)
+    return torch.stack(
+        [
+            found.debiased.detach().double().sum(),
+            found.standard_error.double().square().sum(),
+            found.samples.double().sum(),
+            found.unresolved.double().sum(),
+            found.samples.double().max(),
+        ]
+    )
+
+
+def merged_sampling(parts: Float[Tensor, "parts 5"]) -> Float[Tensor, "5"]:
+    """The same of all items from those of disjoint parts."""
+    return torch.cat([parts[:, :4].sum(0), parts[:, 4:].amax(0)])
+
+
+def merged_moments(parts: Float[Tensor, "parts 3"]) -> Float[Tensor, "3"]:
+    """The moments of all samples from those of disjoint parts (Chan, Golub & LeVeque 1983, eq. 2.1).
+
+    Exact where a sum of squares loses the variance: when the mean is large against it.
+    """
+    parts = parts[parts[:, 0] > 0]
+    count, mean, squares = parts.unbind(-1)
+    total = count.sum()
+    if total == 0:
+        return parts.new_zeros(3)
+    # a weighted mean, not mean + correction: of -inf and a number it is -inf, not NaN
+    middle = (count * mean).sum() / total
+    between = (count * (mean - middle).square()).sum()
+    return torch.stack([total, middle, squares.sum() + between])

@@ -1,0 +1,241 @@
+import copy
+import statistics
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import special
+from scipy.stats import norm, sem
+from sklearn.metrics import log_loss
+from torch.distributions import Categorical, Distribution, Independent, Normal
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.monte_carlo import Estimate, estimate
+from framework.errors import UserError
+from framework.prediction import Prediction
+from plugins.metric.log_likelihood.metric import LogLikelihood, merged_moments, moments_of
+
+
+class Known(Distribution):
+    """A density whose log-likelihoods are given."""
+
+    arg_constraints = {}  # noqa: RUF012 - as torch has it
+
+    def __init__(self, log_prob):
+        self.values = log_prob
+        super().__init__(log_prob.shape, torch.Size((1,)), validate_args=False)
+
+    def log_prob(self, value):
+        return self.values
+
+
+class Drawn(Known):
+    """A density whose log-likelihoods are estimates: with standard errors 0.1, 0.2, ... from 10, 20, ... samples."""
+
+
+@estimate.register
+def _(density: Drawn, value):
+    number = torch.arange(1, len(density.values) + 1)
+    error = 0.1 * number.double()
+    return Estimate(density.values, density.values + error.square() / 2, error, 10 * number, number == 2)
+
+
+def prediction(values, dtype=torch.float64):
+    log_prob = torch.as_tensor(values, dtype=dtype)
+    return Prediction(Known(log_prob), {"target": torch.zeros(len(log_prob), 1)})
+
+
+def measured(*batches, dtype=torch.float64):
+    metric = LogLikelihood()
+    for batch in batches:
+        metric.update(prediction(batch, dtype))
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
+def test_mean_and_standard_error_are_scipys(dtype, tolerance):
+    generator = np.random.default_rng(0)
+    target, loc, scale = generator.normal(size=(3, 200, 1))
+    scale = np.exp(scale)
+    expected = norm(loc, scale).logpdf(target)[:, 0]
+    density = Independent(Normal(torch.tensor(loc, dtype=dtype), torch.tensor(scale, dtype=dtype)), 1)
+    metric = build("metric", resolve("metric", "log_likelihood"))
+    metric.update(Prediction(density, {"target": torch.tensor(target, dtype=dtype)}))
+    found = metric.compute()
+    assert found["log_likelihood"].dtype == torch.float64
+    assert found["log_likelihood"].item() == pytest.approx(expected.mean(), rel=tolerance)
+    assert found["log_likelihood_sem"].item() == pytest.approx(sem(expected), rel=tolerance * 10)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.lists(st.floats(-1e6, 1e3, allow_subnormal=False), max_size=5), min_size=1, max_size=6
+    ).filter(lambda batches: sum(map(len, batches)) > 1)
+)
+def test_any_batches_give_the_numbers_of_the_whole(batches):
+    values = [value for batch in batches for value in batch]
+    found = measured(*batches)
+    assert found["log_likelihood"] == pytest.approx(statistics.fmean(values), rel=1e-12, abs=1e-9)
+    error = statistics.stdev(values) / len(values) ** 0.5  # statistics computes in exact fractions
+    assert found["log_likelihood_sem"] == pytest.approx(error, rel=1e-9, abs=1e-9)
+
+
+def test_a_large_mean_does_not_hide_a_small_spread():
+    values = [-1e9 + offset for offset in (0.0, 0.25, 0.5, 0.75)] * 25
+    error = statistics.stdev(values) / 10
+    assert measured(values[:3], values[3:50], values[50:])["log_likelihood_sem"] == pytest.approx(
+        error, rel=1e-6
+    )
+
+
+def test_nothing_seen_is_nan_and_one_sample_has_no_error():
+    assert all(np.isnan(value) for value in measured([]).values())
+    one = measured([], [-2.5], [])
+    assert one["log_likelihood"] == -2.5
+    assert np.isnan(one["log_likelihood_sem"])
+
+
+def test_an_impossible_target_makes_the_mean_minus_infinity():
+    assert measured([-1.0, -np.inf], [-2.0], [-np.inf])["log_likelihood"] == -np.inf
+    assert np.isnan(measured([-1.0], [np.nan], [-2.0])["log_likelihood"])
+
+
+def halves():
+    generator = torch.Generator().manual_seed(1)
+    values = torch.randn(37, generator=generator, dtype=torch.float64) * 3 - 1e5
+    first, second, whole = LogLikelihood(), LogLikelihood(), LogLikelihood()
+    first.update(prediction(values[:11]))
+    second.update(prediction(values[11:]))
+    whole.update(prediction(values))
+    return first, second, whole.compute()
+
+
+def test_merged_halves_are_the_whole():
+    first, second, whole = halves()
+    first.merge_state(second)
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
+
+
+def test_two_processes_are_the_whole():
+    first, second, whole = halves()
+    idle = LogLikelihood()  # a process that saw no sample
+
+    def gather(state, group=None):
+        name = "moments" if len(state) == 3 else "sampling"
+        return [state, getattr(second, name), getattr(idle, name)]
+
+    first.dist_sync_fn, first.distributed_available_fn = gather, lambda: True
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
+
+
+def test_reset_forgets_and_a_copy_keeps():
+    metric = LogLikelihood()
+    metric.update(prediction([1.0, 2.0]))
+    kept = copy.deepcopy(metric)
+    metric.reset()
+    metric.update(prediction([5.0, 7.0]))
+    assert metric.compute()["log_likelihood"] == 6.0
+    assert kept.compute()["log_likelihood"] == 1.5
+
+
+def test_moments_of_parts_in_any_order():
+    parts = torch.stack([moments_of(torch.randn(size, dtype=torch.float64)) for size in (3, 0, 1, 20)])
+    torch.testing.assert_close(merged_moments(parts), merged_moments(parts.flip(0)))
+
+
+def drawn(values):
+    log_prob = torch.tensor(values, dtype=torch.float64)
+    return Prediction(Drawn(log_prob), {"target": torch.zeros(len(values), 1)})
+
+
+def test_exact_densities_have_nothing_more_to_say():
+    assert set(measured([1.0, 2.0])) == {"log_likelihood", "log_likelihood_sem"}
+
+
+def test_estimates_tell_their_error_and_their_samples():
+    metric = LogLikelihood()
+    for values in ([1.0, 2.0, 6.0], [], [3.0]):
+        metric.update(drawn(values))
+    found = {name: value.item() for name, value in metric.compute().items()}
+    assert found["log_likelihood"] == 3.0
+    squares = [0.01, 0.04, 0.09, 0.01]
+    assert found["log_likelihood_debiased"] == pytest.approx(3 + sum(squares) / 8)
+    assert found["log_likelihood_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
+    assert found["samples_mean"] == pytest.approx((10 + 20 + 30 + 10) / 4)
+    assert found["samples_max"] == 30
+    assert found["items_above_tolerance"] == 1
+
+
+def test_estimates_of_merged_halves_are_those_of_the_whole():
+    first, second, whole = LogLikelihood(), LogLikelihood(), LogLikelihood()
+    first.update(drawn([1.0, -1e3]))
+    second.update(drawn([2.0, -3.0, 5.0]))
+    for values in ([1.0, -1e3], [2.0, -3.0, 5.0]):
+        whole.update(drawn(values))
+    first.merge_state(second)
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, whole.compute()[name], rtol=1e-12, atol=0)
+
+
+def negative(*batches):
+    metric = build("metric", resolve("metric", "nll"))
+    for batch in batches:
+        metric.update(batch)
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("classes", [2, 7])
+def test_nll_of_classes_is_sklearns_log_loss(dtype, tolerance, classes):
+    generator = np.random.default_rng(0)
+    logits = torch.tensor(3 * generator.normal(size=(90, classes)), dtype=dtype)
+    label = generator.integers(classes, size=90)
+    found = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor(label)}))
+    probability = special.softmax(logits.double().numpy(), -1)
+    probability /= probability.sum(-1, keepdims=True)
+    assert found["nll"] == pytest.approx(log_loss(label, probability, labels=range(classes)), rel=tolerance)
+    assert found["nll_sem"] == pytest.approx(sem(-np.log(probability[np.arange(90), label])), rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nll_of_logits_of_ten_thousand(dtype):
+    logits = torch.tensor([[1e4, -1e4], [-1e4, 1e4]], dtype=dtype)
+    found = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor([0, 0])}))
+    assert found == {"nll": 1e4, "nll_sem": 1e4}
+
+
+def test_nll_is_the_negative_of_the_log_likelihood_with_the_same_error():
+    values = [1.0, -2.0, 6.5, -1e3]
+    found, positive = (
+        negative(prediction(values[:3]), prediction([]), prediction(values[3:])),
+        measured(values),
+    )
+    assert found["nll"] == -positive["log_likelihood"]
+    assert found["nll_sem"] == pytest.approx(positive["log_likelihood_sem"], rel=1e-14)
+
+
+def test_nll_of_the_certain_is_zero_without_a_sign_and_of_the_impossible_infinite():
+    assert str(negative(prediction([0.0, 0.0]))["nll"]) == "0.0"
+    assert negative(prediction([-1.0, -np.inf]))["nll"] == np.inf
+    assert all(np.isnan(value) for value in negative(prediction([])).values())
+
+
+def test_nll_names_nan():
+    with pytest.raises(
+        UserError, match=r"2 of 3 log-likelihoods of the targets in this batch are NaN.* row 0"
+    ):
+        negative(prediction([np.nan, 1.0, np.nan]))
+
+
+def test_nll_of_estimates_has_the_bias_the_other_way_round():
+    found = negative(drawn([1.0, 2.0, 6.0]), drawn([]), drawn([3.0]))
+    squares = [0.01, 0.04, 0.09, 0.01]
+    assert found["nll"] == -3.0
+    assert found["nll_debiased"] == pytest.approx(-3 - sum(squares) / 8)
+    assert found["nll_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
+    assert (found["samples_max"], found["items_above_tolerance"]) == (30, 1)

@@ -1,0 +1,100 @@
+"""Calibration of reals and angles by the probability integral transform."""
+
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torchmetrics.utilities.data import dim_zero_cat
+
+from framework.distributions.checks import refuse_nan
+from framework.errors import ConfigError
+from framework.metric import Metric, Pictured
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.pit.functional import cramer_von_mises, kolmogorov_smirnov, transform
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class PIT(Metric, Pictured):
+    """Probability integral transform (PIT): F(y) of each number, which is uniform on [0, 1] of a calibrated forecaster.
+
+    - `pit_ks`: largest distance of the distribution of F(y) from uniform (Kolmogorov-Smirnov), in [0, 1].
+    - `pit_cvm`: mean squared distance of the same (Cramér-von Mises).
+    - `pit_mean`: ½ where forecasts are unbiased; above, where targets lie higher.
+    - `pit_spread`: 12 times the mean square of F(y) - ½: 1 where calibrated, above 1 where densities are too narrow,
+      below 1 where they are too broad.
+
+    The numbers of a target are taken each by its marginal density, and together. Angles are counted from the antipode
+    of the density's mean direction, counter-clockwise. The picture is the histogram with the band that holds each bin
+    of a calibrated forecaster with probability 0.95.
+
+    Args:
+        bins: of the histogram.
+        samples: draws for a density whose distribution function is not known.
+
+    Raises:
+        ConfigError: the target is made of classes.
+        UserError: transforms that are NaN; says how many.
+    """
+
+    bibtex = """@article{diebold1998evaluating,
+  author  = {Diebold, Francis X. and Gunther, Todd A. and Tay, Anthony S.},
+  title   = {Evaluating Density Forecasts with Applications to Financial Risk Management},
+  journal = {International Economic Review},
+  volume  = {39},
+  number  = {4},
+  pages   = {863--883},
+  year    = {1998}
+}"""
+    columns: ClassVar[dict[str, str]] = {"pit_ks": "PIT KS"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"pit_ks": "lower"}
+    picture: ClassVar[str] = "pit"
+    values: list[Tensor] | Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        bins: Annotated[int, Field(ge=2, le=100)] = 20,
+        samples: Annotated[int, Field(ge=10, le=10**6)] = 1000,
+    ) -> None:
+        super().__init__()
+        if target.kind == "class":
+            raise ConfigError(
+                "pit asks which share of a density lies below the target, and classes have no order (this data "
+                f"set's: {target.told}). Leave this metric out; `coverage` judges classes too."
+            )
+        self.numbers = len(target.names)
+        self.bins = bins
+        self.samples = samples
+        self.add_state("values", [], dist_reduce_fx="cat")
+
+    def update(self, prediction: Prediction) -> None:
+        target = prediction.target
+        if len(target) == 0:
+            return
+        assert isinstance(self.values, list)
+        for index in range(self.numbers):
+            at = target[:, index : index + 1]
+            found = transform(prediction.marginal(index), at, self.samples)
+            self.values.append(refuse_nan(found, "transforms"))
+
+    def compute(self) -> dict[str, Tensor]:
+        values = self._seen()
+        return {
+            "pit_ks": kolmogorov_smirnov(values),
+            "pit_cvm": cramer_von_mises(values),
+            "pit_mean": values.mean(),
+            "pit_spread": 12 * (values - 0.5).square().mean(),
+        }
+
+    def figure(self, title: str, *, synthetic: bool) -> "Figure":
+        from plugins.metric.pit.picture import histogram
+
+        return histogram(self._seen().cpu().numpy(), self.bins, self.numbers, title, synthetic=synthetic)
+
+    def _seen(self) -> Tensor:
+        return dim_zero_cat(self.values) if len(self.values) else torch.empty(0, dtype=torch.float64)

@@ -1,0 +1,89 @@
+"""Coverage, size and emptiness of prediction sets."""
+
+import math
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from framework.distributions.prediction_set import PredictionSet
+from framework.errors import UserError
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+
+
+class PredictionSetMetric(Metric):
+    """How often the predicted set holds the target, how large it is, and how often it is empty.
+
+    - `set_coverage`: share of targets in their sets, with its standard error; 1 - miscoverage is best.
+    - `set_size`: mean number of labels; of reals mean length or volume in the target's unit; of several angles volume
+      in radians to their number. Of one angle `set_size_deg`, mean length of the arcs, degrees. Infinite where a set
+      is unbounded.
+    - `set_empty`: share of empty sets, which say that the input is like nothing known.
+
+    Raises:
+        UserError: the predicted densities have no sets, or are NaN (the samples are named).
+    """
+
+    bibtex = """@book{vovk2005algorithmic,
+  author    = {Vovk, Vladimir and Gammerman, Alexander and Shafer, Glenn},
+  title     = {Algorithmic Learning in a Random World},
+  publisher = {Springer},
+  year      = {2005}
+}"""
+    columns: ClassVar[dict[str, str]] = {}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
+    count: Tensor
+    covered: Tensor
+    size: Tensor
+    empty: Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        degrees = target.kind == "angle" and len(target.names) == 1
+        self.key = "set_size_deg" if degrees else "set_size"
+        self.unit = 180 / math.pi if degrees else 1.0
+        self.columns = {  # pyright: ignore[reportAttributeAccessIssue]  # the unit is the target's
+            "set_coverage": "coverage",
+            self.key: "set size °" if degrees else "set size",
+            "set_empty": "empty sets",
+        }
+        self.better = {self.key: "lower"}  # pyright: ignore[reportAttributeAccessIssue]
+        for name in ("count", "covered", "size", "empty"):
+            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        sets = prediction.density
+        if len(prediction.target) == 0:
+            return
+        if not isinstance(sets, PredictionSet):
+            raise UserError(
+                f"prediction_set judges sets, but the model predicts a {type(sets).__name__}, which has none. Put "
+                "conformal last among the wrappers, uncertainty=[..., conformal], or leave this metric out."
+            )
+        size = sets.size()
+        broken = (size.isnan() | prediction.log_prob.isnan()).nonzero().flatten()
+        if len(broken):
+            index = prediction.batch.get("index")
+            names = broken if index is None else index[broken]
+            raise UserError(
+                f"The densities of samples {names[:10].tolist()} are NaN and have no set. Look at these samples and at "
+                "the training, which may have diverged."
+            )
+        self.count += len(size)
+        self.covered += sets.contains(prediction.target).sum()
+        self.size += self.unit * size.sum()
+        self.empty += sets.empty().sum()
+
+    def compute(self) -> dict[str, Tensor]:
+        coverage = self.covered / self.count
+        return {
+            "set_coverage": coverage,
+            # of a share p of n: sqrt(p (1 - p) / (n - 1)), unbiased in its square
+            "set_coverage_sem": (coverage * (1 - coverage) / (self.count - 1)).sqrt()
+            if self.count > 1
+            else coverage.new_tensor(math.nan),
+            self.key: self.size / self.count,
+            "set_empty": self.empty / self.count,
+        }

@@ -1,0 +1,122 @@
+"""Selective prediction: what error remains when the least confident predictions are left out."""
+
+import math
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import torch
+from torch import Tensor
+from torchmetrics.utilities.data import dim_zero_cat
+
+from framework.distributions.checks import refuse_nan
+from framework.distributions.circular import angular_distance
+from framework.metric import Metric, Pictured
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.risk_coverage.functional import area, at_coverage, curve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RISKS = {
+    "class": ("", "error rate"),
+    "real": ("", "mean absolute error"),
+    "angle": ("_deg", "mean angular deviation (°)"),
+}
+"""Kind of target → suffix of the keys, and what the risk is."""
+
+
+class RiskCoverage(Metric, Pictured):
+    """Error of the most confident share of predictions, against that share.
+
+    The risk is the error rate of classes, the mean absolute error of reals (in their unit, over the numbers of a
+    target) and the mean angular deviation of angles in degrees: then the keys end in `_deg`.
+
+    - `aurc`: area under the curve: mean risk over all shares.
+    - `e_aurc`: how much of it a perfect order of confidence would save; 0 where mistakes are the least confident.
+    - `risk_80`, `risk_95`: risk of the most confident 80 % and 95 %.
+
+    Equally confident predictions count by their mean risk, so that their order is no matter.
+
+    Args:
+        confidence: "entropy": minus the predictive entropy; "mode": the (log-)probability of the mode.
+
+    Raises:
+        UserError: confidences or errors that are NaN; says how many.
+    """
+
+    bibtex = """@inproceedings{geifman2017selective,
+  author    = {Geifman, Yonatan and El-Yaniv, Ran},
+  title     = {Selective Classification for Deep Neural Networks},
+  booktitle = {Advances in Neural Information Processing Systems},
+  volume    = {30},
+  year      = {2017}
+}
+@inproceedings{geifman2019bias,
+  author    = {Geifman, Yonatan and Uziel, Guy and El-Yaniv, Ran},
+  title     = {Bias-Reduced Uncertainty Estimation for Deep Neural Classifiers},
+  booktitle = {International Conference on Learning Representations},
+  year      = {2019}
+}"""
+    columns: ClassVar[dict[str, str]] = {"aurc": "AURC", "risk_80": "risk at 80 %"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"aurc": "lower", "risk_80": "lower"}
+    picture: ClassVar[str] = "risk_coverage"
+    confidences: list[Tensor] | Tensor
+    risks: list[Tensor] | Tensor
+
+    def __init__(self, target: Target, *, confidence: Literal["entropy", "mode"] = "entropy") -> None:
+        super().__init__()
+        self.kind = target.kind
+        self.confidence = confidence
+        self.unit, self.risk_name = RISKS[target.kind]
+        if target.kind == "angle":
+            self.columns = {  # pyright: ignore[reportAttributeAccessIssue]
+                "aurc_deg": "AURC °",
+                "risk_80_deg": "risk at 80 % °",
+            }
+            self.better = dict.fromkeys(self.columns, "lower")  # pyright: ignore[reportAttributeAccessIssue]
+        self.add_state("confidences", [], dist_reduce_fx="cat")
+        self.add_state("risks", [], dist_reduce_fx="cat")
+
+    def update(self, prediction: Prediction) -> None:
+        if len(prediction.target) == 0:
+            return
+        assert isinstance(self.confidences, list) and isinstance(self.risks, list)
+        self.confidences.append(refuse_nan(self._confidence(prediction), "confidences"))
+        self.risks.append(refuse_nan(self._risk(prediction), "errors"))
+
+    def compute(self) -> dict[str, Tensor]:
+        confidence, risk = self._seen()
+        kept = curve(confidence, risk)
+        found = {
+            "aurc": area(kept),
+            "e_aurc": area(kept) - area(curve(-risk, risk)),
+            "risk_80": at_coverage(kept, 0.8),
+            "risk_95": at_coverage(kept, 0.95),
+        }
+        return {f"{name}{self.unit}": value for name, value in found.items()}
+
+    def figure(self, title: str, *, synthetic: bool) -> "Figure":
+        from plugins.metric.risk_coverage.picture import risk_coverage
+
+        confidence, risk = self._seen()
+        lines = (curve(confidence, risk), curve(-risk, risk))
+        own, oracle = (line.cpu().numpy() for line in lines)
+        return risk_coverage(own, oracle, self.risk_name, title, synthetic=synthetic)
+
+    def _confidence(self, prediction: Prediction) -> Tensor:
+        if self.confidence == "entropy":
+            return -prediction.entropy.double()
+        return prediction.density.log_prob(prediction.density.mode).double()
+
+    def _risk(self, prediction: Prediction) -> Tensor:
+        point, target = prediction.point, prediction.target
+        if self.kind == "class":
+            return (point != target).double()
+        if self.kind == "angle":
+            return angular_distance(point.double(), target.double()).mean(-1) * (180 / math.pi)
+        return (point.double() - target.double()).abs().mean(-1)
+
+    def _seen(self) -> tuple[Tensor, Tensor]:
+        if not len(self.risks):
+            return torch.empty(0, dtype=torch.float64), torch.empty(0, dtype=torch.float64)
+        return dim_zero_cat(self.confidences), dim_zero_cat(self.risks)

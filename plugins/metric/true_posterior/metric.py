@@ -1,0 +1,194 @@
+"""The azimuth density against what is truly known of the azimuth of a symmetric object."""
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.circular import grid, wrap
+from framework.errors import ConfigError, DataError
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+
+CHUNK = 16  # azimuths evaluated at once: CHUNK × batch × components numbers should stay in the cache
+
+
+class TruePosterior(Metric):
+    """How the predicted azimuth density agrees with the known symmetry of the object.
+
+    Reads the batch field "symmetry", int64: 1 for an object without symmetry; n ≥ 2 where the azimuth is
+    known only up to 2π/n, so that the true posterior has n modes, at the annotated azimuth + 2πk/n, of mass
+    1/n each; 0 where the object looks the same from all sides and the true posterior is uniform.
+
+    - `azimuth_entropy`: mean entropy of the azimuth, nats, over all samples.
+    - `mode_mass_<k>_of_<n>`: mass within ±π/(2n) of mode k, mean over the samples with n modes; 1/n is best.
+    - `mode_mass_min`: the smallest of those means: near 0 when a mode is missed. 1/(largest n) is best.
+    - `uniform_gap`: log 2π minus the entropy, nats, mean over the samples with symmetry 0; 0 is best.
+
+    Each is NaN where no sample speaks of it. Integrals are sums over `points` equally spaced azimuths, so a
+    sample costs that many evaluations of the azimuth marginal, and nothing of the other angles. A density
+    so narrow that the grid misses it (its sum there is not 1 within 1 %) is judged from
+    `prediction.samples` draws.
+
+    Args:
+        target: with an angle called azimuth.
+        points: azimuths on the grid; resolves concentrations up to points²/40.
+        largest_symmetry: the largest n the metric keeps apart.
+
+    Raises:
+        ConfigError: no azimuth in the target; at the first update, no "symmetry" in the data.
+        DataError: a symmetry below 0 or above `largest_symmetry`.
+    """
+
+    bibtex = """@inproceedings{prokudin2018deep,
+  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
+  booktitle = {European Conference on Computer Vision},
+  pages     = {534--551},
+  year      = {2018}
+}"""
+    columns: ClassVar[dict[str, str]] = {
+        "azimuth_entropy": "azimuth entropy",
+        "mode_mass_min": "least mode mass",
+        "uniform_gap": "gap to uniform",
+    }
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {
+        "mode_mass_min": "higher",
+        "uniform_gap": "lower",
+    }
+    count: Tensor
+    entropy: Tensor
+    samples_with: Tensor
+    mass: Tensor
+    gap: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        points: Annotated[int, Field(ge=180)] = 720,
+        largest_symmetry: Annotated[int, Field(ge=2, le=36)] = 16,
+    ) -> None:
+        super().__init__()
+        if target.kind != "angle" or "azimuth" not in target.names:
+            raise ConfigError(
+                "true_posterior judges the angle called azimuth; this data set's targets are of kind "
+                f"{target.kind!r}: {target.told}. Leave this metric out."
+            )
+        self.azimuth = target.names.index("azimuth")
+        self.points = points
+        self.largest = largest_symmetry
+        zero = torch.zeros((), dtype=torch.float64)
+        rows = self.largest + 1
+        self.add_state("count", zero, dist_reduce_fx="sum")
+        self.add_state("entropy", zero.clone(), dist_reduce_fx="sum")
+        self.add_state("gap", zero.clone(), dist_reduce_fx="sum")
+        # by symmetry n, and by n and mode k
+        self.add_state("samples_with", zero.new_zeros(rows), dist_reduce_fx="sum")
+        self.add_state("mass", zero.new_zeros(rows, self.largest), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        symmetry = self._symmetry(prediction)
+        if len(symmetry) == 0:
+            return
+        azimuth = prediction.target[:, self.azimuth]
+        density = prediction.marginal(self.azimuth)
+        entropy, mass = entropy_and_mode_mass(
+            density, azimuth, symmetry, self.largest, self.points, prediction.samples
+        )
+        self.count += len(symmetry)
+        self.entropy += entropy.sum()
+        self.gap += (math.log(2 * math.pi) - entropy)[symmetry == 0].sum()
+        self.samples_with += torch.bincount(symmetry, minlength=len(self.samples_with))
+        self.mass.index_add_(0, symmetry, mass)
+
+    def compute(self) -> dict[str, Tensor]:
+        found = {
+            "azimuth_entropy": self.entropy / self.count,
+            "mode_mass_min": self.entropy.new_tensor(torch.nan),
+            "uniform_gap": self.gap / self.samples_with[0],
+        }
+        means = {
+            f"mode_mass_{mode}_of_{modes}": self.mass[modes, mode] / self.samples_with[modes]
+            for modes in range(2, self.largest + 1)
+            if self.samples_with[modes] > 0
+            for mode in range(modes)
+        }
+        if means:
+            found["mode_mass_min"] = torch.stack(list(means.values())).min()
+        return found | means
+
+    def _symmetry(self, prediction: Prediction) -> Int[Tensor, "batch"]:
+        if "symmetry" not in prediction.batch:
+            raise ConfigError(
+                'true_posterior needs the batch field "symmetry", but this data set records no symmetry of '
+                f"its objects (its fields: {', '.join(prediction.batch)}). Leave this metric out, or choose "
+                "data that does."
+            )
+        symmetry = prediction.batch["symmetry"].long()
+        wrong = (symmetry < 0) | (symmetry > self.largest)
+        if wrong.any():
+            raise DataError(
+                f"true_posterior got the symmetry {int(symmetry[wrong][0])}; wanted 0 (continuous), 1 (none) "
+                f"or the number of modes, up to largest_symmetry={self.largest}. Mend the data, or raise "
+                "largest_symmetry."
+            )
+        return symmetry
+
+
+def entropy_and_mode_mass(
+    density: Distribution,
+    azimuth: Float[Tensor, "batch"],
+    symmetry: Int[Tensor, "batch"],
+    modes: int,
+    points: int,
+    samples: int,
+) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch modes"]]:
+    """Entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, column k < n.
+
+    The trapezium rule on the circle; a grid cell that a window's edge cuts counts with the part inside.
+    """
+    step = 2 * math.pi / points
+    # around the annotated azimuth, so that windows and modes lie alike on every sample's grid
+    relative = grid(points, dtype=torch.float64, device=azimuth.device)
+    angles = wrap(azimuth.double() + relative.unsqueeze(-1)).to(azimuth.dtype)
+    angles = angles.unsqueeze(-1)  # (points, batch, 1)
+    log_density = torch.cat([density.log_prob(chunk).double() for chunk in angles.split(CHUNK)])
+    weight = log_density.exp() * step
+    total = weight.sum(0)
+    # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
+    entropy = -(weight * log_density.clamp(min=-1e4)).sum(0) / total
+    mass = _mass_by_mode(relative.unsqueeze(-1).expand_as(weight), weight / total, symmetry, modes, step)
+    narrow = ~((total - 1).abs() < 0.01)
+    if narrow.any():
+        drawn = density.sample(torch.Size((samples,)))
+        away = wrap(drawn.squeeze(-1).double() - azimuth.double())
+        even = torch.full_like(away, 1 / samples)
+        entropy = torch.where(narrow, -density.log_prob(drawn).double().mean(0), entropy)
+        mass = torch.where(narrow.unsqueeze(-1), _mass_by_mode(away, even, symmetry, modes, 0.0), mass)
+    return entropy, mass
+
+
+def _mass_by_mode(
+    away: Float[Tensor, "points batch"],
+    weight: Float[Tensor, "points batch"],
+    symmetry: Int[Tensor, "batch"],
+    modes: int,
+    step: float,
+) -> Float[Tensor, "batch modes"]:
+    count = symmetry.clamp(min=1)
+    turn = 2 * math.pi
+    nearest = (away * count / turn).round()
+    distance = (away - nearest * turn / count).abs()
+    half_width = math.pi / (2 * count)
+    if step > 0:
+        inside = ((half_width - distance) / step + 0.5).clamp(0, 1)
+    else:
+        inside = (distance <= half_width).double()
+    mass = weight.new_zeros(len(symmetry), modes)
+    return mass.scatter_add_(1, nearest.long().remainder(count).T, (weight * inside).T)

@@ -1,0 +1,72 @@
+"""Acc_π/6 and MedErr of Tulsiani & Malik (2015) on the geodesic distance between rotations."""
+
+import math
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+from torchmetrics.utilities.data import dim_zero_cat
+
+from framework.errors import ConfigError
+from framework.geometry.rotation import geodesic_distance, viewpoint_rotation
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+
+ANGLES = ("azimuth", "elevation", "tilt")
+
+
+class Viewpoint(Metric):
+    """Acc_π/6 and MedErr: share within 30° of the true rotation, and the median error in degrees.
+
+    Both on Δ(R₁, R₂) = ||log(R₁ᵀR₂)||_F / √2 between the rotation matrices of the true and the predicted
+    viewpoint (Tulsiani & Malik 2015; thesis Table 3.3). The median of an even number of errors is the mean
+    of the middle two.
+
+    Raises:
+        ConfigError: the target is not the three angles azimuth, elevation and tilt.
+    """
+
+    bibtex = """@inproceedings{tulsiani2015viewpoints,
+  author    = {Tulsiani, Shubham and Malik, Jitendra},
+  title     = {Viewpoints and Keypoints},
+  booktitle = {Proceedings of the IEEE Conference on Computer Vision and Pattern Recognition},
+  pages     = {1510--1519},
+  year      = {2015}
+}"""
+    columns: ClassVar[dict[str, str]] = {"acc_pi_6": "Acc π/6", "mederr_deg": "MedErr °"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"acc_pi_6": "higher", "mederr_deg": "lower"}
+    errors: list[Tensor] | Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        if target.kind != "angle" or sorted(target.names) != sorted(ANGLES):
+            raise ConfigError(
+                f"viewpoint compares rotations given by the three angles {', '.join(ANGLES)}; this data "
+                f"set's targets are of kind {target.kind!r}: {target.told}. "
+                "Leave this metric out; `angular_deviation` judges any angles."
+            )
+        self.order = [target.names.index(name) for name in ANGLES]
+        self.add_state("errors", [], dist_reduce_fx="cat")
+
+    def update(self, prediction: Prediction) -> None:
+        # float64: near a half turn, float32 rotation matrices resolve no more than 0.02°
+        true = viewpoint_rotation(prediction.target[:, self.order].double())
+        predicted = viewpoint_rotation(prediction.point[:, self.order].double())
+        assert isinstance(self.errors, list)
+        self.errors.append(geodesic_distance(true, predicted))
+
+    def compute(self) -> dict[str, Tensor]:
+        errors = dim_zero_cat(self.errors) if len(self.errors) else torch.empty(0, dtype=torch.float64)
+        return {
+            "acc_pi_6": (errors < math.pi / 6).double().mean(),
+            "mederr_deg": _median(errors) * (180 / math.pi),
+        }
+
+
+def _median(values: Tensor) -> Tensor:
+    """Mean of the middle two; NaN of nothing, or where one value is NaN."""
+    if len(values) == 0 or values.isnan().any():
+        return values.new_tensor(torch.nan)
+    ordered, count = values.sort().values, len(values)
+    return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2

@@ -1,0 +1,156 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch.distributions import Distribution
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.density import median
+from framework.errors import ConfigError
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.viewpoint.metric import Viewpoint
+
+TARGET = Target("angle", ("azimuth", "elevation", "tilt"))
+
+
+class At(Distribution):
+    """A density of which only the point prediction is known."""
+
+    arg_constraints = {}  # noqa: RUF012 - as torch has it
+
+    def __init__(self, point):
+        self.point = point
+        super().__init__(point.shape[:-1], point.shape[-1:], validate_args=False)
+
+
+@median.register
+def _(density: At, samples: int) -> torch.Tensor:
+    return density.point
+
+
+def prediction(point, target, dtype=torch.float64):
+    return Prediction(
+        At(torch.as_tensor(point, dtype=dtype)), {"target": torch.as_tensor(target, dtype=dtype)}
+    )
+
+
+def measured(point, target, dtype=torch.float64):
+    metric = Viewpoint(TARGET)
+    metric.update(prediction(point, target, dtype))
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+def scipy_distance(point, target):
+    """Angle of R₁⁻¹R₂ in radians, from unit quaternions, of rotations Rz(t) Rx(e - π/2) Rz(-a)."""
+
+    def rotations(angles):
+        azimuth, elevation, tilt = np.asarray(angles, dtype=np.float64).T
+        return Rotation.from_euler("ZXZ", np.stack([tilt, elevation - math.pi / 2, -azimuth], -1))
+
+    return (rotations(point).inv() * rotations(target)).magnitude()
+
+
+angle = st.floats(-7, 7, allow_subnormal=False)
+viewpoints = st.tuples(angle, angle, angle)
+
+
+@settings(deadline=None, max_examples=200)
+@given(viewpoints, viewpoints)
+def test_error_is_scipys_angle(point, target):
+    expected = math.degrees(scipy_distance([point], [target])[0])
+    assert measured([point], [target])["mederr_deg"] == pytest.approx(expected, abs=math.degrees(1e-6))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-8, 1e-5, 0.1])
+@pytest.mark.parametrize("about", [0.0, math.pi])
+def test_error_is_right_to_1e_6_radians_near_0_and_a_half_turn(gap, about):
+    generator = np.random.default_rng(2)
+    for target in generator.uniform(-math.pi, math.pi, (20, 3)):
+        # A turn of the azimuth turns the object about its own axis by exactly that much.
+        point = target + np.array([about - gap, 0, 0])
+        found = math.radians(measured(point[None], target[None])["mederr_deg"])
+        assert found == pytest.approx(abs(about - gap), abs=1e-6)
+        assert found == pytest.approx(scipy_distance([point], [target])[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [1, 2, 101, 200])
+def test_accuracy_and_median_are_numpys(dtype, count):
+    generator = np.random.default_rng(count)
+    target = generator.uniform(-math.pi, math.pi, (count, 3)).astype(str(dtype).removeprefix("torch."))
+    point = target + generator.normal(0, 0.4, (count, 3)).astype(target.dtype)
+    metric = build("metric", resolve("metric", "viewpoint"), target=TARGET)
+    metric.update(prediction(point, target, dtype))
+    found = metric.compute()
+    errors = scipy_distance(point, target)
+    assert found["acc_pi_6"].item() == np.mean(errors < math.pi / 6)
+    assert found["mederr_deg"].item() == pytest.approx(math.degrees(np.median(errors)), abs=1e-6)
+
+
+def test_359_degrees_is_next_to_1_degree():
+    point, target = np.radians([[359, 20, 359]]), np.radians([[1, 20, 359]])
+    found = measured(point, target)
+    assert found["mederr_deg"] == pytest.approx(2, abs=1e-9)
+    assert found["acc_pi_6"] == 1
+
+
+def test_the_order_of_the_angles_does_not_matter():
+    generator = np.random.default_rng(3)
+    point, target = generator.uniform(-3, 3, (2, 9, 3))
+    swapped = Viewpoint(Target("angle", ("tilt", "azimuth", "elevation")))
+    swapped.update(prediction(point[:, [2, 0, 1]], target[:, [2, 0, 1]]))
+    assert swapped.compute()["mederr_deg"].item() == measured(point, target)["mederr_deg"]
+
+
+def test_nothing_seen_is_nan():
+    empty = np.zeros((0, 3))
+    assert all(np.isnan(value) for value in measured(empty, empty).values())
+
+
+def test_a_prediction_that_is_not_a_number_is_not_hidden():
+    found = measured([[np.nan, 0, 0], [0, 0, 0], [0, 0, 0]], np.zeros((3, 3)))
+    assert np.isnan(found["mederr_deg"])
+    assert found["acc_pi_6"] == pytest.approx(2 / 3)
+
+
+def test_merged_halves_are_the_whole():
+    generator = np.random.default_rng(4)
+    point, target = generator.uniform(-1, 1, (2, 31, 3))
+    first, second, whole = (Viewpoint(TARGET) for _ in range(3))
+    first.update(prediction(point[:12], target[:12]))
+    second.update(prediction(point[12:], target[12:]))
+    whole.update(prediction(point, target))
+    first.merge_state(second)
+    assert first.compute() == whole.compute()
+
+
+def test_two_processes_are_the_whole():
+    generator = np.random.default_rng(5)
+    point, target = generator.uniform(-1, 1, (2, 31, 3))
+    first, second, whole = (Viewpoint(TARGET) for _ in range(3))
+    for rows in (slice(0, 5), slice(5, 12)):
+        first.update(prediction(point[rows], target[rows]))
+    second.update(prediction(point[12:], target[12:]))
+    whole.update(prediction(point, target))
+    others = torch.cat(second.errors)
+    first.dist_sync_fn = lambda state, group=None: [state, others]
+    first.distributed_available_fn = lambda: True
+    assert first.compute() == whole.compute()
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        Target("angle", ("azimuth",)),
+        Target("angle", ("pan", "tilt", "roll")),
+        Target("real", ("azimuth", "elevation", "tilt")),
+    ],
+)
+def test_refuses_anything_but_the_three_angles(target):
+    with pytest.raises(ConfigError, match="three angles azimuth, elevation, tilt"):
+        Viewpoint(target)

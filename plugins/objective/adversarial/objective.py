@@ -1,0 +1,104 @@
+"""The training loss on adversarial neighbours of the training inputs."""
+
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from framework.calibration.module_flags import flagged
+from framework.data import Batch
+from framework.errors import ConfigError, DataError, NonFiniteLoss
+from framework.model import Predictor
+from framework.objective import Objective
+
+
+class Adversarial(Objective):
+    """Asks for the loss to stay low within ±ε of every training input, where it grows fastest (thesis eq. 2.20).
+
+    The penalty is the weight times the mean loss on x' = x + ε sign(∇ₓ loss(x, y)), with the labels of x. It needs a
+    loss that is differentiable in the inputs and knows nothing of the density, so that it works for any head and any
+    wrapper.
+
+    Images that come as uint8 are read as 0…1 and x' is kept within; floats are taken as they come, and x' may leave
+    their range by ε (images that the data plugin augments arrive as floats). Dropout draws another mask for the
+    gradient than for the loss at x'. Batch norm normalises x' by its own batch, and keeps no moments of it.
+
+    Args:
+        weight: of the penalty, against the loss on x itself.
+        epsilon: ε, in the units of the inputs; of images, 1 is from black to white.
+
+    Raises (in training):
+        DataError: inputs of integers that are not bytes.
+        ConfigError: the loss does not depend on the inputs by gradient.
+        NonFiniteLoss: the gradient in an input is NaN.
+    """
+
+    bibtex = """@inproceedings{goodfellow2015explaining,
+  author    = {Goodfellow, Ian J. and Shlens, Jonathon and Szegedy, Christian},
+  title     = {Explaining and Harnessing Adversarial Examples},
+  booktitle = {International Conference on Learning Representations},
+  year      = {2015}
+}"""
+
+    def __init__(
+        self,
+        *,
+        weight: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+        epsilon: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.01,
+    ) -> None:
+        super().__init__()
+        self.weight = weight
+        self.epsilon = epsilon
+
+    def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        inputs = as_floats(batch["input"], predictor)
+        # x' belongs to the training distribution no more than it is in the batch: no running moments from it
+        with flagged(predictor, _BatchNorm, "track_running_stats", False):
+            moved = inputs + self.epsilon * self._direction(predictor, inputs, batch)
+            if batch["input"].dtype == torch.uint8:
+                moved = moved.clamp(0, 1)
+            losses = predictor.loss(moved, batch["target"])
+        return self.weight * losses.sum() / max(1, len(losses))  # no samples, no penalty
+
+    def _direction(self, predictor: Predictor, inputs: Tensor, batch: Batch) -> Tensor:
+        """sign(∇ₓ[-log p(y | x)]), 0 where the loss is flat (eq. 2.20); leaves no gradient behind."""
+        given = inputs.detach().requires_grad_()
+        with torch.enable_grad():
+            # a sum, whose gradient in one input is that of its own loss
+            loss = predictor.loss(given, batch["target"]).sum()
+        (gradient,) = torch.autograd.grad(loss, given, allow_unused=True) if loss.requires_grad else (None,)
+        if gradient is None:
+            raise ConfigError(
+                "objective.adversarial moves inputs along the gradient of the loss, but the loss has no gradient in "
+                "them; wanted encoders that are differentiable in their inputs. Leave out this objective, or choose "
+                "another encoder."
+            )
+        if gradient.isnan().any():
+            rows = gradient.isnan().flatten(1).any(1).nonzero().flatten()
+            names = batch["index"][rows] if "index" in batch else rows
+            raise NonFiniteLoss(
+                f"The gradient of the loss in the inputs is NaN for samples {names.tolist()[:10]} of the training "
+                "split. The weights were not changed by this step. Look at these samples, or lower "
+                "optimizer.learning_rate."
+            )
+        return gradient.sign()
+
+
+def as_floats(inputs: Tensor, predictor: Predictor) -> Tensor:
+    """The inputs as floating-point numbers, bytes as 0…1, in the type of the predictor's parameters.
+
+    Raises:
+        DataError: integers that are not bytes.
+    """
+    if inputs.is_floating_point():
+        return inputs
+    if inputs.dtype != torch.uint8:
+        raise DataError(
+            f"objective.adversarial got inputs of type {inputs.dtype}, which cannot be moved a little; wanted floats, "
+            "or images as uint8. Leave out this objective."
+        )
+    dtypes = (parameter.dtype for parameter in predictor.parameters() if parameter.is_floating_point())
+    return inputs.to(next(dtypes, torch.get_default_dtype())) / 255

@@ -1,0 +1,57 @@
+"""How far a density is from knowing nothing: divergences between it and a uniform one, for every kind of target."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.density import Circular
+from framework.distributions.monte_carlo import normal_quantile
+
+DRAWS = 16
+"""Targets that a divergence of a continuous density is estimated from, for each of the batch."""
+
+
+def from_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
+    """KL(p ‖ u) = log K - H(p) over K classes, nats: the entropy of thesis eq. 2.21 up to a constant."""
+    log_prob = density.log_prob(density.enumerate_support())
+    # p log p → 0 as p → 0; cut off where p is 0 in any floating-point number, lest 0 × ∞
+    return (log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) + math.log(len(log_prob))
+
+
+def to_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
+    """KL(u ‖ p) = -Σ_k log p_k / K - log K over K classes, nats (Hendrycks et al. 2019, §4)."""
+    log_prob = density.log_prob(density.enumerate_support())
+    return -log_prob.mean(0) - math.log(len(log_prob))
+
+
+def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]:
+    """KL(u ‖ p) = E_u[-log p] - H(u) of a continuous density, nats, from a few targets drawn from u; unbiased.
+
+    u is uniform in every angle, over the range that the density's support gives it, and N(0, scale²) in every real.
+    Places are a Latin hypercube: each of n equal shares of each number's mass holds one (McKay, Beckman & Conover
+    1979), so that the estimate of one number errs by O(n^-3/2) and not O(n^-1/2). All members of a batch of
+    (batch, member) see the same targets.
+    """
+    support = density.support
+    numbers = density.event_shape[0]
+    members = (1,) * (len(density.batch_shape) - 1)
+    like = density.sample(torch.Size((0,)))  # of nothing: tells the density's type and device
+    place = latin_hypercube((*density.batch_shape[:1], *members, numbers), like.device)
+    if isinstance(support, Circular):
+        ranges = support.ranges or ((-math.pi, math.pi),) * numbers
+        low, high = torch.tensor(ranges, dtype=place.dtype, device=place.device).T
+        drawn = low + place * (high - low)
+        entropy = sum(math.log(highest - lowest) for lowest, highest in ranges)
+    else:
+        drawn = scale * normal_quantile(place)
+        entropy = numbers * (0.5 + 0.5 * math.log(2 * math.pi) + math.log(scale))
+    return -density.log_prob(drawn.to(like.dtype)).mean(0) - entropy
+
+
+def latin_hypercube(shape: tuple[int, ...], device: torch.device) -> Float[Tensor, "draw *shape"]:
+    """DRAWS places in [0, 1) for each of `shape`, one in each DRAWS-th, in random order; float64."""
+    order = torch.rand(DRAWS, *shape, dtype=torch.float64, device=device).argsort(0)
+    return (order + torch.rand(DRAWS, *shape, dtype=torch.float64, device=device)) / DRAWS

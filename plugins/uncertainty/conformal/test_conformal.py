@@ -1,0 +1,243 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.datasets import make_moons
+from torch import nn
+from torch.distributions import Categorical
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.batch_shapes import Stacked
+from framework.distributions.density import Mixture
+from framework.distributions.prediction_set import PredictionSet
+from framework.errors import ConfigError, UserError
+from framework.model import Predictor
+from framework.target import Target
+from framework.testing.metrics import Cardioid
+from plugins.uncertainty.conformal.wrapper import halves, threshold
+
+CLASSES, ANGLE = Target("class", ("upper", "lower")), Target("angle", ("azimuth",))
+SPLITS, POOL = 200, 1600
+
+
+class Given(Predictor):
+    """Densities made of the inputs themselves; remembers what it was calibrated on."""
+
+    def __init__(self, make):
+        super().__init__()
+        self.make = make
+        self.seen = []
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, inputs):
+        return self.make(inputs)
+
+    def loss(self, inputs, target):
+        return -self(inputs).log_prob(target) * self.weight
+
+    def training_densities(self, inputs):
+        return self(inputs)
+
+    def calibrate(self, batches):
+        self.seen = torch.cat([batch["index"] for batch in batches]).tolist()
+
+
+def around(model, target=CLASSES, name="conformal", **config):
+    resolved = resolve("uncertainty", {"name": name, **config})
+    return build("uncertainty", resolved, model=lambda: model, target=target).eval()
+
+
+def batches(inputs, target, size=100):
+    index = torch.arange(len(target))
+    parts = zip(inputs.split(size), target.split(size), index.split(size), strict=True)
+    return ({"input": a, "target": b, "index": c} for a, b, c in parts)
+
+
+def moons(count):
+    """Two moons, and a fixed classifier that is much too sure: logits of a hand-made boundary, sharpened."""
+    points, label = make_moons(count, noise=0.35, random_state=0)
+    return torch.from_numpy(points), torch.from_numpy(label)
+
+
+def sure_classifier(points):
+    x, y = points.unbind(-1)
+    margin = 6 * (0.25 + 0.6 * torch.sin(2.2 * x + 0.4) - y)
+    return Categorical(logits=torch.stack([-margin, margin], -1).log_softmax(-1), validate_args=False)
+
+
+def circle(count):
+    """Von Mises noise about directions, of κ that varies with the input."""
+    generator = np.random.default_rng(0)
+    inputs = generator.uniform(-3, 3, (count, 2))
+    noise = generator.vonmises(0, 4 + 3 * np.tanh(inputs[:, 1]))
+    return torch.from_numpy(inputs), torch.from_numpy(inputs[:, :1] + noise[:, None])
+
+
+def sure_direction(inputs):
+    """The right direction with κ eight times too large."""
+    kind = type(build("density_head", resolve("density_head", "von_mises"), target=ANGLE)(torch.zeros(1, 3)))
+    return kind(inputs[:, :1], 8 * (4 + 3 * torch.tanh(inputs[:, 1:])))
+
+
+PROBLEMS = {"moons": (moons, sure_classifier, CLASSES), "circle": (circle, sure_direction, ANGLE)}
+
+
+@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("score", ["density", "mass"])
+@pytest.mark.parametrize("miscoverage", [0.1, 0.05])
+def test_coverage_is_what_was_promised(problem, score, miscoverage):
+    """Mean over 200 random splits of one pool, within 1 %, of models that are badly calibrated.
+
+    Of every split half of the validation samples are left to what is wrapped, as the wrapper leaves them.
+    """
+    make, predict, target = PROBLEMS[problem]
+    inputs, label = make(POOL)
+    wrapper = around(Given(predict), target, score=score, miscoverage=miscoverage)
+    scores = wrapper(inputs).scores(label)
+    half = POOL // 2
+    mine = torch.cat([batch["index"] for batch in halves(list(batches(inputs[:half], label[:half])))[1]])
+    generator = torch.Generator().manual_seed(0)
+    covered = []
+    for _ in range(SPLITS):
+        order = torch.randperm(POOL, generator=generator)
+        validation, test = scores[order[:half]], scores[order[half:]]
+        covered.append((test <= threshold(validation[mine], miscoverage)).double().mean())
+    assert torch.stack(covered).mean().item() == pytest.approx(1 - miscoverage, abs=0.01)
+    # the wrapper does the same on one of them, and its sets hold what its scores say
+    wrapper.calibrate(batches(inputs[order[:half]], label[order[:half]]))
+    assert wrapper.threshold.item() == pytest.approx(threshold(validation[mine], miscoverage), rel=1e-9)
+    rest = order[half:]
+    held = wrapper(inputs[rest]).contains(label[rest])
+    assert held.double().mean().item() == pytest.approx(covered[-1].item(), abs=2 / len(rest))
+    # without it, the model's own region of that mass covers too little
+    if score == "mass":
+        own = PredictionSet(predict(inputs), -torch.tensor(miscoverage).double().log(), "mass")
+        assert own.contains(label).double().mean().item() < 1 - miscoverage - 0.03
+
+
+def test_around_a_temperature_it_still_covers():
+    inputs, label = moons(1500)
+    generator = torch.Generator().manual_seed(1)
+    covered = []
+    for _ in range(20):
+        order = torch.randperm(1500, generator=generator)
+        first, rest = order[:1000], order[1000:]
+        inner = around(Given(sure_classifier), name="temperature")
+        wrapper = around(inner, miscoverage=0.1, score="mass")
+        wrapper.calibrate(batches(inputs[first], label[first]))
+        covered.append(wrapper(inputs[rest]).contains(label[rest]).double().mean())
+    # one split's coverage has a standard deviation of about 0.019, so their mean one of 0.004
+    assert torch.stack(covered).mean().item() == pytest.approx(0.9, abs=0.02)
+    assert inner.temperature.item() > 1.5
+    alone = around(Given(sure_classifier), name="temperature")
+    theirs, _ = halves(list(batches(inputs[first], label[first])))
+    alone.calibrate(theirs)
+    assert inner.temperature.item() == alone.temperature.item()
+
+
+@pytest.mark.parametrize("target", [CLASSES, ANGLE])
+def test_wrappers_compose_in_any_order(target):
+    def members(inputs):
+        both = [inputs[:, :2], 0.5 * inputs[:, :2]]
+        if target is CLASSES:
+            parts = [Categorical(logits=one, validate_args=False) for one in both]
+        else:
+            parts = [Cardioid(one[:, :1]) for one in both]
+        return Mixture(torch.zeros(len(inputs), 2, dtype=inputs.dtype), Stacked(parts))
+
+    torch.manual_seed(0)
+    inputs = torch.randn(80, 2, dtype=torch.float64)
+    label = members(inputs).sample()
+    names = ["temperature", "conformal"] + (["platt"] if target is CLASSES else [])
+    for first in names:
+        for second in names:
+            wrapper = around(around(Given(members), target, name=first), target, name=second)
+            wrapper.calibrate(batches(inputs, label, 16))
+            density = wrapper(inputs)
+            assert isinstance(density, PredictionSet) == (second == "conformal")
+            assert density.log_prob(label).isfinite().all() and density.log_prob(label).shape == (80,)
+
+
+def test_what_is_wrapped_gets_one_half():
+    model = Given(sure_classifier)
+    inputs, label = moons(47)
+    wrapper = around(model)
+    wrapper.calibrate(batches(inputs, label, 5))
+    theirs = set(model.seen)
+    rest = torch.tensor([index for index in range(47) if index not in theirs])
+    assert len(theirs) == 24 and model.seen == sorted(theirs)
+    mine = PredictionSet(sure_classifier(inputs[rest]), wrapper.threshold, "density").scores(label[rest])
+    assert wrapper.threshold.item() == threshold(mine, 0.1)
+    wrapper.calibrate(batches(inputs, label, 11))  # how the samples are batched is no matter
+    assert set(model.seen) == theirs
+    ones = halves(list(batches(inputs[:4], label[:4], 1)))
+    assert [len(half) for half in ones] == [2, 2]  # no empty batches
+
+
+def test_neighbours_that_alternate_do_not_split_by_class():
+    inputs, label = moons(400)
+    turns = torch.stack([(label == 0).nonzero()[:190, 0], (label == 1).nonzero()[:190, 0]], 1).flatten()
+    inner = around(Given(sure_classifier), name="platt")
+    around(inner).calibrate(batches(inputs[turns], label[turns]))
+    assert inner.slope > 0.05 and inner.biases.abs().max() < 1
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(allow_nan=False), min_size=1, max_size=200), st.integers(1, 99))
+def test_the_threshold_is_the_order_statistic(scores, percent):
+    """⌈(n + 1)(1 - α)⌉-th smallest, in exact integers."""
+    rank = -(-(len(scores) + 1) * (100 - percent) // 100)
+    wanted = sorted(scores)[rank - 1] if rank <= len(scores) else math.inf
+    assert threshold(torch.tensor(scores, dtype=torch.float64), percent / 100) == wanted
+
+
+@pytest.mark.parametrize("score", ["density", "mass"])
+def test_too_few_samples_make_the_set_everything_and_it_is_said(score, caplog):
+    inputs, label = moons(16)  # 8 of its own: 9 would do for 10 %
+    wrapper = around(Given(sure_classifier), score=score)
+    assert wrapper(inputs).labels().all()  # before calibration too
+    wrapper.calibrate(batches(inputs, label))
+    assert wrapper.threshold.item() == math.inf and wrapper(inputs).labels().all()
+    assert "with 8 validation samples" in caplog.text and "9 would do" in caplog.text
+    caplog.clear()
+    inputs, label = moons(18)
+    wrapper.calibrate(batches(inputs, label))
+    assert math.isfinite(wrapper.threshold.item()) and not caplog.text
+
+
+def test_targets_that_are_ruled_out_are_ordinary_scores(caplog):
+    def certain(inputs):
+        return Categorical(logits=torch.tensor([0.0, -math.inf]).expand(len(inputs), 2), validate_args=False)
+
+    inputs, label = torch.zeros(400, 2), torch.zeros(400, dtype=torch.int64)
+    label[::10] = 1  # about 10 %, beyond α = 5 %
+    wrapper = around(Given(certain), miscoverage=0.05)
+    wrapper.calibrate(batches(inputs, label))
+    assert wrapper(inputs).labels().all() and "The sets are everything" in caplog.text
+    loose = around(Given(certain), miscoverage=0.2)
+    loose.calibrate(batches(inputs, label))
+    assert loose(inputs).labels().tolist() == [[True, False]] * 400
+
+
+def test_bad_sets_get_a_sentence():
+    inputs, label = moons(60)
+    _, mine = halves(list(batches(inputs, label)))
+    first, second = mine[0]["index"][:2].tolist()
+    inputs[[first, second]] = math.nan
+    with pytest.raises(
+        UserError, match=rf"score of validation samples \[{first}, {second}\] is not a number"
+    ):
+        around(Given(sure_classifier)).calibrate(batches(inputs, label))
+    with pytest.raises(UserError, match="conformal is calibrated on the validation split, but got no sample"):
+        around(Given(sure_classifier)).calibrate(iter(()))
+    with pytest.raises(UserError, match="got one sample of it; wanted 2 or more"):
+        around(Given(sure_classifier)).calibrate(batches(inputs[:1], label[:1]))
+
+
+@pytest.mark.parametrize("config", [{"miscoverage": 0.0}, {"miscoverage": 1.0}, {"score": "rank"}])
+def test_a_config_out_of_range_is_refused(config):
+    with pytest.raises(ConfigError, match="uncertainty"):
+        around(Given(sure_classifier), **config)

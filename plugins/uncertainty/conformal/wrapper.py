@@ -1,0 +1,142 @@
+"""Split conformal prediction: sets that hold the target with a promised probability, whatever the model."""
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.calibration.validation import densities, repeatable, require_numbers
+from framework.data import Batch
+from framework.distributions.prediction_set import PredictionSet, Score
+from framework.errors import UserError
+from framework.model import Predictor
+from framework.uncertainty import Uncertainty
+
+SEED = 71
+"""Of the split into halves."""
+_log = logging.getLogger(__name__)
+
+
+class Conformal(Uncertainty):
+    """Densities as they are, each with a set (distributions.prediction_set) that holds the target with 1 - miscoverage.
+
+    On data that is exchangeable with the validation set a new target lies in its set with a probability of at least
+    1 - α, and of at most 1 - α + 1/(n + 1) where no two of the n scores are equal, on average over both, however wrong
+    the model is (Vovk, Gammerman & Shafer 2005, §4.1). Not for each input apart. Put it last: what wraps it keeps the
+    densities and drops the sets.
+
+    What is wrapped is calibrated on a random half of the validation set, always the same, and the threshold on the
+    rest: on scores that a temperature was fitted to, nothing is promised. Before `calibrate` the set is everything.
+
+    Args:
+        miscoverage: α, the share of targets that may lie outside.
+        score: "density": one level of density for all inputs, the smallest sets on average; "mass": one mass for all
+            inputs, sets that grow where the model is unsure.
+
+    Attributes:
+        threshold: the largest score in a set, nats, a float64 buffer.
+
+    Raises:
+        UserError: fewer than 2 validation samples, or a score that is NaN (its samples are named).
+    """
+
+    bibtex = """@book{vovk2005algorithmic,
+  author    = {Vovk, Vladimir and Gammerman, Alexander and Shafer, Glenn},
+  title     = {Algorithmic Learning in a Random World},
+  publisher = {Springer},
+  year      = {2005}
+}
+
+@article{sadinle2019least,
+  author  = {Sadinle, Mauricio and Lei, Jing and Wasserman, Larry},
+  title   = {Least Ambiguous Set-Valued Classifiers with Bounded Error Levels},
+  journal = {Journal of the American Statistical Association},
+  volume  = {114},
+  number  = {525},
+  pages   = {223--234},
+  year    = {2019}
+}
+
+@inproceedings{romano2020classification,
+  author    = {Romano, Yaniv and Sesia, Matteo and Cand{\\`e}s, Emmanuel J.},
+  title     = {Classification with Valid and Adaptive Coverage},
+  booktitle = {Advances in Neural Information Processing Systems},
+  year      = {2020}
+}"""
+    threshold: Tensor
+
+    def __init__(
+        self,
+        model: Callable[[], Predictor],
+        *,
+        miscoverage: Annotated[float, Field(gt=0, lt=1)] = 0.1,
+        score: Score = "density",
+    ) -> None:
+        super().__init__()
+        self.knobs = {}
+        self.model = model()
+        self.miscoverage = miscoverage
+        self.score: Score = score
+        self.register_buffer("threshold", torch.tensor(math.inf, dtype=torch.float64))
+
+    def forward(self, inputs: Tensor) -> PredictionSet:
+        return PredictionSet(self.model(inputs), self.threshold, self.score)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        return self.model.loss(inputs, target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self.model.training_densities(inputs)
+
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        theirs, mine = halves(repeatable(batches, by="conformal"))
+        if not mine:
+            raise UserError(
+                "conformal shares the validation split with what it wraps, and got one sample of it; wanted 2 or more. "
+                "Give the data set a larger validation split."
+            )
+        self.model.calibrate(theirs)
+        sets = [PredictionSet(density, self.threshold, self.score) for density in densities(self.model, mine)]
+        scores = torch.cat([one.scores(batch["target"]) for one, batch in zip(sets, mine, strict=True)])
+        require_numbers(scores, mine, "score")
+        self.threshold.fill_(threshold(scores, self.miscoverage))
+        if self.threshold.isinf():
+            _log.warning(
+                "conformal: with %d validation samples no set short of everything is certain to miss %g of the targets "
+                "or fewer; %d would do, if no density ruled them out. The sets are everything.",
+                len(scores),
+                self.miscoverage,
+                math.ceil(1 / self.miscoverage) - 1,
+            )
+
+
+def halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
+    """A random half of the samples, rounded up, and the rest, both in order and without empty batches.
+
+    Not every other one: in many data sets neighbours alternate, or belong together. The same of every set of one size.
+    """
+    sizes = [len(batch["target"]) for batch in batches]
+    order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(SEED))
+    chosen = torch.zeros(sum(sizes), dtype=torch.bool)
+    chosen[order[: (len(order) + 1) // 2]] = True
+    found: tuple[list[Batch], list[Batch]] = ([], [])
+    for batch, mask in zip(batches, chosen.split(sizes), strict=True):
+        for part, some in zip(found, (mask, ~mask), strict=True):
+            rows = some.nonzero().flatten().to(batch["target"].device)
+            if len(rows):
+                part.append({name: field[rows] for name, field in batch.items()})
+    return found
+
+
+def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
+    """The k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉ (Vovk, Gammerman & Shafer 2005, §4.1); infinite if k > n."""
+    count = len(scores)
+    # from the other side, so that (n + 1) α is whole where it should be: α itself is rounded
+    left_out = math.floor((count + 1) * miscoverage * (1 + 1e-12))
+    return scores.sort().values[count - left_out].item() if left_out else math.inf

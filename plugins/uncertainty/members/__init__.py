@@ -1,0 +1,1 @@
+"""Several members, or several passes of one."""

@@ -1,0 +1,1 @@
+"""Post-hoc scaling: temperature and Platt."""
