@@ -102,7 +102,7 @@ def main() -> None:
             root = {"root": sys.argv[2]} if len(sys.argv) > 2 else {}
             data = build("data", described["config"]["data"] | root)
             data.prepare()
-            batch = data.test().__getitems__(range(min(IMAGES, len(data.test()))))
+            batch = data.splits().test.__getitems__(range(min(IMAGES, len(data.splits().test))))
             fields = {"input": batch["input"], "target": batch["target"]}
         found = log_likelihoods(model, fields["input"], fields["target"][:, :1])
         rows.append({"method": row["method"], "seed": row["seed"], "synthetic": row["synthetic"], **found})

@@ -120,7 +120,7 @@ def differences(data: Data, fields: dict[str, Tensor], dtype: torch.dtype) -> fl
         network(model).load_state_dict(whole.together.read(index))
         alone.append(model)
     bare(whole, fields, EPOCHS, 0)
-    test = data.test().fields["input"].to(dtype)  # type: ignore[attr-defined]
+    test = data.splits().test.fields["input"].to(dtype)  # type: ignore[attr-defined]
     label = torch.ones(len(test), dtype=torch.int64)
     worst = 0.0
     for model in alone:
@@ -137,7 +137,7 @@ def spread(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Test NLL of members of one ensemble; of networks trained apart from starts of their own in the same order of
     batches; and of such with orders of their own."""
-    test = data.test().fields  # type: ignore[attr-defined]
+    test = data.splits().test.fields  # type: ignore[attr-defined]
     whole = predictor(data, 128, 0, count)
     bare(whole, fields, epochs, 0)
     with torch.no_grad():
@@ -162,7 +162,7 @@ def main() -> None:
     logging.getLogger("pytorch_lightning").setLevel(logging.ERROR)
     data: Data = build("data", resolve("data", "moons"))
     data.prepare()
-    fields: dict[str, Tensor] = data.train().fields  # type: ignore[attr-defined]
+    fields: dict[str, Tensor] = data.splits().train.fields  # type: ignore[attr-defined]
     lines = ["| network | loop | together, s | apart, s | ratio | rounds |", "|---|---|---|---|---|---|"]
     for width in (32, 128, 512):
         for loop, (together, apart, rounds) in ratios(data, fields, width).items():

@@ -106,8 +106,8 @@ def main() -> None:
     torch.set_num_threads(1)
     data = build("data", resolve("data", "modelnet40"))
     data.prepare()
-    count = min(256, len(data.test()))
-    clouds = torch.stack([data.test()[index]["input"] for index in range(count)])
+    count = min(256, len(data.splits().test))
+    clouds = torch.stack([data.splits().test[index]["input"] for index in range(count)])
     order = list(ROWS)
     rows = [row for folder in sys.argv[1:] for row in found(Path(folder), clouds)]
     rows.sort(key=lambda row: order.index(row.pop("key")))

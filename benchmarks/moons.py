@@ -98,7 +98,7 @@ def best_possible(seeds: list[int]) -> str:
     for seed in seeds:
         data = build("data", resolve("data", {"name": "moons", "data_seed": seed}))
         data.prepare()
-        fields = data.test().fields
+        fields = data.splits().test.fields
         p, label = fields["posterior"][:, 1].double().numpy(), fields["target"].numpy()
         own = np.where(label == 1, p, 1 - p)
         found.append((((p > 0.5) == label).mean(), -np.log(own).mean(), ((label - p) ** 2).mean()))
@@ -142,7 +142,7 @@ def pictures(rows: list[dict[str, Any]]) -> None:
     data, others = build("data", resolve("data", "moons")), build("data", resolve("data", "moons_outliers"))
     data.prepare()
     others.prepare()
-    seen, far = data.train().fields, others.test().fields["input"].numpy()
+    seen, far = data.splits().train.fields, others.splits().test.fields["input"].numpy()
     plane = Plane(seen["input"].numpy(), seen["target"].numpy(), far, data.target.names, 4.0)
     six = ["vanilla_128", "vanilla_512", "temperature", "mc_dropout", "ensemble", "outlier_exposure"]
     panels = {

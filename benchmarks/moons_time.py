@@ -18,9 +18,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
+from framework.datasets.fields import as_batch
 from framework.evaluation.tradeoff import rows, tradeoff, write
 from framework.reports.tradeoff_picture import tradeoff as drawn
-from framework.training.batches import as_batch
 
 HERE = Path(__file__).parent
 KNOBS = {
@@ -37,7 +37,7 @@ def main() -> None:
     torch.set_num_threads(1)
     data = build("data", resolve("data", "moons"))
     data.prepare()
-    test = data.test()
+    test = data.splits().test
     batches = [as_batch(test.__getitems__(range(start, start + 500))) for start in range(0, len(test), 500)]
     metrics = [
         build("metric", resolve("metric", name), target=data.target) for name in ("nll", "calibration_error")

@@ -25,9 +25,9 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
+from framework.figures.style import COLOURS, MARKERS, titled_figure
 from framework.geometry.clouds import Normalised, normalised, sizes
 from framework.geometry.nearest import chamfer
-from framework.reports.pictures import COLOURS, MARKERS, titled_figure
 from framework.reports.table import csv, markdown
 from plugins.encoder.bps.basis import Strategy, basis
 from plugins.encoder.bps.encoding import decode, encode, prepared
@@ -60,7 +60,7 @@ def shapes(points: int, models: int, classes: list[str] | None = None) -> tuple[
     }
     data = build("data", resolve("data", config))
     data.prepare()
-    test = data.test()
+    test = data.splits().test
     clouds = test.__getitems__(range(len(test)))["input"]
     return normalised(clouds, "unit_ball").clouds, data.synthetic
 

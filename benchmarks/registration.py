@@ -43,7 +43,7 @@ def residuals(data) -> dict[int, float]:
     """Mean vertex error, cm, of held-out bodies projected onto as many principal components of training bodies."""
     # every k-th sample's target is the mesh in its scan's own frame, as a model has to predict it
     parts = {}
-    for name, split, count in (("fitted", data.train(), BODIES), ("held", data.test(), HELD)):
+    for name, split, count in (("fitted", data.splits().train, BODIES), ("held", data.splits().test, HELD)):
         batches = [split.__getitems__(range(first, first + 100)) for first in range(0, count, 100)]
         parts[name] = {
             key: torch.cat([batch[key].float() for batch in batches]) for key in ("target", "scale")
@@ -63,7 +63,7 @@ def residuals(data) -> dict[int, float]:
 
 def speeds(data) -> list[tuple[str, float]]:
     """Milliseconds of every step for one scan, one thread."""
-    split = data.test()
+    split = data.splits().test
     batch = split.__getitems__([0])
     cloud = batch["input"][:, : int((~batch["input"].isnan()).all(-1).sum())]
     shape, pose = split.shape[:64], split.pose[:64]
@@ -121,7 +121,7 @@ def main(arguments: list[str]) -> None:
         *(f"| {rank} | {value:.2f} |" for rank, value in ranks.items()),
     ]
     if arguments:
-        lines += ["", *trained(Path(arguments[0]), data.test())]
+        lines += ["", *trained(Path(arguments[0]), data.splits().test)]
     if len(arguments) > 1:
         picture(arguments[0], Path(arguments[1]))
         lines += ["", "![A real scan and the mesh registered to it](registration.png)"]

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
+from framework.figures.style import titled_figure
 from framework.geometry.clouds import sizes
 from framework.geometry.nearest import nearest
-from framework.reports.pictures import titled_figure
 from framework.reports.table import markdown
 from plugins.data.bodies.body import Body
 from plugins.data.bodies.registration import poses
@@ -153,8 +153,8 @@ def main() -> None:
     data = build("data", resolve("data", {"name": "registration", "train": TRAIN, "test": TEST}))
     data.prepare()
     names, vertex_part = parts_of(chosen_body(None)[0])
-    clouds, labels = labelled(data.train(), TRAIN, vertex_part)
-    held = labelled(data.test(), TEST, vertex_part)
+    clouds, labels = labelled(data.splits().train, TRAIN, vertex_part)
+    held = labelled(data.splits().test, TEST, vertex_part)
     made = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
     rows, said = [], {}
     for heading, whole in (("the point alone", False), ("with its cloud's code", True)):

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -14,6 +14,20 @@ from framework.target import Target
 Batch = dict[str, Tensor]
 """Named fields of a batch, first dimension the samples: "input"; "target" (radians for angles); "index", int64, the
 sample's number in its split; "group", int64 index into `Data.groups`; and what a plugin adds, said in its README."""
+
+
+class Splits(NamedTuple):
+    """The splits of a data set; disjoint.
+
+    Attributes:
+        train: what is trained on.
+        validation: early stopping and calibration see it, training does not.
+        test: seen by nothing but the test stage.
+    """
+
+    train: Dataset[Batch]
+    validation: Dataset[Batch]
+    test: Dataset[Batch]
 
 
 class Data(ABC):
@@ -46,6 +60,12 @@ class Data(ABC):
     skipped: int
     """How many samples were left out because they could not be read (only when the config allows it)."""
 
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        # plugins written before `splits` have three methods of the splits' names
+        if "splits" not in vars(cls) and all(callable(getattr(cls, name, None)) for name in Splits._fields):
+            cls.splits = _from_three_methods  # type: ignore[method-assign]
+        super().__init_subclass__(**keywords)
+
     @abstractmethod
     def prepare(self) -> None:
         """Find or generate the data, check its layout, read what is needed to set the attributes.
@@ -55,17 +75,9 @@ class Data(ABC):
         """
 
     @abstractmethod
-    def train(self) -> Dataset[Batch]:
-        """The training split. Items are dicts of tensors without batch dimension; a dataset that can fetch many
-        items faster at once also has `__getitems__(indices) -> Batch`, already batched (datasets.fields.Fields)."""
-
-    @abstractmethod
-    def validation(self) -> Dataset[Batch]:
-        """The validation split: early stopping and calibration see it, training does not."""
-
-    @abstractmethod
-    def test(self) -> Dataset[Batch]:
-        """The test split: seen by nothing but the test stage."""
+    def splits(self) -> Splits:
+        """The three splits. Items are dicts of tensors without batch dimension; a dataset that can fetch many items
+        faster at once also has `__getitems__(indices) -> Batch`, already batched (framework.datasets.fields)."""
 
     @abstractmethod
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
@@ -90,3 +102,7 @@ class Data(ABC):
     @abstractmethod
     def picture(self, inputs: Tensor) -> np.ndarray:
         """One input as a person would see it: (height, width, 3) uint8."""
+
+
+def _from_three_methods(data: Any) -> Splits:
+    return Splits(data.train(), data.validation(), data.test())

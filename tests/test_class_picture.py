@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from matplotlib.colors import to_hex
 
+from framework.figures.style import BLUE, GREEN, RED
 from framework.reports.class_picture import choose_classified, classified
-from framework.reports.pictures import BLUE, GREEN, RED
 from tests.test_pictures import drawn, words
 
 NAMES = ("cone", "a_chair_with_a_very_long_name", "cup", "lamp")

@@ -118,14 +118,15 @@ def test_features_are_computed_once_and_are_the_same_as_in_each_step():
     whole = Preceded([encoder], Model([], categorical(), (4,)))
     encoded = Encoded(data, whole.features, batch_size=7, workers=0)
     for name in ("train", "validation", "test"):
-        raw, found = getattr(data, name)(), getattr(encoded, name)()
-        assert getattr(encoded, name)() is found
-        assert found.fields.keys() == raw.fields.keys()
-        torch.testing.assert_close(found.fields["input"], Squares()(raw.fields["input"]), rtol=0, atol=0)
-        assert torch.equal(found.fields["index"], raw.fields["index"])
+        raw, found = getattr(data.splits(), name), getattr(encoded.splits(), name)
+        assert getattr(encoded.splits(), name) is found
+        every = found.__getitems__(range(len(found)))
+        assert every.keys() == raw.fields.keys()
+        torch.testing.assert_close(every["input"], Squares()(raw.fields["input"]), rtol=0, atol=0)
+        assert torch.equal(every["index"], raw.fields["index"])
     assert encoder.seen == 100
     some = next(iter(batches(data).of(data.test())))
-    same = next(iter(batches(encoded).of(encoded.test())))
+    same = next(iter(batches(encoded).of(encoded.splits().test)))
     assert torch.equal(whole(some["input"]).logits, whole.predictor(same["input"]).logits)
     assert torch.equal(
         whole.loss(some["input"], some["target"]), whole.predictor.loss(same["input"], same["target"])

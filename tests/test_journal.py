@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.errors import DataError
+from framework.storage.files import write_whole
 from framework.tracking import journal as module
-from framework.tracking.journal import Journal, write_atomically
+from framework.tracking.journal import Journal
 
 
 @pytest.fixture
@@ -338,9 +339,9 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
         Journal(tmp_path / "file" / "journal.jsonl").write({"a": 1.0}, 0, 0)
 
 
-def test_write_atomically_replaces_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_whole_replaces_all_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.json"
-    write_atomically(path, b"old")
+    write_whole(path, b"old")
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -348,8 +349,8 @@ def test_write_atomically_replaces_all_or_nothing(tmp_path: Path, monkeypatch: p
     with monkeypatch.context() as patched:
         patched.setattr(module.os, "fsync", full)
         with pytest.raises(OSError, match="No space"):
-            write_atomically(path, b"new")
+            write_whole(path, b"new")
     assert path.read_bytes() == b"old"
-    write_atomically(path, b"new")
+    write_whole(path, b"new")
     assert path.read_bytes() == b"new"
     assert list(tmp_path.iterdir()) == [path]

@@ -279,7 +279,7 @@ from pathlib import Path
 from framework.storage.cache import folder
 from framework.geometry.nearest.compiled import KEPT_IN
 assert Path(KEPT_IN).is_relative_to(folder("numba"))
-assert list(Path(KEPT_IN).glob("**/nearest_numba.answer-*.nbi"))
+assert list(Path(KEPT_IN).glob("**/processor.answer-*.nbi"))
 from numba import config
 assert not config.CACHE_DIR
 """

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from framework.errors import ConfigError
+from framework.runs.job import leave_value
 from framework.sweeps import jobs as sweep
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -24,6 +25,7 @@ APP = """
 import json, os, sys, types
 from pathlib import Path
 import hydra
+from framework.runs.job import leave_value
 from framework.sweeps import jobs as sweep
 
 HERE = Path(__file__).parent
@@ -371,7 +373,7 @@ def test_free_number() -> None:
 def test_what_a_job_leaves_for_an_optimising_sweeper(tmp_path: Path) -> None:
     job = sweep.Job(0, [], [], tmp_path, "key", "config")
     assert job.value() is None
-    sweep.leave_value(tmp_path, 0.25)
+    leave_value(tmp_path, 0.25)
     assert job.value() == 0.25
     assert [path.name for path in tmp_path.iterdir()] == ["value.json"]
 

@@ -182,8 +182,8 @@ def test_a_run_imports_only_what_it_names(stranger_site: Path, tmp_path: Path) -
     run = f"hydra.run.dir={tmp_path / 'run'}"
     done = listed(*QUIET, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
     assert done.code == 0, done.out
-    plugins = {name.split(".")[1] for name in done.modules if name.startswith("plugins.")}
-    assert plugins == {"mlp", "log_likelihood", "angular_deviation"}
+    plugins = {".".join(name.split(".")[1:3]) for name in done.modules if name.startswith("plugins.")}
+    assert plugins - {"encoder", "metric"} == {"encoder.mlp", "metric.log_likelihood", "metric.angular"}
     assert not {"mlflow", "numba", "trimesh", "sklearn", "kornia"} & {
         name.split(".")[0] for name in done.modules
     }

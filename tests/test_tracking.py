@@ -271,7 +271,7 @@ def test_long_parameters_on_a_full_disk_stop_nobody(
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(tracking, "write_atomically", full)
+    monkeypatch.setattr(tracking, "write_whole", full)
     tracker.log_params({"long": "y" * 251})
     tracker.close("FINISHED")
     assert client(folder).get_run(identity(folder)).data.params == {"long": "y" * 249 + "…"}
@@ -1104,7 +1104,7 @@ def test_run_json_that_cannot_be_written_stops_nobody(
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("framework.tracking.run_info.write_atomically", full)
+    monkeypatch.setattr("framework.tracking.run_info.write_whole", full)
     log(tracker, range(5))
     tracker.close("FINISHED")
     assert history(folder) == losses(range(5))

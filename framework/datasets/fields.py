@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, default_collate
+
+from framework.data import Batch
 
 
 class Fields(Dataset[dict[str, Tensor]]):
@@ -28,3 +30,8 @@ class Fields(Dataset[dict[str, Tensor]]):
 
     def __getitems__(self, indices: Sequence[int]) -> Mapping[str, Tensor]:
         return {name: tensor[list(indices)] for name, tensor in self.fields.items()}
+
+
+def as_batch(items: Mapping[str, Tensor] | list[Batch]) -> Batch:
+    """Collation: what a dataset's `__getitems__` batched stays as it is, single items are stacked."""
+    return dict(items) if isinstance(items, Mapping) else default_collate(items)

@@ -22,7 +22,7 @@ from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.modes.train import record_citations
 from framework.runs.run import opened
-from framework.tracking.journal import write_atomically
+from framework.storage.files import write_whole
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
@@ -160,8 +160,8 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
                     "Give the same files and settings, or another mode.into."
                 )
         return
-    write_atomically(collection.into / NAMES, text)
-    write_atomically(path, json.dumps(said, indent=1).encode())
+    write_whole(collection.into / NAMES, text)
+    write_whole(path, json.dumps(said, indent=1).encode())
 
 
 @torch.no_grad()
@@ -198,7 +198,7 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
             found.append(features)
         content = io.BytesIO()
         np.save(content, torch.cat(found).numpy(), allow_pickle=False)
-        write_atomically(collection.path(number), content.getvalue())
+        write_whole(collection.path(number), content.getvalue())
         written += 1
     return written
 

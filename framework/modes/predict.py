@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader
 
 from framework.configuration.settings import Settings
 from framework.data import Data
+from framework.datasets.fields import as_batch
 from framework.distributions.circular import wrap
 from framework.errors import DataError
 from framework.model import Predictor
@@ -20,7 +21,7 @@ from framework.modes.test import loaded
 from framework.prediction import Prediction
 from framework.runs.run import opened
 from framework.target import Target
-from framework.training.batches import as_batch, seed_step
+from framework.training.batches import seed_step
 
 
 def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
@@ -56,7 +57,7 @@ def predictions(
     predictor: Predictor, data: Data, target: Target, files: Sequence[Path], settings: Settings
 ) -> list[dict[str, str]]:
     """One row a sample: its name, the point prediction, and the entropy of the density in nats."""
-    dataset = data.read(files) if files else data.test()
+    dataset = data.read(files) if files else data.splits().test
     loader = DataLoader(dataset, batch_size=settings.batch_size, collate_fn=as_batch)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []

@@ -30,9 +30,9 @@ from framework.errors import ConfigError
 from framework.evaluation.splits import on_device
 from framework.model import Preceded, Predictor
 from framework.reports.report import report_test, report_training
+from framework.runs.job import leave_value
 from framework.runs.loading import PREFIX, description, fill, weights
 from framework.runs.run import Run, opened
-from framework.sweeps.jobs import RECORD, leave_value
 from framework.training.batches import Batches, seed_step
 from framework.training.cached_features import Encoded, fits
 from framework.training.checkpoint import WholeCheckpoints, latest_good, read
@@ -48,8 +48,7 @@ def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: lis
     """Returns the validation loss of the kept weights, nats: what a sweeper minimises."""
     with opened(folder, values, settings, overrides) as run:
         loss = _run(run)
-    if (folder / RECORD).is_file():  # this is a job of a sweep
-        leave_value(folder, loss)
+    leave_value(folder, loss)
     return loss
 
 
@@ -145,7 +144,7 @@ def _encoded(run: Run, predictor: Predictor, data: Data, console: Console) -> Da
         return data
     encoded = Encoded(data, predictor.features, batch_size=64, workers=run.settings.workers)
     start = time.perf_counter()
-    count = sum(len(split) for split in (encoded.train(), encoded.validation()))  # type: ignore[arg-type]
+    count = encoded.compute()
     seconds = time.perf_counter() - start
     console.print(
         f"features of {count} samples computed once in {seconds:.1f} s ({1e3 * seconds / max(1, count):.2g} ms each)"

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from framework.reports.pictures import BLUE, GREEN, GREY, RED, titled_figure
+from framework.figures.style import BLUE, GREEN, GREY, RED, titled_figure
 
 LISTED = 3
 """Classes named below each sample."""

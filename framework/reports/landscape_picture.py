@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from framework.figures.style import BLUE, ORANGE, titled_figure
 from framework.model import Predictor
-from framework.reports.pictures import BLUE, ORANGE, titled_figure
 
 POINTS = 61
 """Along each side of the plane."""

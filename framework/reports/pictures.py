@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
@@ -17,13 +16,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from matplotlib.transforms import Bbox
 
 from framework.evaluation.work_precision import Point, front
+from framework.figures.style import BLUE, COLOURS, GREEN, GREY, MARKERS, RED, titled_figure
 from framework.reports.table import SPREADS, Row
 
-# Okabe & Ito 2008, told apart by colour-blind people; without the yellow, too pale for lines on white.
-BLUE, RED, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
-COLOURS = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY, "black")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
-GREY = "0.4"
 # where a word may stand beside its point, in order of preference, typographical points
 SIDES = ((9, 6), (9, -6), (-9, 6), (-9, -6), (0, 13), (0, -13), (12, 15), (12, -15), (-12, 15))
 
@@ -283,16 +278,6 @@ def comparison(
     if group is not None:
         handles = [Line2D([], [], marker=markers[kind], color=GREY, ls="", label=kind) for kind in markers]
         figure.legend(handles=handles, loc="outside right upper", title=group, fontsize=9, frameon=False)
-    return figure
-
-
-def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Figure:
-    """Empty, `size` in inches; the title says where data are synthetic."""
-    figure = Figure(figsize=size, dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    if synthetic and "synthetic" not in title.lower():
-        title = f"{title} (synthetic data)"
-    figure.suptitle(textwrap.fill(title, int(size[0] * 10)), fontsize=12, parse_math=False)
     return figure
 
 

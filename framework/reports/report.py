@@ -59,7 +59,7 @@ def report_test(
         samples=settings.samples,
         seed=settings.seed,
         device=device,
-        outliers=() if outliers is None else batches.of(outliers.test()),
+        outliers=() if outliers is None else batches.of(outliers.splits().test),
     )
     spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
@@ -245,7 +245,7 @@ def contact_sheet(predictor: Predictor, data: Data, batches: Batches, device: to
     """Classified samples from all over the test split: certain, ambiguous, failed."""
     from framework.reports.class_picture import choose_classified, classified
 
-    dataset = data.test()
+    dataset = data.splits().test
     length: int = len(dataset)  # pyright: ignore[reportArgumentType]
     some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
     inputs: list[torch.Tensor] = []
@@ -287,7 +287,7 @@ def landscape(
 
 def _points_of(data: Data) -> tuple[np.ndarray, np.ndarray]:
     """Inputs and targets of the first PICTURED test samples."""
-    dataset = data.test()
+    dataset = data.splits().test
     count = min(PICTURED, len(dataset))  # type: ignore[arg-type]
     items = [dataset[index] for index in range(count)]
     inputs = torch.stack([item["input"] for item in items]).numpy()

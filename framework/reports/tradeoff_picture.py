@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from framework.evaluation.tradeoff import Turn
-from framework.reports.pictures import COLOURS, GREY, MARKERS, titled_figure
+from framework.figures.style import COLOURS, GREY, MARKERS, titled_figure
 
 
 def tradeoff(

@@ -2,20 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from framework import __version__
 from framework.configuration.assembly import Resolved, build_predictor
 from framework.configuration.schema import resolve
 from framework.data import Data
 from framework.density_head import Fitted
 from framework.errors import CheckpointError
-from framework.model import Predictor
+from framework.model import Predictor, describe_mismatch
 from framework.target import Target
-from framework.training.checkpoint import describe_mismatch, latest_good, read
+from framework.training.checkpoint import latest_good, read
 
 PREFIX = "predictor."
 """What Lightning's checkpoints put before the predictor's own parameter names."""
@@ -25,7 +25,7 @@ def description(resolved: Resolved, data: Data) -> dict[str, Any]:
     """What a checkpoint must hold beside the weights so that the model can be built again: plain values only."""
     return {
         "format": 1,
-        "version": __version__,
+        "version": version("robust-visual-learning"),
         "config": resolved,
         "target": {**asdict(data.target), "names": list(data.target.names)},
         "input_shape": list(data.input_shape),

@@ -13,9 +13,9 @@ import yaml
 
 from framework.configuration.settings import Settings, store_experiment
 from framework.errors import UserError
+from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
-from framework.sweeps.jobs import PARENT, SYNCED_WITHIN
-from framework.tracking.journal import write_atomically
+from framework.storage.files import write_whole
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker, read_run_info
 
@@ -64,8 +64,8 @@ def opened(folder: Path, values: dict[str, Any], settings: Settings, overrides: 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "checkpoints").mkdir(exist_ok=True)
     if not resumed:
-        write_atomically(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
-        write_atomically(folder / "overrides.yaml", yaml.safe_dump(overrides).encode())
+        write_whole(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
+        write_whole(folder / "overrides.yaml", yaml.safe_dump(overrides).encode())
     tracker = _tracker(
         folder, settings, values, overrides, earlier.run_id if resumed and earlier else None, resumed
     )

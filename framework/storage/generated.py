@@ -1,12 +1,10 @@
 """Generated data in the cache: written whole or not at all, by one process at a time, and marked as synthetic."""
 
-import fcntl
 import json
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from framework.errors import DataError
+from framework.storage.files import alone
 
 MARK = "synthetic.json"
 PAINTERS = 2
@@ -32,7 +31,7 @@ def generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
         if not root.exists():
-            with _alone(root.with_name(f".{root.name}.lock")):
+            with alone(root.with_name(f".{root.name}.lock")):
                 if not root.exists():  # another process may have written it while this one waited
                     _write(root, mark, write)
     except OSError as error:
@@ -75,14 +74,6 @@ def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
         except BaseException:
             painters.shutdown(cancel_futures=True)
             raise
-
-
-@contextmanager
-def _alone(file: Path) -> Iterator[None]:
-    """Hold a lock that ends with the process, whatever ends it."""
-    with file.open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 def _write(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from framework.configuration.settings import store_experiment
 from framework.errors import ConfigError, did_you_mean
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
-from framework.sweeps.jobs import RECORD
+from framework.runs.job import RECORD
 from framework.tracking.tracker import MlflowTracker, mark_dead
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}

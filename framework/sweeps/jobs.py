@@ -15,22 +15,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, UserError
+from framework.runs.job import PARENT, RECORD, VALUE
+from framework.storage.files import write_whole
 from framework.tracking.signals import Stopped
 
-PARENT = "FRAMEWORK_SWEEP_PARENT"
-"""Environment variable that tells a job the tracking run its sweep is recorded under."""
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """What runs one job; its overrides follow. No config can set it, since it would then run code."""
-SYNCED_WITHIN = 60.0
-"""Seconds: what a shorter job has to tell the tracking store, the sweep sends when it has ended."""
-RECORD = "job.json"
 CONSOLE = "console.log"
-VALUE = "value.json"
 
 log = logging.getLogger(__name__)
 
@@ -68,27 +63,12 @@ class Job:
     def update(self, **values: Any) -> None:
         """Change the record, in memory and on the disk."""
         self.record |= values
-        write_whole(self.folder / RECORD, self.record)
+        write_whole(self.folder / RECORD, json.dumps(self.record, indent=1).encode())
 
     def value(self) -> float | None:
         """What the job left for the sweeper to minimise (`leave_value`)."""
         path = self.folder / VALUE
         return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-
-
-def leave_value(folder: Path, value: float) -> None:
-    """Called in a job: the number a sweeper that optimises is to get."""
-    write_whole(folder / VALUE, value)
-
-
-def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
-    """The id of the tracking run that the jobs are to be recorded under, if any."""
-    return import_module("framework.sweeps.comparison").begin(folder, config)
-
-
-def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
-    """Compare the jobs that completed."""
-    import_module("framework.sweeps.comparison").summarise(folder, overrides)
 
 
 def hashed(*parts: str) -> str:
@@ -192,9 +172,11 @@ def run(
 
 
 def _sync(folder: Path) -> None:
-    """Send what a job left unsent; one that died is closed and sent by `summarise`."""
+    """Send what a job left unsent; one that died is closed and sent by the comparison."""
+    from framework.tracking.tracker import sync  # Hydra imports this module at every start
+
     try:
-        import_module("framework.tracking.tracker").sync(folder)
+        sync(folder)
     except UserError as error:
         log.warning(f"{folder}: {error}")
 
@@ -212,16 +194,6 @@ def failure(jobs: Sequence[Job]) -> UserError | None:
         f"{len(bad)} of {len(jobs)} jobs did not complete:\n" + "\n".join(lines) + "\n"
         "The same command with hydra.sweep.dir=<folder of this sweep> runs these alone."
     )
-
-
-def write_whole(path: Path, content: Any) -> None:
-    """JSON that is there whole or not at all, whatever happens meanwhile."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("w", encoding="utf-8") as file:
-        json.dump(content, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
 
 
 @dataclass

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from framework.errors import DataError
+from framework.storage.files import write_whole
 
 _log = logging.getLogger(__name__)
 # json.dumps with options builds its encoder anew at each call; this one is built once.
@@ -143,7 +144,7 @@ class Journal:
                 else:
                     kept.append(line)  # a damaged one too: nothing goes that was not understood
             marker = {"n": self.last + 1, "time": round(time.time(), 3), "resumed_after": int(step)}
-            write_atomically(self.path, b"".join([*kept, _encode(marker).encode(), b"\n"]))
+            write_whole(self.path, b"".join([*kept, _encode(marker).encode(), b"\n"]))
             self.last += 1
             self._reopen()
             return dropped
@@ -293,28 +294,6 @@ class Journal:
             elif record["n"] > after:
                 records.append(record)
         return records
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file as a whole, on the disk when this returns; a crash leaves the old or the new one.
-
-    Raises:
-        OSError: there is no room; the old file is as it was.
-    """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _append_to(path: Path) -> int:

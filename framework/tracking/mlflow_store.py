@@ -6,13 +6,12 @@ import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from fcntl import LOCK_EX, LOCK_UN, flock
 from pathlib import Path
 from typing import final
 
 from framework.errors import CheckpointError
 from framework.storage.cache import folder as cache_folder
+from framework.storage.files import alone, remove_leftovers, replacing
 from framework.tracking.run_info import RunInfo, default_uri, sqlite_path, store_uri, without_password
 from framework.tracking.sender import Record, Store, reason
 
@@ -216,7 +215,7 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
         return client, _experiment(client, info)
     path.parent.mkdir(parents=True, exist_ok=True)
     # MLflow's own migrations and get-or-create fail when several processes begin at once.
-    with _locked(path.with_name(f".{path.name}.lock")):
+    with alone(path.with_name(f".{path.name}.lock")):
         if not path.exists() or path.stat().st_size == 0:
             _make_database(path, info)
         client = MlflowClient(tracking_uri=info.uri)
@@ -225,11 +224,9 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
 
 def _make_database(path: Path, info: RunInfo) -> None:
     """Make an SQLite store aside and rename it: MLflow cannot mend one whose making was cut short."""
-    partial = path.with_name(f".{path.name}.partial")
-    for leftover in (partial, partial.with_name(f"{partial.name}-journal")):
-        leftover.unlink(missing_ok=True)
-    SqlAlchemyStore(f"sqlite:///{partial}", info.artifacts).engine.dispose()
-    partial.replace(path)
+    remove_leftovers(path.parent)
+    with replacing(path) as partial:
+        SqlAlchemyStore(f"sqlite:///{partial}", info.artifacts).engine.dispose()
     # MLflow keeps its connections by address: they may lead to a deleted file that was there before.
     SqlAlchemyStore(info.uri, info.artifacts).engine.dispose()
 
@@ -248,16 +245,6 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
             f"experiment {info.experiment!r} was deleted there; restore it, or choose another name"
         )
     return found.experiment_id
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("a") as file:
-        flock(file, LOCK_EX)
-        try:
-            yield
-        finally:
-            flock(file, LOCK_UN)  # a child forked meanwhile holds the descriptor too
 
 
 def _user() -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, DataError
-from framework.tracking.journal import write_atomically
+from framework.storage.files import write_whole
 
 _log = logging.getLogger(__name__)
 
@@ -80,7 +80,7 @@ class Sidecar:
         with self._lock:
             self.info = replace(self.info, **changes)
             try:
-                write_atomically(self._path, json.dumps(asdict(self.info), indent=1).encode())
+                write_whole(self._path, json.dumps(asdict(self.info), indent=1).encode())
             except (
                 OSError
             ) as error:  # an old one costs only that lines are sent again, which the store ignores

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 from framework.errors import DataError, UserError
-from framework.tracking.journal import Journal, write_atomically
+from framework.storage.files import write_whole
+from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
     SIDECAR,
     RunInfo,
@@ -272,7 +273,7 @@ class MlflowTracker(Tracker):
         path = self.folder / "params.json"
         try:
             earlier = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-            write_atomically(path, json.dumps({**earlier, **params}, indent=1).encode())
+            write_whole(path, json.dumps({**earlier, **params}, indent=1).encode())
         except OSError as error:
             _log.warning("Parameters too long for the store are not in %s either: %s.", path, error.strerror)
         else:

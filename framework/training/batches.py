@@ -2,16 +2,17 @@
 
 import hashlib
 import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 import pytorch_lightning as pl
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from framework.data import Batch, Data
+from framework.datasets.fields import as_batch
 from framework.errors import ConfigError, DataError
 
 Position = tuple[int, int]
@@ -122,13 +123,13 @@ class Batches(pl.LightningDataModule):
         self.trainer = trainer
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        return self._loader(self.data.train(), position=self._position, seed=self.seed, drop_last=True)
+        return self._loader(self.data.splits().train, position=self._position, seed=self.seed, drop_last=True)
 
     def val_dataloader(self) -> DataLoader[Batch]:
-        return self._loader(self.data.validation(), seed=None, drop_last=False)
+        return self._loader(self.data.splits().validation, seed=None, drop_last=False)
 
     def test_dataloader(self) -> DataLoader[Batch]:
-        return self._loader(self.data.test(), seed=None, drop_last=False)
+        return self._loader(self.data.splits().test, seed=None, drop_last=False)
 
     def of(self, dataset: Dataset[Batch]) -> DataLoader[Batch]:
         """Batches of a dataset that is none of the four stages', in its own order."""
@@ -187,11 +188,6 @@ class Batches(pl.LightningDataModule):
             epoch, first = epoch.started - 1, processed
         # Overfitting wants the same few batches every time.
         return (0 if trainer.overfit_batches else epoch), first
-
-
-def as_batch(items: Mapping[str, torch.Tensor] | list[Batch]) -> Batch:
-    """Collation: what a dataset's `__getitems__` batched stays as it is, single items are stacked."""
-    return dict(items) if isinstance(items, Mapping) else default_collate(items)
 
 
 def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:

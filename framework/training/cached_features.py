@@ -1,6 +1,7 @@
 """A data set whose inputs are features, computed once per sample: what precedes everything that is learned."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import final
 
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError
 from framework.training.batches import Batches
@@ -42,22 +43,22 @@ class Encoded(Data):
         self.synthetic = data.synthetic
         self.skipped = data.skipped
         self.varies = False
-        self.splits: dict[str, Dataset[Batch]] = {}
+        train, validation, test = (_Computed(split, self._computed) for split in data.splits())
+        self.computed = train, validation
+        self._splits = Splits(train, validation, test)
 
     def prepare(self) -> None:
         """Nothing: the data is prepared."""
 
-    def train(self) -> Dataset[Batch]:
-        return self._split("train", self.data.train)
+    def splits(self) -> Splits:
+        return self._splits
 
-    def validation(self) -> Dataset[Batch]:
-        return self._split("validation", self.data.validation)
-
-    def test(self) -> Dataset[Batch]:
-        return self._split("test", self.data.test)
+    def compute(self) -> int:
+        """Compute what training reads, now; of how many samples."""
+        return sum(len(split.fields) for split in self.computed)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return self._computed(self.data.read(files))
+        return _Computed(self.data.read(files), self._computed)
 
     def augment(self, batch: Batch) -> Batch:
         return batch
@@ -67,11 +68,6 @@ class Encoded(Data):
 
     def picture(self, inputs: Tensor) -> np.ndarray:
         raise ConfigError("Features have no picture; ask the data they were computed from.")
-
-    def _split(self, name: str, dataset: Callable[[], Dataset[Batch]]) -> Dataset[Batch]:
-        if name not in self.splits:
-            self.splits[name] = self._computed(dataset())
-        return self.splits[name]
 
     @torch.no_grad()
     def _computed(self, dataset: Dataset[Batch]) -> Fields:
@@ -89,9 +85,31 @@ class Encoded(Data):
         return Fields(**fields)
 
 
+@final
+class _Computed(Dataset[Batch]):
+    """A split whose features are computed when it is first read."""
+
+    def __init__(self, dataset: Dataset[Batch], compute: Callable[[Dataset[Batch]], Fields]) -> None:
+        self.dataset = dataset
+        self.compute = compute
+
+    @cached_property
+    def fields(self) -> Fields:
+        return self.compute(self.dataset)
+
+    def __len__(self) -> int:
+        return len(self.dataset)  # pyright: ignore[reportArgumentType]
+
+    def __getitem__(self, index: int) -> Batch:
+        return self.fields[index]
+
+    def __getitems__(self, indices: Sequence[int]) -> Mapping[str, Tensor]:
+        return self.fields.__getitems__(indices)
+
+
 def fits(data: Data, features: Callable[[Tensor], Tensor]) -> bool:
     """Whether the features of the training split, its largest, can be held in memory."""
-    dataset = data.train()
+    dataset = data.splits().train
     count: int = len(dataset)  # pyright: ignore[reportArgumentType]
     if count == 0:
         return True

@@ -4,26 +4,24 @@ import errno
 import hashlib
 import os
 import shutil
-import socket
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, BinaryIO, cast, final
 
 import torch
-from jaxtyping import Shaped
 from pytorch_lightning.plugins.io import CheckpointIO
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError
+from framework.storage.files import remove_leftovers, replacing
 
 # A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
 # all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
 # bit can make torch 2.13 return uninitialised memory for a tensor.
 _MARK = b"\nsha256 of above:"
 _TRAILER = len(_MARK) + hashlib.sha256().digest_size
-_LISTED = 5  # names of weights a message lists before it counts the rest
 
 
 @final
@@ -44,27 +42,21 @@ class WholeCheckpoints(CheckpointIO):
         """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(path.parent)
+        remove_leftovers(path.parent)
         needed = _bytes_needed(checkpoint)
         if shutil.disk_usage(path.parent).free < needed:
             raise _no_room(path, needed)
-        partial = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.partial")
         try:
-            with partial.open("wb") as file:
-                hashed = _Hashed(file)
-                torch.save(checkpoint, cast(BinaryIO, hashed))
-                file.write(_MARK + hashed.digest.digest())
-                file.flush()
-                os.fsync(file.fileno())
-            _require_plain(partial, path)
-            partial.replace(path)
-            _sync_folder(path.parent)
+            with replacing(path) as partial:
+                with partial.open("wb") as file:
+                    hashed = _Hashed(file)
+                    torch.save(checkpoint, cast(BinaryIO, hashed))
+                    file.write(_MARK + hashed.digest.digest())
+                _require_plain(partial, path)
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise _no_room(path, needed) from error
             raise
-        finally:
-            partial.unlink(missing_ok=True)
 
     def load_checkpoint(
         self, path: str | Path, map_location: object = None, weights_only: bool | None = None
@@ -112,29 +104,6 @@ def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | No
     ]
     files.sort(key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
     return next((path for path in files if verify(path) is None), None)
-
-
-def describe_mismatch(
-    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Shaped[Tensor, "..."]]
-) -> str | None:
-    """One sentence on how the weights of a file differ from those a model wants, or None where they fit."""
-    missing = [name for name in wanted if name not in found]
-    unexpected = [name for name in found if name not in wanted]
-    reshaped = [
-        f"{name} ({_shape(found[name])}, wanted {_shape(tensor)})"
-        for name, tensor in wanted.items()
-        if name in found and found[name].shape != tensor.shape
-    ]
-    parts = [
-        f"{len(names)} of {total} {what}: {_some(names)}"
-        for names, total, what in (
-            (missing, len(wanted), "weights are missing"),
-            (unexpected, len(found), "weights found are unknown"),
-            (reshaped, len(wanted), "weights have another shape"),
-        )
-        if names
-    ]
-    return "; ".join(parts) + "." if parts else None
 
 
 class _Hashed:
@@ -221,31 +190,3 @@ def _bytes_needed(checkpoint: object) -> int:
         else:
             stack.extend(item)
     return needed
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Parts that a killed process of this machine left behind."""
-    for partial in folder.glob(f".*.{socket.gethostname()}.*.partial"):
-        try:
-            os.kill(int(partial.suffixes[-2][1:]), 0)
-        except ProcessLookupError:
-            partial.unlink(missing_ok=True)
-        except (PermissionError, ValueError):
-            continue  # the process lives, under another user; or the name is none of ours
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _shape(tensor: Shaped[Tensor, "..."]) -> str:
-    return "×".join(map(str, tensor.shape)) or "scalar"
-
-
-def _some(names: list[str]) -> str:
-    rest = len(names) - _LISTED
-    return ", ".join(names[:_LISTED]) + (f" and {rest} more" if rest > 0 else "")

@@ -28,7 +28,7 @@ def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
     Raises:
         DataError: a feature is not finite; names the sample.
     """
-    seen = list(batches.of(batches.data.train()))
+    seen = list(batches.of(batches.data.splits().train))
     target = torch.cat([batch["target"] for batch in seen])
     for number, model in enumerate(fitted_models(predictor)):
         features = torch.cat([model.raw(batch["input"]) for batch in seen])

@@ -47,6 +47,8 @@ class PoolLauncher(Launcher):
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Called once, or by some sweepers once for each batch of jobs."""
+        from framework.sweeps import comparison  # Hydra imports this module at every start
+
         setup_globals()
         hydra = self.config.hydra
         configure_log(hydra.hydra_logging, hydra.verbose)
@@ -55,14 +57,14 @@ class PoolLauncher(Launcher):
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
         jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
         if not self.launched:
-            self.parent = sweep.begin(folder, _plain(configs[0], folder))
+            self.parent = comparison.begin(folder, _plain(configs[0], folder))
         self.launched += [job.overrides for job in jobs]
         try:
             sweep.run(
                 jobs, at_once=self.at_once, retries=self.retries, devices=self.devices, parent=self.parent
             )
         finally:
-            sweep.summarise(folder, self.launched)
+            comparison.summarise(folder, self.launched)
         failure = sweep.failure(jobs)
         return [
             JobReturn(

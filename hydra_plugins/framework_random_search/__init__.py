@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -96,9 +95,9 @@ class RandomSearch(Sweeper):
     def _rank(
         self, folder: Path, space: Mapping[str, Any], returned: Sequence[JobReturn], loader: ConfigLoader
     ) -> None:
+        from framework.sweeps import comparison  # Hydra imports this module at every start
         from hydra_plugins.framework_random_search import _best
 
-        comparison = import_module("framework.sweeps.comparison")
         trials = [
             comparison.Trial(
                 folder=_folder(one),

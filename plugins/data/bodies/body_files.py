@@ -16,6 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from framework.errors import DataError
+from framework.storage.files import replacing
 from plugins.data.bodies import restricted_pickle
 from plugins.data.bodies.body import Body
 
@@ -53,10 +54,8 @@ def save(body: Body, file: Path) -> None:
     arrays |= {"source": np.array(body.source), "names": np.array(body.names, dtype=np.str_)}
     if body.pose_shapes is not None:
         arrays["pose_shapes"] = body.pose_shapes
-    part = file.with_name(f".{file.name}.part")
-    with part.open("wb") as stream:
+    with replacing(file) as part, part.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **arrays)
-    part.replace(file)
 
 
 def load(file: Path) -> Body:

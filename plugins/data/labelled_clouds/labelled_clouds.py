@@ -6,7 +6,6 @@ depends on, so that a second run starts at once.
 
 import hashlib
 import json
-import os
 import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,6 +29,7 @@ from framework.geometry import meshes
 from framework.geometry.clouds import pad
 from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.storage import cache
+from framework.storage.files import replacing
 
 VERSION = 1
 """Of what `cloud` makes of a file; a change takes a new number, and with it a new place in the cache."""
@@ -198,17 +198,13 @@ def _read_all(files: Sequence[Path], how: Reading) -> tuple[Tensor, Tensor, dict
 
 def _keep(file: Path, points: NDArray, offset: NDArray, faults: NDArray) -> None:
     """Write an archive whole or not at all."""
-    part = file.with_name(f".{file.stem}.{os.getpid()}.part")
     try:
-        with part.open("wb") as stream:
+        with replacing(file) as part, part.open("wb") as stream:
             np.savez(stream, points=points, offset=offset, faults=faults)
-        part.replace(file)
     except OSError as error:
         raise DataError(
             f"{file} cannot be written ({error}). Free space there, or set FRAMEWORK_CACHE to another folder."
         ) from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def tracked(count: int, what: str) -> Iterator[int]:

@@ -14,7 +14,7 @@ from jaxtyping import Shaped
 from torch import Tensor, nn
 
 from framework.errors import CheckpointError, ConfigError
-from framework.training.checkpoint import describe_mismatch
+from framework.model import describe_mismatch
 
 _log = logging.getLogger(__name__)
 

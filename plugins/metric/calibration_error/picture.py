@@ -5,7 +5,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from framework.reports.pictures import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, titled_figure
+from framework.figures.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, titled_figure
 
 Numbers = Float[np.ndarray, "bin"]
 QUANTILE = 1.959963984540054

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import binom
 
-from framework.reports.pictures import BLUE, GREY, titled_figure
+from framework.figures.style import BLUE, GREY, titled_figure
 
 
 def histogram(values: np.ndarray, bins: int, numbers: int, title: str, *, synthetic: bool) -> Figure:

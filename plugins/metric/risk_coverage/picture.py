@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from framework.reports.pictures import BLUE, GREEN, GREY, titled_figure
+from framework.figures.style import BLUE, GREEN, GREY, titled_figure
 
 
 def risk_coverage(

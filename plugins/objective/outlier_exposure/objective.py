@@ -12,10 +12,10 @@ from torch.utils.data import DataLoader
 
 from framework.calibration.module_flags import flagged
 from framework.data import Batch, Data
+from framework.datasets.fields import as_batch
 from framework.errors import ConfigError
 from framework.model import Predictor, each_alone
 from framework.objective import Objective
-from framework.training.batches import as_batch
 from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignorance, to_uniform
 
 
@@ -83,7 +83,7 @@ class OutlierExposure(Objective):
         self.prior_scale = prior_scale
         if outliers is not None:
             outliers.prepare()
-            self.split = outliers.train()
+            self.split = outliers.splits().train
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         inputs = batch["input"]

@@ -10,7 +10,7 @@ from scipy import integrate, special, stats
 from torch import nn
 
 from framework.configuration.schema import build, resolve
-from framework.data import Data
+from framework.data import Data, Splits
 from framework.datasets.fields import Fields
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError
@@ -292,6 +292,15 @@ def test_members_train_as_if_alone():
 # where outliers come from
 
 
+class Unread(torch.utils.data.Dataset):
+    """A split that nobody may read."""
+
+    def __getitem__(self, index):
+        raise AssertionError("training alone is drawn from")
+
+    __len__ = __getitems__ = __getitem__
+
+
 class Tiny(Data):
     """Ten inputs of value 0 to 9; augmentation adds a half."""
 
@@ -304,17 +313,12 @@ class Tiny(Data):
         inputs = torch.arange(10.0).reshape(10, *[1] * len(self.input_shape)).expand(10, *self.input_shape)
         self.table = Fields(input=inputs.contiguous(), target=torch.zeros(10), index=torch.arange(10))
 
-    def train(self):
+    def splits(self):
         assert self.prepared
-        return self.table
+        return Splits(self.table, Unread(), Unread())
 
     def augment(self, batch):
         return {**batch, "input": batch["input"] + 0.5}
-
-    def validation(self):
-        raise AssertionError("training alone is drawn from")
-
-    test = validation
 
     def read(self, files):
         raise AssertionError("nothing is read")
@@ -462,7 +466,7 @@ def test_a_config_names_the_data_to_draw_from():
     exposure = objective(outliers={"name": "moons", "train": 20}, count=3)
     predictor = Given(head("categorical", CLASSES), torch.zeros(3))
     exposure(predictor, given_batch())
-    drawn, known = predictor.seen[0], exposure.outliers.train().fields["input"]
+    drawn, known = predictor.seen[0], exposure.outliers.splits().train.fields["input"]
     assert drawn.shape == (3, 2)
     assert all((known == one).all(1).any() for one in drawn)
     with pytest.raises(ConfigError, match="No data is called 'moon'"):

@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture
 from framework.datasets.fields import Fields
 from framework.geometry import clouds
@@ -104,7 +104,7 @@ class Registration(Data):
         self.groups = KINDS
         self.synthetic = True
         self.skipped = 0
-        self.splits = {name: self._drawn(number) for number, name in enumerate(SPLITS)}
+        self._drawn_splits = [self._drawn(number) for number in range(len(SPLITS))]
 
     def _drawn(self, split: int) -> "Scans":
         count = self.sizes[SPLITS[split]]
@@ -130,14 +130,8 @@ class Registration(Data):
             torch.float16 if SPLITS[split] == "train" else torch.float32,
         )
 
-    def train(self) -> Dataset[Batch]:
-        return self.splits["train"]
-
-    def validation(self) -> Dataset[Batch]:
-        return self.splits["validation"]
-
-    def test(self) -> Dataset[Batch]:
-        return self.splits["test"]
+    def splits(self) -> Splits:
+        return Splits(*self._drawn_splits)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         found = [torch.from_numpy(read(file).vertices).float() for file in files]
@@ -148,7 +142,7 @@ class Registration(Data):
 
     def fingerprint(self) -> Mapping[str, str]:
         digest = hashlib.sha256(np.ascontiguousarray(self._body.template).tobytes())
-        for split in self.splits.values():
+        for split in self._drawn_splits:
             for values in (split.shape, split.pose, split.kind):
                 digest.update(values.numpy().tobytes())
         return {

@@ -166,8 +166,8 @@ def test_poses_stay_within_their_limits_and_vary_as_stated():
 
 def test_people_are_split_and_drawn_by_the_data_seed(file):
     one, same, other = prepared(file), prepared(file), prepared(file, data_seed=1)
-    batch = one.test().__getitems__([3, 0, 29])
-    again = same.test().__getitems__([29, 3])
+    batch = one.splits().test.__getitems__([3, 0, 29])
+    again = same.splits().test.__getitems__([29, 3])
     assert torch.equal(
         batch["input"][2].nan_to_num(), again["input"][0].nan_to_num()[: batch["input"].shape[1]]
     )
@@ -187,15 +187,15 @@ def test_people_are_split_and_drawn_by_the_data_seed(file):
         "group": (torch.int64, 3),
         "index": (torch.int64, 3),
     }
-    assert one.train().__getitems__([0])["target"].dtype == torch.float16
-    single = one.test()[7]
+    assert one.splits().train.__getitems__([0])["target"].dtype == torch.float16
+    single = one.splits().test[7]
     assert single["target"].shape == (396,)
     assert one.picture(single["input"]).shape == (160, 160, 3)
 
 
 def test_points_lie_on_the_body_and_both_in_one_frame(file):
     made = prepared(file, noise=0, partial=0, outliers=0)
-    scans = made.test()
+    scans = made.splits().test
     batch = scans.__getitems__(range(5))
     place = batch["centre"].double(), batch["scale"].double()
     vertices = denormalised(batch["target"].double().unflatten(1, (-1, 3)), *place)
@@ -216,8 +216,8 @@ def planes(vertices, faces):
 def test_scans_lack_parts_and_hold_strangers_as_asked(file):
     whole, partial, outliers = (
         prepared(file, noise=0, partial=float(kind == "partial"), outliers=float(kind == "outliers"))
-        .test()
-        .__getitems__(range(30))
+        .splits()
+        .test.__getitems__(range(30))
         for kind in KINDS
     )
     assert set(whole["group"].tolist()) == {0}
@@ -351,7 +351,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     found = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
     assert found["synthetic"]
     assert 0 < found["vertex_error_median_cm"] < 100
-    points = prepared(file).test().__getitems__([0])
+    points = prepared(file).splits().test.__getitems__([0])
     cloud = denormalised(points["input"], points["centre"], points["scale"])[0, :400].numpy()
     np.save(tmp_path / "me.npy", cloud)
     code, told = command(tmp_path, "plugins.data.bodies.registration", "run", "me.npy", "--folder", "meshes")
@@ -369,7 +369,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told
 
     # thesis Table 6.4: a model of the body that FAUST's registrations have, on FAUST's scans
-    batch = prepared(file, points=200).test().__getitems__(range(6))
+    batch = prepared(file, points=200).splits().test.__getitems__(range(6))
     place = batch["centre"], batch["scale"]
     meshes = denormalised(batch["target"].unflatten(1, (-1, 3)), *place).numpy()
     scans = denormalised(batch["input"], *place).numpy()

@@ -1,0 +1,1 @@
+"""What pictures share, wherever they are drawn: by metrics, by data sets, by reports."""

@@ -1,0 +1,65 @@
+"""Files that are whole or absent, and locks between processes."""
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file beside `path` to write; it takes that name, its bytes synced, when the block ends without an error.
+
+    A crash, SIGKILL or power cut leaves the old file or the new one; an error leaves the old one. Its folder is made.
+
+    Raises:
+        OSError: there is no room, or no right to write.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(
+        f".{path.name}.{socket.gethostname()}.{threading.get_ident()}.{os.getpid()}.partial"
+    )
+    try:
+        yield partial
+        sync(partial)
+        partial.replace(path)
+        sync(path.parent)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Replace a file by `content`, on the disk when this returns; see `replacing`."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what processes of this machine that are no more began to write in `folder`."""
+    for partial in folder.glob(f".*.{socket.gethostname()}.*.partial"):
+        try:
+            os.kill(int(partial.suffixes[-2][1:]), 0)
+        except ProcessLookupError:
+            partial.unlink(missing_ok=True)
+        except (PermissionError, ValueError):
+            continue  # the process lives, under another user; or the name is none of ours
+
+
+def sync(path: Path) -> None:
+    """Ask the disk for a file's bytes, or for the names in a folder."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Hold the lock `path`; waits for other processes and threads. It ends with the process, whatever ends that."""
+    with FileLock(path, thread_local=False):
+        yield
