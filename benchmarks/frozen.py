@@ -26,7 +26,7 @@ from benchmarks.machine import machine
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
 from framework.deployment.frozen import frozen
-from framework.model import Model, Preceded, Predictor
+from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.target import Target
 
 ROUNDS = 9
@@ -36,7 +36,7 @@ BPS = {"name": "bps", "points": 512}
 Calls = dict[str, Callable[[], object]]
 
 
-def predictor(encoders: list[dict], shape: tuple[int, ...]) -> Model | Preceded:
+def predictor(encoders: list[dict], shape: tuple[int, ...]) -> Model | FrozenFrontEnd:
     """Untrained but for the moments of batch norm."""
     config = {
         "encoder": [resolve("encoder", part) for part in encoders],
@@ -98,7 +98,7 @@ def classifier(count: int) -> list[str]:
 
 def clouds(count: int) -> list[str]:
     made = predictor([BPS, MLP], (2048, 3))
-    assert isinstance(made, Preceded)
+    assert isinstance(made, FrozenFrontEnd)
     form = frozen(made)
     inputs = torch.randn(count, 2048, 3)
     inputs = inputs / inputs.norm(dim=-1, keepdim=True)

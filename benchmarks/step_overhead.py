@@ -1,6 +1,6 @@
 """What a training step costs above a bare PyTorch loop on the same model: python benchmarks/step_overhead.py
 
-Both loops run the same model, batches, optimiser and gradient clipping, alternating in one process; the ratio of
+Both loops run the same model, batches, fused optimiser and gradient clipping, alternating in one process; the ratio of
 their medians is the figure. Writes step_overhead.md beside this file.
 """
 
@@ -19,13 +19,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.assembly import build_predictor, resolve_all
 from framework.configuration.settings import OptimizerSettings
-from framework.data import Batch
+from framework.data import Batch, Splits
 from framework.datasets.fields import Fields
 from framework.target import Target
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import NoTracker
 from framework.training.batches import Batches
-from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
+from framework.training.module import OPTIMIZERS, KeepCheckpoints, Report, StopAtBatch, Training
 
 BATCH, STEPS, ROUNDS = 64, 40, 7
 CONFIG = {
@@ -51,11 +51,8 @@ class Crops:
             index=torch.arange(count),
         )
 
-    def train(self) -> Fields:
-        return self.fields
-
-    def validation(self) -> Fields:
-        return self.fields
+    def splits(self) -> Splits:
+        return Splits(self.fields, self.fields, self.fields)
 
     def augment(self, batch: Batch) -> Batch:
         return batch
@@ -64,7 +61,7 @@ class Crops:
 def bare(data: Crops) -> float:
     """Milliseconds a step of the plainest loop."""
     predictor = build_predictor(resolve_all(CONFIG), data.target, data.input_shape, seed=0).train()
-    optimizer = torch.optim.AdamW(predictor.parameters(), lr=1e-3)
+    optimizer = OPTIMIZERS["adamw"](predictor.parameters(), lr=1e-3)
     order = torch.randperm(len(data.fields)).split(BATCH)
     start = time.perf_counter()
     for rows in order:

@@ -42,28 +42,25 @@ def _run() -> None:
         show()
         return
     import hydra
+    from hydra.core.hydra_config import HydraConfig
     from omegaconf import DictConfig
 
-    from framework.configuration.composition import (
-        folder,
-        refuse_logging_overrides,
-        register,
-        swept_with_experiment,
-    )
+    from framework.configuration.composition import command_line, folder, plain, register
 
-    sys.argv[1:] = _with_resumed_folder(sys.argv[1:])
-    refuse_logging_overrides(sys.argv[1:])
-    sys.argv[1:] = swept_with_experiment(sys.argv[1:])
+    sys.argv[1:] = command_line(sys.argv[1:])
     register()
 
     failures: list[BaseException] = []
 
     @hydra.main(version_base="1.3", config_path=str(folder()), config_name="config")
     def run(config: DictConfig) -> float | None:
-        from framework.modes import run as run_mode
+        from framework import modes
 
+        hydra_config = HydraConfig.get()
         try:
-            return run_mode(config)
+            return modes.run(
+                plain(config), Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
+            )
         except UserError as error:
             # Hydra would print a stack trace's worth of its own around a sentence.
             failures.append(error)
@@ -72,21 +69,6 @@ def _run() -> None:
     run()
     if failures:
         raise failures[0]
-
-
-def _with_resumed_folder(arguments: list[str]) -> list[str]:
-    """`resume=<run folder>` runs in that folder, so that Hydra makes no new one."""
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key == "resume" and value not in ("auto", "never", "null", ""):
-            path = Path(value).expanduser()
-            if not (path / "config.yaml").is_file():
-                raise ConfigError(
-                    f"resume={value}: {path / 'config.yaml'} does not exist. Give the folder of a run, "
-                    "as printed at its start (outputs/<experiment>/<time>)."
-                )
-            return [*arguments, f"hydra.run.dir={path}"]
-    return arguments
 
 
 def _fail(message: str, code: int) -> None:

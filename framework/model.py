@@ -99,7 +99,7 @@ class Model(Predictor):
 
 
 @final
-class Preceded(Predictor):
+class FrozenFrontEnd(Predictor):
     """A predictor of features that need be computed but once (`Encoder.fixed`), with the encoders that give them.
 
     So whatever wraps the predictor (several members, many passes) does not compute them again.
@@ -126,6 +126,12 @@ class Preceded(Predictor):
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
         self.predictor.calibrate({**batch, "input": self.features(batch["input"])} for batch in batches)
+
+
+def fitted_models(predictor: Predictor) -> list[Model]:
+    """Those with such a head, wherever they are wrapped."""
+    found = [module for module in predictor.modules() if isinstance(module, Model)]
+    return [model for model in found if isinstance(model.head, Fitted)]
 
 
 def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:

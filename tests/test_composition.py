@@ -9,14 +9,12 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from framework.app import _with_resumed_folder
 from framework.configuration.composition import (
+    command_line,
     folder,
     plain,
-    refuse_logging_overrides,
     register,
     sentence,
-    swept_with_experiment,
 )
 from framework.configuration.settings import check_trainer_keys, settings
 from framework.errors import ConfigError
@@ -118,15 +116,15 @@ def test_an_unknown_trainer_argument_is_refused() -> None:
 )
 def test_hydra_logging_cannot_be_changed(argument: str) -> None:
     with pytest.raises(ConfigError, match="can run code"):
-        refuse_logging_overrides(["seed=1", argument])
+        command_line(["seed=1", argument])
 
 
 def test_resume_names_a_run_folder(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
-        _with_resumed_folder([f"resume={tmp_path}"])
+        command_line([f"resume={tmp_path}"])
     (tmp_path / "config.yaml").write_text("seed: 1")
-    assert _with_resumed_folder([f"resume={tmp_path}"])[-1] == f"hydra.run.dir={tmp_path}"
-    assert _with_resumed_folder(["resume=auto"]) == ["resume=auto"]
+    assert command_line([f"resume={tmp_path}"])[-1] == f"hydra.run.dir={tmp_path}"
+    assert command_line(["resume=auto"]) == ["resume=auto"]
 
 
 def test_a_shadowed_plugins_package_is_named(tmp_path: Path) -> None:
@@ -162,11 +160,11 @@ def test_single_values_beside_a_swept_experiment_are_swept_too() -> None:
         "hydra.sweep.dir=d",
         "~z",
     ]
-    assert swept_with_experiment(given) == [*wanted, "name=choice('p,q')"]
+    assert command_line(given) == [*wanted, "name=choice('p,q')"]
 
 
 @pytest.mark.parametrize(
     "given", [["experiment=a,b", "x=1"], ["-m", "experiment=a", "x=1,2", "y=3"], ["-m", "x=[", "e"]]
 )
 def test_other_commands_are_left_as_they_are(given: list[str]) -> None:
-    assert swept_with_experiment(given) == given
+    assert command_line(given) == given

@@ -13,11 +13,11 @@ from framework.datasets.fields import Fields
 from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.model import Model, Preceded
+from framework.model import FrozenFrontEnd, Model
 from framework.modes.combine import _inner
 from framework.target import Target
 from framework.training.batches import Batches
-from framework.training.cached_features import LARGEST, Encoded, fits
+from framework.training.cached_features import LARGEST, CachedFeatures, fits
 from framework.training.fitting import fit_at_once, fitted_models, mean_loss
 
 CLASSES = Target("class", ("low", "high"))
@@ -115,8 +115,8 @@ def batches(data, size=8):
 
 def test_features_are_computed_once_and_are_the_same_as_in_each_step():
     data, encoder = Points(), Squares()
-    whole = Preceded([encoder], Model([], categorical(), (4,)))
-    encoded = Encoded(data, whole.features, batch_size=7, workers=0)
+    whole = FrozenFrontEnd([encoder], Model([], categorical(), (4,)))
+    encoded = CachedFeatures(data, whole.features, batch_size=7, workers=0)
     for name in ("train", "validation", "test"):
         raw, found = getattr(data.splits(), name), getattr(encoded.splits(), name)
         assert getattr(encoded.splits(), name) is found
@@ -182,8 +182,8 @@ def test_a_head_fitted_at_once_gives_no_gradient_to_what_is_before_it():
 
 
 def test_runs_on_other_features_do_not_join():
-    first, other = (Preceded([Squares(factor)], Model([], Shares())) for factor in (2.0, 3.0))
-    whole = Preceded([Squares()], Model([], Shares()))
+    first, other = (FrozenFrontEnd([Squares(factor)], Model([], Shares())) for factor in (2.0, 3.0))
+    whole = FrozenFrontEnd([Squares()], Model([], Shares()))
     assert _inner(whole, first, 0) is first.predictor
     assert whole.encoders[0].factor == 2.0
     with pytest.raises(CheckpointError, match=r"member 1 .* differ in 0\.factor"):

@@ -17,7 +17,7 @@ from framework.deployment.frozen import frozen
 from framework.deployment.frozen_network import affine_logits, connected, read, softmax
 from framework.encoder import Encoder
 from framework.errors import CheckpointError
-from framework.model import Model, Preceded, Predictor
+from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.runs.loading import PREFIX
 from framework.target import Target
 from framework.training.checkpoint import WholeCheckpoints
@@ -204,7 +204,7 @@ class Lengths(Encoder):
 @pytest.mark.parametrize("given", [None, (30, 3)])
 def test_fixed_encoders_in_front_are_kept(given):
     inner = trained([mlp((12,), widths=[16], batch_norm=True)], head("categorical", SEVEN), (12,))
-    predictor = Preceded([Lengths(12)], inner).eval()
+    predictor = FrozenFrontEnd([Lengths(12)], inner).eval()
     form = frozen(predictor, given)
     assert form.form.endswith("then softmax")
     for points in (30, 8):
@@ -226,7 +226,7 @@ def test_wrappers_are_run_as_they_are():
 def test_heads_fitted_at_once_are_run_as_they_are():
     made = head("extra_trees", SEVEN, trees=5)
     made.fit(torch.randn(70, 6), torch.arange(70) % 7, 0)
-    predictor = Preceded([Lengths(6)], Model([], made, (6,))).eval()
+    predictor = FrozenFrontEnd([Lengths(6)], Model([], made, (6,))).eval()
     same(frozen(predictor), predictor, torch.randn(4, 9, 3))
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 import framework.configuration.registry as registry
-from framework.configuration.registry import GROUPS, config_folders, describe, find, installed, load
+from framework.configuration.registry import GROUPS, config_folders, find, installed, load
+from framework.modes.plugins import describe
 from framework.errors import ConfigError
 
 

@@ -12,7 +12,7 @@ from framework.density_head import DensityHead
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.metric import Metric
-from framework.model import Model, Preceded, Predictor
+from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.objective import Objective
 from framework.target import Target
 
@@ -126,7 +126,7 @@ def build_predictor(
     factory: Callable[[], Predictor] = model
     for part in resolved["uncertainty"]:
         factory = _wrapped(part, factory, target)
-    return Preceded(fixed, factory()) if fixed else factory()
+    return FrozenFrontEnd(fixed, factory()) if fixed else factory()
 
 
 def _wrapped(

@@ -43,7 +43,32 @@ def register() -> None:
     OmegaConf.register_new_resolver("first", lambda *values: next(filter(None, values)), replace=True)
 
 
-def refuse_logging_overrides(arguments: list[str]) -> None:
+def command_line(arguments: list[str]) -> list[str]:
+    """The arguments as Hydra is to read them.
+
+    Raises:
+        ConfigError: one would change Hydra's logging, or names a run to resume that is not there.
+    """
+    _refuse_logging_overrides(arguments)
+    return _swept_with_experiment(_in_resumed_folder(arguments))
+
+
+def _in_resumed_folder(arguments: list[str]) -> list[str]:
+    """`resume=<run folder>` runs in that folder, so that Hydra makes no new one."""
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key == "resume" and value not in ("auto", "never", "null", ""):
+            path = Path(value).expanduser()
+            if not (path / "config.yaml").is_file():
+                raise ConfigError(
+                    f"resume={value}: {path / 'config.yaml'} does not exist. Give the folder of a run, "
+                    "as printed at its start (outputs/<experiment>/<time>)."
+                )
+            return [*arguments, f"hydra.run.dir={path}"]
+    return arguments
+
+
+def _refuse_logging_overrides(arguments: list[str]) -> None:
     """Hydra's logging configs go to logging.config.dictConfig, which calls what they name; keep them ours.
 
     Raises:
@@ -58,7 +83,7 @@ def refuse_logging_overrides(arguments: list[str]) -> None:
             )
 
 
-def swept_with_experiment(arguments: list[str]) -> list[str]:
+def _swept_with_experiment(arguments: list[str]) -> list[str]:
     """The arguments of a sweep over experiments, single values written as sweeps of one.
 
     Hydra first composes what is not swept, by itself: `data.x=1` beside `experiment=a,b` would meet a config in which

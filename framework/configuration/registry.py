@@ -1,8 +1,6 @@
 """The names of everything installed, read from package metadata; reading them imports nothing."""
 
-import ast
 import re
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -131,50 +129,3 @@ def config_folders() -> dict[str, Path]:
             owner[config] = entry.name
         folders[entry.name] = folder
     return folders
-
-
-@dataclass(frozen=True)
-class Description:
-    """What `mode=plugins` says of a plugin, read from its source without importing it."""
-
-    group: str
-    name: str
-    origin: str
-    summary: str
-    bibtex: str
-
-
-def describe(group: str, entry: Entry) -> Description:
-    """First docstring line and BibTeX of the class an entry point names."""
-    summary, bibtex = "(source not found)", ""
-    module, _, attribute = entry.value.partition(":")
-    package, *rest = module.split(".")
-    spec = find_spec(package)
-    roots = list(spec.submodule_search_locations or []) if spec else []
-    for path in (candidate for root in roots for candidate in _candidates(Path(root), rest)):
-        if path.is_file():
-            summary, bibtex = _docstring_and_bibtex(path, attribute)
-            break
-    return Description(group, entry.name, origin(entry), summary, bibtex)
-
-
-def _candidates(root: Path, rest: list[str]) -> tuple[Path, Path]:
-    folder = root.joinpath(*rest)
-    return folder.with_suffix(".py") if rest else root / "__init__.py", folder / "__init__.py"
-
-
-def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
-    try:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-    except SyntaxError as error:
-        return f"(broken: {path.name} line {error.lineno} does not parse)", ""
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef) and node.name == attribute:
-            summary = (ast.get_docstring(node) or "(no description)").partition("\n")[0]
-            for statement in node.body:
-                if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
-                    targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
-                    if any(isinstance(target, ast.Name) and target.id == "bibtex" for target in targets):
-                        return summary, str(ast.literal_eval(statement.value))
-            return summary, ""
-    return "(class not found)", ""

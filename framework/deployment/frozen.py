@@ -19,7 +19,7 @@ from torch.distributions import Categorical, Distribution
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import median
-from framework.model import Model, Preceded, Predictor
+from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.runs.loading import load_with_description
 
 
@@ -56,7 +56,7 @@ class Frozen:
 
     def __init__(self, predictor: Predictor, input_shape: Sequence[int] | None = None) -> None:
         self.predictor = copy.deepcopy(predictor).cpu().eval().requires_grad_(False)
-        self.preceded = self.predictor if isinstance(self.predictor, Preceded) else None
+        self.preceded = self.predictor if isinstance(self.predictor, FrozenFrontEnd) else None
         self.inner = self.predictor if self.preceded is None else self.preceded.predictor
         floats = (tensor.dtype for tensor in self.predictor.parameters())
         self.dtype = next(floats, torch.get_default_dtype())

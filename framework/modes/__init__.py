@@ -1,29 +1,22 @@
 """What a command line can ask for; each mode is a module of its own, imported when it is chosen."""
 
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
-from framework.configuration.composition import plain
-from framework.configuration.settings import settings
+from framework.configuration.config import Config
 from framework.errors import ConfigError, did_you_mean
 
 MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
 
 
-def run(config: DictConfig) -> float | None:
-    """Run the chosen mode on a composed config; the value, if any, is what a sweeper minimises.
+def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
+    """Run the chosen mode on composed values; what it returns, if anything, is what a sweeper minimises.
 
     Raises:
         ConfigError: an unknown mode, or a fault in the config.
     """
-    from hydra.core.hydra_config import HydraConfig
-
-    values = plain(config)
-    hydra = HydraConfig.get()
-    folder, overrides = Path(hydra.runtime.output_dir), list(hydra.overrides.task)
     if values.get("resume") not in ("auto", "never", None):
         values, overrides = _stored(folder, overrides)
     name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
@@ -31,12 +24,10 @@ def run(config: DictConfig) -> float | None:
         raise ConfigError(
             f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}."
         )
-    chosen = settings(values)
-    module = import_module(f"framework.modes.{name}")
-    return module.run(values, chosen, folder, overrides)
+    return import_module(f"framework.modes.{name}").run(Config.of(values, folder, overrides))
 
 
-def _stored(folder: Path, overrides: list[str]) -> tuple[dict[str, Any], list[str]]:
+def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """The config and overrides the run in `folder` was started with: resuming changes neither."""
     from framework.runs.run import stored_config, stored_overrides
     from framework.tracking.run_info import read_run_info

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from framework.configuration.settings import Settings
+from framework.configuration.config import Config
 from framework.errors import ConfigError, UserError
 from framework.reports.table import csv
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
@@ -32,31 +31,31 @@ class ContractBroken(UserError):
     """A plugin does not do what its group's contract promises."""
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+def run(config: Config) -> None:
     """Print a table for every plugin chosen on the command line.
 
     Raises:
         ConfigError: nothing that has a contract is chosen.
         ContractBroken: a property does not hold; the table says which and where.
     """
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
-    chosen = _chosen(values)
+    if config.settings.threads:
+        torch.set_num_threads(config.settings.threads)
+    chosen = _chosen(config.values)
     if not chosen:
         raise ConfigError(
             "mode=check needs something to check: name a plugin, e.g. `mode=check density_head=<name>`; "
             f"there are contracts for {', '.join(CONTRACTS)}. mode=plugins lists what is installed."
         )
     console, lines, failed = Console(), [], []
-    for group, config in chosen:
-        plain = {key: value for key, value in config.items() if key != "name"}
-        table, found, broken = examine(contract(group, config["name"], plain), console)
+    for group, part in chosen:
+        plain = {key: value for key, value in part.items() if key != "name"}
+        table, found, broken = examine(contract(group, part["name"], plain), console)
         console.print(table)
         lines += found
         failed += broken
-    folder.mkdir(parents=True, exist_ok=True)
-    csv(lines, COLUMNS, folder / "check.csv")
-    console.print(f"every finding of every row: {folder / 'check.csv'}", soft_wrap=True)
+    config.folder.mkdir(parents=True, exist_ok=True)
+    csv(lines, COLUMNS, config.folder / "check.csv")
+    console.print(f"every finding of every row: {config.folder / 'check.csv'}", soft_wrap=True)
     if failed:
         raise ContractBroken(
             f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. "

@@ -5,72 +5,60 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict
-from rich.console import Console
 
-from framework.configuration.assembly import build_metrics, build_outliers, build_predictor, citations
-from framework.configuration.schema import check, resolve
-from framework.configuration.settings import Settings
+from framework.configuration.assembly import build_predictor
+from framework.configuration.config import Config, Options
+from framework.configuration.schema import resolve
 from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
-from framework.evaluation.splits import on_device
-from framework.model import Preceded, Predictor
-from framework.modes.test import data_for
-from framework.modes.train import quiet, record_citations, save_model
+from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
-from framework.runs.loading import description, load_with_description
-from framework.runs.run import Run, opened
-from framework.training.batches import Batches, seed_step
+from framework.runs.loading import load_with_description
+from framework.runs.run import opened
+from framework.runs.session import around, begin, calibrate
 from framework.uncertainty import Joining
 
 
-class _Options(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class CombineOptions(Options):
+    """Which models become members, and of what."""
 
-    name: str
     members: str | list[str]
     wrapper: str
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+def run(config: Config) -> None:
     """Write checkpoints/model.ckpt, which every other mode takes; print its table row."""
-    with opened(folder, values, settings, overrides) as run:
-        _run(run, _Options.model_validate(check(_Options, values["mode"], "mode")))
-
-
-def _run(run: Run, options: _Options) -> None:
-    settings, console = run.settings, Console()
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
-    quiet()
+    options = config.options(CombineOptions)
+    console = begin(config.settings)
     sources = found(options.members)
-    members = [load_with_description(source, uri=settings.logger.uri) for source in sources]
+    members = [load_with_description(source, uri=config.settings.logger.uri) for source in sources]
     described = common([described for _, described in members])
-    config = described["config"]
-    data = data_for(run, described, str(sources[0]))
-    config["uncertainty"] = [
-        *config["uncertainty"],
+    wrappers = [
         resolve("uncertainty", {"name": options.wrapper, "members": len(members)}, "mode.wrapper"),
         *(
             resolve("uncertainty", part, f"uncertainty.{key}")
-            for key, part in (run.values.get("uncertainty") or {}).items()
+            for key, part in (config.values.get("uncertainty") or {}).items()
         ),
     ]
-    outliers = build_outliers(config, data)
-    record_citations(run, citations(config))
-    predictor = joined(config, data, [member for member, _ in members], options.wrapper)
-
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    predictor.eval().to(device)
-    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
-    seed_step(settings.seed, 0, "calibrate")
-    predictor.calibrate(on_device(batches.val_dataloader(), device))
-    run.checkpoints.mkdir(parents=True, exist_ok=True)
-    save_model(run.checkpoints / "model.ckpt", predictor, description(config, data))
-    run.tracker.log_artifact(run.checkpoints / "model.ckpt", "checkpoints")
-    console.print(f"{len(members)} members: {', '.join(map(str, sources))}", soft_wrap=True)
-    metrics = build_metrics(config, data.target)
-    report_test(run, predictor, config, data, batches, metrics, device, console, outliers)
+    parts = {**described["config"], "uncertainty": [*described["config"]["uncertainty"], *wrappers]}
+    session = around(config, members[0][0], {**described, "config": parts}, str(sources[0]), console)
+    session.predictor = joined(parts, session.data, [member for member, _ in members], options.wrapper)
+    with opened(config) as run:
+        session.record(run)
+        calibrate(session)
+        session.save_model(run)
+        console.print(f"{len(members)} members: {', '.join(map(str, sources))}", soft_wrap=True)
+        report_test(
+            run,
+            session.predictor,
+            session.parts,
+            session.data,
+            session.batches(),
+            session.metrics,
+            session.device,
+            session.console,
+            session.outliers,
+        )
 
 
 def found(members: str | Sequence[str]) -> list[str | Path]:
@@ -130,7 +118,7 @@ def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wra
         ConfigError: the wrapper cannot take members that were trained apart.
     """
     predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
-    if isinstance(predictor, Preceded):
+    if isinstance(predictor, FrozenFrontEnd):
         members = [_inner(predictor, member, index) for index, member in enumerate(members)]
     joining = next((module for module in predictor.modules() if isinstance(module, Joining)), None)
     if joining is None:
@@ -142,9 +130,9 @@ def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wra
     return predictor
 
 
-def _inner(whole: Preceded, member: Predictor, index: int) -> Predictor:
+def _inner(whole: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
     """What reads the features of a member's encoders, which must be the same in all; they are put into `whole`."""
-    assert isinstance(member, Preceded)
+    assert isinstance(member, FrozenFrontEnd)
     state = member.encoders.state_dict()
     if index == 0:
         whole.encoders.load_state_dict(state)

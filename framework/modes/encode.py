@@ -10,18 +10,17 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
-from rich.console import Console
+from pydantic import Field
 from torch import Tensor
 
-from framework.configuration.assembly import citations
-from framework.configuration.schema import build, check, resolve
+from framework.configuration.config import Config, Options
+from framework.configuration.schema import build, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
-from framework.modes.train import record_citations
 from framework.runs.run import opened
+from framework.runs.session import begin, record_citations
 from framework.storage.files import write_whole
 from framework.training.batches import Batches
 
@@ -29,10 +28,9 @@ DESCRIPTION, NAMES = "encoding.json", "files.txt"
 """What stands beside the parts: what was computed, and of which files, a line each."""
 
 
-class _Options(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class EncodeOptions(Options):
+    """Which files to encode, and where the features go."""
 
-    name: str
     files: str
     into: str
     part: Annotated[int, Field(gt=0)] = 1000
@@ -70,27 +68,27 @@ class Collection:
         return [number for number in range(self.parts) if not self.path(number).is_file()]
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+def run(config: Config) -> None:
     """Write this job's share of the parts; those that are there already are left as they are."""
-    options = _Options.model_validate(check(_Options, values["mode"], "mode"))
-    config = {
-        "data": resolve("data", values.get("data") or {}),
+    options = config.options(EncodeOptions)
+    console = begin(config.settings)
+    chosen = config.values
+    parts = {
+        "data": resolve("data", chosen.get("data") or {}),
         "encoder": [
-            resolve("encoder", part, f"encoder.{key}") for key, part in (values.get("encoder") or {}).items()
+            resolve("encoder", part, f"encoder.{key}") for key, part in (chosen.get("encoder") or {}).items()
         ],
     }
-    with opened(folder, values, settings, overrides) as run:
-        if settings.threads:
-            torch.set_num_threads(settings.threads)
-        record_citations(run, citations(config))
-        collection = collected(
-            Path(options.files).expanduser(), Path(options.into).expanduser(), options.part
-        )
-        describe(collection, config)
-        mine = share(collection.parts, options.share)
-        written = encode(collection, config, mine, settings)
+    if not parts["encoder"]:
+        raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
+    collection = collected(Path(options.files).expanduser(), Path(options.into).expanduser(), options.part)
+    mine = share(collection.parts, options.share)
+    with opened(config) as run:
+        record_citations(run, parts)
+        describe(collection, parts)
+        written = encode(collection, parts, mine, config.settings)
         left = len(collection.missing())
-        Console().print(
+        console.print(
             f"{written} parts written, {len(mine) - written} of this job's {len(mine)} were there; "
             f"{left} of all {collection.parts} are missing: {collection.into}",
             soft_wrap=True,

@@ -1,18 +1,20 @@
 """mode=plugins: every registry with origin, a line of description and the paper; imports no plugin."""
 
+import ast
 import re
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from framework.configuration.registry import GROUPS, describe, installed
-from framework.configuration.settings import Settings
+from framework.configuration.config import Config
+from framework.configuration.registry import GROUPS, Entry, installed, origin
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+def run(config: Config) -> None:
     """Print the list."""
     show()
 
@@ -44,3 +46,50 @@ def paper(bibtex: str) -> str:
 def _value(bibtex: str, key: str) -> str:
     found = re.search(rf"\b{key}\s*=\s*[{{\"]+(.*?)[}}\"]+\s*,?\s*(?:\n|$)", bibtex, re.DOTALL)
     return re.sub(r"[{}]", "", " ".join(found.group(1).split())) if found else ""
+
+
+@dataclass(frozen=True)
+class Description:
+    """What `mode=plugins` says of a plugin, read from its source without importing it."""
+
+    group: str
+    name: str
+    origin: str
+    summary: str
+    bibtex: str
+
+
+def describe(group: str, entry: Entry) -> Description:
+    """First docstring line and BibTeX of the class an entry point names."""
+    summary, bibtex = "(source not found)", ""
+    module, _, attribute = entry.value.partition(":")
+    package, *rest = module.split(".")
+    spec = find_spec(package)
+    roots = list(spec.submodule_search_locations or []) if spec else []
+    for path in (candidate for root in roots for candidate in _candidates(Path(root), rest)):
+        if path.is_file():
+            summary, bibtex = _docstring_and_bibtex(path, attribute)
+            break
+    return Description(group, entry.name, origin(entry), summary, bibtex)
+
+
+def _candidates(root: Path, rest: list[str]) -> tuple[Path, Path]:
+    folder = root.joinpath(*rest)
+    return folder.with_suffix(".py") if rest else root / "__init__.py", folder / "__init__.py"
+
+
+def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+    except SyntaxError as error:
+        return f"(broken: {path.name} line {error.lineno} does not parse)", ""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and node.name == attribute:
+            summary = (ast.get_docstring(node) or "(no description)").partition("\n")[0]
+            for statement in node.body:
+                if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
+                    targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+                    if any(isinstance(target, ast.Name) and target.id == "bibtex" for target in targets):
+                        return summary, str(ast.literal_eval(statement.value))
+            return summary, ""
+    return "(class not found)", ""

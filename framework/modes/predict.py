@@ -4,41 +4,45 @@ import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
-from rich.console import Console
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
 from framework.distributions.circular import wrap
 from framework.errors import DataError
 from framework.model import Predictor
-from framework.modes.test import loaded
 from framework.prediction import Prediction
 from framework.runs.run import opened
+from framework.runs.session import for_trained
 from framework.target import Target
 from framework.training.batches import seed_step
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+class PredictOptions(Options):
+    """What to predict for: a file or a folder of files, or the test split."""
+
+    files: str | None = None
+
+
+def run(config: Config) -> None:
     """Write predictions.csv into the run folder."""
-    with opened(folder, values, settings, overrides) as run:
-        wanted = values["mode"].get("files")
-        files = _files(Path(str(wanted)).expanduser()) if wanted else []
-        predictor, data, described = loaded(run, prepare=not files)
-        target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-        rows = predictions(predictor, data, target, files, settings)
+    wanted = config.options(PredictOptions).files
+    files = _files(Path(wanted).expanduser()) if wanted else []
+    session = for_trained(config, prepare=not files)
+    with opened(config) as run:
+        rows = predictions(session.predictor, session.data, session.target, files, config.settings)
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
         run.tracker.log_artifact(path)
-        Console().print(f"{len(rows)} predictions in {path}", soft_wrap=True)
+        session.console.print(f"{len(rows)} predictions in {path}", soft_wrap=True)
 
 
 def _files(path: Path) -> list[Path]:

@@ -1,21 +1,25 @@
 """mode=sync: send to the tracking store what a run could not send while it ran."""
 
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from framework.configuration.settings import Settings
+from framework.configuration.config import Config, Options
 from framework.errors import ConfigError
 from framework.tracking.tracker import sync
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+class SyncOptions(Options):
+    """Whose journal to send."""
+
+    run: str
+
+
+def run(config: Config) -> None:
     """Replay the journal of `mode.run`."""
-    target = Path(str(values["mode"]["run"])).expanduser()
-    if not (target / "run.json").is_file():
+    folder = Path(config.options(SyncOptions).run).expanduser()
+    if not (folder / "run.json").is_file():
         raise ConfigError(
-            f"mode.run={target}: {target / 'run.json'} does not exist. Give the folder of a run."
+            f"mode.run={folder}: {folder / 'run.json'} does not exist. Give the folder of a run."
         )
-    sent = sync(target)
-    Console().print(f"{sent} journal lines sent from {target}.")
+    Console().print(f"{sync(folder)} journal lines sent from {folder}.")

@@ -1,34 +1,32 @@
 """mode=work_precision: error against run time along a declared knob of a trained model."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 
 from framework.configuration.assembly import build_metrics
-from framework.configuration.schema import check
-from framework.configuration.settings import Positive, Settings
+from framework.configuration.config import Config, Options
+from framework.configuration.settings import Positive
 from framework.data import Batch, Data
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
 from framework.evaluation.splits import on_device
 from framework.evaluation.work_precision import COLUMNS, rows, work_precision, write
 from framework.model import Model, Predictor
-from framework.modes.test import loaded
 from framework.reports.report import picture
 from framework.reports.table import results_table
 from framework.runs.run import Run, opened
+from framework.runs.session import Session, for_trained
 from framework.training.batches import Batches
 from framework.uncertainty import Uncertainty
 
 
-class _Options(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class WorkPrecisionOptions(Options):
+    """Which knob is turned, to which values, and what is measured."""
 
-    name: str
     knob: str | None = None
     values: list[Positive] | None = None
     repeats: Annotated[int, Field(ge=2)] = 5
@@ -37,16 +35,19 @@ class _Options(BaseModel):
     metrics: list[str] | None = None
 
 
-def run(values: dict[str, Any], settings: Settings, folder: Path, overrides: list[str]) -> None:
+def run(config: Config) -> None:
     """Write work_precision.csv and .png; print the table with Pareto points marked."""
-    with opened(folder, values, settings, overrides) as run:
-        _run(run, _Options.model_validate(check(_Options, values["mode"], "mode")))
+    options = config.options(WorkPrecisionOptions)
+    session = for_trained(config)
+    with opened(config) as run:
+        session.record(run)
+        _run(run, session, options)
 
 
-def _run(run: Run, options: _Options) -> None:
+def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     from framework.reports import pictures
 
-    predictor, data, described = loaded(run)
+    predictor, data, described = session.predictor, session.data, {"config": session.parts}
     if options.metrics is not None or not isinstance(predictor, Model):
         _metrics_against_time(run, options, predictor, data, described)
         return
@@ -104,7 +105,7 @@ def _kept(run: Run, data: Data, device: torch.device, limit: int) -> list[Batch]
 
 
 def _metrics_against_time(
-    run: Run, options: _Options, predictor: Predictor, data: Data, described: dict[str, Any]
+    run: Run, options: WorkPrecisionOptions, predictor: Predictor, data: Data, described: dict[str, Any]
 ) -> None:
     """The metrics of the test split themselves, where there is no reference to be off from: of wrappers, say."""
     from framework.evaluation import tradeoff

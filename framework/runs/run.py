@@ -3,7 +3,7 @@
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,29 +11,46 @@ from typing import Any
 
 import yaml
 
+from framework.configuration.config import Config
 from framework.configuration.settings import Settings, store_experiment
 from framework.errors import UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
 from framework.storage.files import write_whole
+from framework.tracking.run_info import read_run_info
 from framework.tracking.signals import Stopped, Stopper
-from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker, read_run_info
+from framework.tracking.silent import SilentTracker
+from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
 
 
-@dataclass
+@dataclass(frozen=True)
 class Run:
     """What a mode needs to know of the run it is in."""
 
-    folder: Path
-    values: dict[str, Any]
-    settings: Settings
+    config: Config
     tracker: Tracker
     stopper: Stopper
     resumed: bool
 
     @property
+    def folder(self) -> Path:
+        return self.config.folder
+
+    @property
+    def settings(self) -> Settings:
+        return self.config.settings
+
+    @property
     def checkpoints(self) -> Path:
         return self.folder / "checkpoints"
+
+
+def first_rank() -> bool:
+    """Whether this process keeps the run's record: the only one, or the first of several that train together."""
+    rank = next((os.environ[key] for key in ("RANK", "SLURM_PROCID") if key in os.environ), None)
+    if rank is not None:
+        return rank == "0"
+    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
 
 
 def stored_config(folder: Path) -> dict[str, Any] | None:
@@ -49,39 +66,43 @@ def stored_overrides(folder: Path) -> list[str]:
 
 
 @contextmanager
-def opened(folder: Path, values: dict[str, Any], settings: Settings, overrides: list[str]) -> Iterator[Run]:
-    """Open the run before anything is built; on the way out close it with the right status.
+def opened(config: Config) -> Iterator[Run]:
+    """Open the run; on the way out close it with the right status.
 
-    Continues the run in `folder` when its config is the same, it did not finish and `resume` allows it.
+    Continues the run in its folder when that has the same config, did not finish and `resume` allows it. A rank other
+    than the first writes nothing: its run is a silent one.
     """
-    earlier = read_run_info(folder)
+    stopper = Stopper()
+    if not first_rank():
+        with stopper.installed():
+            yield Run(config, SilentTracker(config.folder), stopper, resumed=False)
+        return
+    earlier = read_run_info(config.folder)
     resumed = (
         earlier is not None
         and earlier.status != "FINISHED"
-        and settings.resume != "never"
-        and _same(stored_config(folder), values)
+        and config.settings.resume != "never"
+        and _same(stored_config(config.folder), config.values)
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "checkpoints").mkdir(exist_ok=True)
+    (config.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
     if not resumed:
-        write_whole(folder / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
-        write_whole(folder / "overrides.yaml", yaml.safe_dump(overrides).encode())
-    tracker = _tracker(
-        folder, settings, values, overrides, earlier.run_id if resumed and earlier else None, resumed
-    )
-    stopper = Stopper()
+        write_whole(
+            config.folder / "config.yaml", yaml.safe_dump(dict(config.values), sort_keys=False).encode()
+        )
+        write_whole(config.folder / "overrides.yaml", yaml.safe_dump(list(config.overrides)).encode())
+    tracker = _tracker(config, earlier.run_id if resumed and earlier else None, resumed)
     with stopper.installed():
         tracker.open()
-        run = Run(folder, values, settings, tracker, stopper, resumed)
+        run = Run(config, tracker, stopper, resumed)
         try:
-            _describe(run, overrides)
+            _describe(run)
             yield run
         except BaseException as error:
             _record(run, error)
             killed = isinstance(error, KeyboardInterrupt | Stopped)
             tracker.close("KILLED" if killed else "FAILED")
             if killed:
-                sys.stderr.write(f"stopped; go on with: python -m framework resume={folder}\n")
+                sys.stderr.write(f"stopped; go on with: python -m framework resume={run.folder}\n")
             raise
         tracker.close("FINISHED")
 
@@ -92,21 +113,14 @@ def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
     return {**stored, "resume": None} == {**values, "resume": None}
 
 
-def _tracker(
-    folder: Path,
-    settings: Settings,
-    values: Mapping[str, Any],
-    overrides: list[str],
-    run_id: str | None,
-    resumed: bool,
-) -> Tracker:
-    if settings.logger.name == "none":
-        return NoTracker(folder, resumed=resumed)
+def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
+    if config.settings.logger.name == "none":
+        return NoTracker(config.folder, resumed=resumed)
     return MlflowTracker(
-        folder,
-        uri=settings.logger.uri,
-        experiment=store_experiment(values),
-        run_name=run_name(settings, values["mode"]["name"], overrides),
+        config.folder,
+        uri=config.settings.logger.uri,
+        experiment=store_experiment(config.values),
+        run_name=run_name(config.settings, config.mode, config.overrides),
         parent=os.environ.get(PARENT),
         wait=SYNCED_WITHIN if PARENT in os.environ else 0.0,
         run_id=run_id,
@@ -114,7 +128,7 @@ def _tracker(
     )
 
 
-def run_name(settings: Settings, mode: str, overrides: list[str]) -> str:
+def run_name(settings: Settings, mode: str, overrides: Sequence[str]) -> str:
     """What tells a run from its neighbours: the method, then what was changed on the command line, then the seed."""
     parts = [(settings.experiment_name or mode).rpartition("/")[2]]
     for override in overrides:
@@ -132,12 +146,13 @@ def run_name(settings: Settings, mode: str, overrides: list[str]) -> str:
     return ", ".join([*parts, f"seed={settings.seed}"])[:200]
 
 
-def _describe(run: Run, overrides: list[str]) -> None:
+def _describe(run: Run) -> None:
+    config = run.config
     tags = {f"git.{key}": str(value) for key, value in git_commit(Path.cwd()).items()}
     tags |= {f"version.{key}": value for key, value in package_versions().items()}
-    tags |= {"mode": run.values["mode"]["name"], "overrides": " ".join(overrides), "folder": str(run.folder)}
+    tags |= {"mode": config.mode, "overrides": " ".join(config.overrides), "folder": str(run.folder)}
     run.tracker.set_tags(tags)
-    run.tracker.log_params(flatten(run.values))
+    run.tracker.log_params(flatten(config.values))
     run.tracker.log_artifact(run.folder / "config.yaml")
     run.tracker.log_artifact(run.folder / "overrides.yaml")
 

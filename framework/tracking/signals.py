@@ -39,9 +39,8 @@ class Stopper:
                 signal.signal(number, handler)
 
     def stop(self) -> NoReturn:
-        """Stop now for the signal received."""
-        assert self.received is not None
-        raise Stopped(self.received)
+        """Stop now for the signal received, by this process or by another rank of it."""
+        raise Stopped(self.received or signal.SIGTERM)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         first = self.received is None

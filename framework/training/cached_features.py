@@ -20,7 +20,7 @@ LARGEST = 8 * 2**30
 
 
 @final
-class Encoded(Data):
+class CachedFeatures(Data):
     """Another data set's samples with features for inputs; each split is computed when it is first asked for.
 
     Args:

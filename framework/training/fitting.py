@@ -7,14 +7,8 @@ import torch
 from framework.data import Batch
 from framework.density_head import Fitted
 from framework.errors import DataError
-from framework.model import Model, Predictor
+from framework.model import Predictor, fitted_models
 from framework.training.batches import Batches
-
-
-def fitted_models(predictor: Predictor) -> list[Model]:
-    """Those with such a head, wherever they are wrapped."""
-    found = [module for module in predictor.modules() if isinstance(module, Model)]
-    return [model for model in found if isinstance(model.head, Fitted)]
 
 
 @torch.no_grad()

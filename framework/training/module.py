@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -13,11 +14,12 @@ from torch import Tensor, nn
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
 from framework.errors import NonFiniteLoss
-from framework.model import Preceded, Predictor
+from framework.model import FrozenFrontEnd, Predictor
 from framework.objective import Objective
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
 from framework.training.batches import seed_step
+from framework.training.ranks import Share, WholeBatch, gathered, share, summed
 
 # fused: one pass over the memory of each parameter instead of several, half the time of a small network's step
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
@@ -36,8 +38,8 @@ class Training(pl.LightningModule):
     run before the optimiser sees it.
 
     Args:
-        encoded: whether batches hold cached features (training.cached_features) and not inputs; the predictor is a
-            `Preceded` then.
+        cached: whether batches hold cached features (training.cached_features) and not inputs; the predictor is a
+            `FrozenFrontEnd` then.
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class Training(pl.LightningModule):
         seed: int,
         description: dict[str, Any],
         *,
-        encoded: bool = False,
+        cached: bool = False,
     ) -> None:
         super().__init__()
         self.predictor = predictor
@@ -58,35 +60,51 @@ class Training(pl.LightningModule):
         self.optimizer_settings = optimizer
         self.seed = seed
         self.description = description
-        self.encoded = encoded
+        self.cached = cached
 
     @property
     def learner(self) -> Predictor:
         """What reads the batches."""
-        if self.encoded:
-            assert isinstance(self.predictor, Preceded)
+        if self.cached:
+            assert isinstance(self.predictor, FrozenFrontEnd)
             return self.predictor.predictor
         return self.predictor
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        rows = self._share(batch)
         # by batches, not by optimiser steps: those stand still while gradients are accumulated
-        seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train", self.global_rank)
-        batch = self.augment(batch)
-        losses = self.learner.loss(batch["input"], batch["target"])
-        loss = losses.mean()
-        for objective in self.objectives:
-            loss = loss + objective(self.learner, batch)
-        if not math.isfinite(value := loss.item()):
+        seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train")
+        with WholeBatch(rows) if rows else nullcontext():
+            batch = self.augment(batch)
+            losses = self.learner.loss(batch["input"], batch["target"])
+            loss = losses.mean()
+            for objective in self.objectives:
+                loss = loss + objective(self.learner, batch)
+        if rows:  # gradients are averaged over ranks, whose shares may differ by a row
+            loss = loss * (rows.count * self.trainer.world_size / rows.whole)
+            value = summed(loss).item() / self.trainer.world_size
+        else:
+            value = loss.item()
+        if not math.isfinite(value):
             raise NonFiniteLoss(self._blame(losses, batch, value))
         self.last_loss = value
         return loss
+
+    def _share(self, batch: Batch) -> Share | None:
+        """This rank's part of the batch; None where one process trains."""
+        return share(len(batch["index"]), self.device) if self.trainer.world_size > 1 else None
 
     def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
         seed_step(self.seed, batch_index, "validation")
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
-        loss = self.learner.loss(batch["input"], batch["target"]).mean()
-        self.log("validation/loss", loss, on_epoch=True, batch_size=len(batch["target"]), sync_dist=True)
+        rows = self._share(batch)
+        with WholeBatch(rows) if rows else nullcontext():
+            loss = self.learner.loss(batch["input"], batch["target"]).mean()
+        count = len(batch["target"])
+        if rows:  # by rows here, since Lightning averages the ranks' numbers of rows as whole numbers
+            loss, count = summed(loss * rows.count) / rows.whole, rows.whole
+        self.log("validation/loss", loss, on_epoch=True, batch_size=count, sync_dist=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
         chosen = self.optimizer_settings
@@ -124,6 +142,8 @@ class Training(pl.LightningModule):
     def _blame(self, losses: Tensor, batch: Batch, value: float) -> str:
         bad = (~losses.detach().isfinite()).nonzero().flatten().tolist()
         rows = [int(batch["index"][row]) for row in bad]
+        if self.trainer.world_size > 1:
+            rows = [row for some in gathered(rows) for row in some]
         who = f"samples {rows[:10]} of the training split" if rows else "an objective, not a sample"
         return (
             f"The training loss became {value} at step {self.global_step} (epoch {self.current_epoch}), through {who}. "
@@ -232,14 +252,18 @@ class StopAtBatch(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if self.stopper.received is not None and not trainer.is_last_batch:
+        if self._told(trainer) and not trainer.is_last_batch:
             self.keep.save_last(trainer)
             self.stopper.stop()
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        if self.stopper.received is not None:
+        if self._told(trainer):
             self.keep.save_last(trainer)
             self.stopper.stop()
+
+    def _told(self, trainer: pl.Trainer) -> bool:
+        """Whether a signal has come, to whichever rank: they save and stop together."""
+        return trainer.strategy.reduce_boolean_decision(self.stopper.received is not None, all=False)
 
     def on_validation_batch_end(
         self,
@@ -251,5 +275,5 @@ class StopAtBatch(pl.Callback):
         dataloader_idx: int = 0,
     ) -> None:
         # The last checkpoint stands: one saved inside validation would skip the rest of it on resuming.
-        if self.stopper.received is not None:
+        if self._told(trainer):
             self.stopper.stop()

@@ -1,0 +1,147 @@
+"""Fits the session's predictor: by gradient with Lightning, or at once where its head has no gradient."""
+
+import inspect
+import os
+import time
+from pathlib import Path
+
+import pytorch_lightning as pl
+from pytorch_lightning.callbacks import EarlyStopping, RichProgressBar
+from rich.console import Console
+from torch import distributed as dist
+
+from framework.configuration.settings import TRAINER_OURS, check_trainer_keys
+from framework.data import Data
+from framework.model import FrozenFrontEnd, fitted_models
+from framework.runs.loading import fill, weights
+from framework.runs.run import Run, first_rank
+from framework.runs.session import Session
+from framework.training.cached_features import CachedFeatures, fits
+from framework.training.checkpoint import WholeCheckpoints, latest_good, read
+from framework.training.fitting import fit_at_once, mean_loss
+from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
+
+TRAINED = {"last.ckpt", "previous.ckpt", "best.ckpt"}
+"""Checkpoints that training can go on from; model.ckpt holds weights alone."""
+RESUMED_FROM = "FRAMEWORK_RESUMED_FROM"
+"""Environment variable by which the first rank tells those it starts which checkpoint they go on from."""
+
+
+def fit(session: Session, run: Run) -> tuple[float, int | None]:
+    """Leaves the kept weights in the predictor; their validation loss (nats) and epoch, from 0.
+
+    The epoch is None where the head was fitted at once. Ranks other than the first return when training has ended.
+    """
+    if fitted_models(session.predictor):
+        return _at_once(session, run), None
+    return _by_gradient(session, run)
+
+
+def _at_once(session: Session, run: Run) -> float:
+    fed = _cached(session)
+    inner = session.predictor
+    if fed is not session.data and isinstance(inner, FrozenFrontEnd):
+        inner = inner.predictor
+    batches = session.batches(fed)
+    start = time.perf_counter()
+    fit_at_once(inner, batches, session.settings.seed)
+    loss = mean_loss(inner.eval(), batches.val_dataloader())
+    session.console.print(f"fitted in {time.perf_counter() - start:.1f} s; validation loss {loss:.4f} nats")
+    run.tracker.log_metrics({"validation/loss": loss}, 0, 0)
+    return loss
+
+
+def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
+    settings = session.settings
+    fed = session.data if session.objectives else _cached(session)  # those may change or add inputs
+    training = Training(
+        session.predictor,
+        session.objectives,
+        fed,
+        settings.optimizer,
+        settings.seed,
+        session.description(),
+        cached=fed is not session.data,
+    )
+    keep = KeepCheckpoints(
+        run.checkpoints,
+        settings.trainer.get("checkpoint_every_steps"),
+        settings.trainer.get("keep") or "best",
+    )
+    trainer = _trainer(run, keep)
+    batches = session.batches(fed)
+    batches.attach(trainer)
+    resume = _resumed_from(session, run)
+    trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
+    _part()
+    if first_rank():
+        fill(session.predictor, weights(read(keep.kept)), str(keep.kept))
+    session.device = trainer.strategy.root_device
+    return keep.kept_loss, keep.kept_epoch
+
+
+def _resumed_from(session: Session, run: Run) -> Path | None:
+    """The checkpoint that training goes on from, the same for all ranks."""
+    if not first_rank():
+        told = os.environ.get(RESUMED_FROM)
+        return Path(told) if told else None
+    resume = latest_good(run.checkpoints, names=TRAINED) if run.resumed else None
+    if run.resumed:
+        step = 0 if resume is None else int(read(resume)["global_step"])
+        run.tracker.drop_after(step)
+        session.console.print(
+            "nothing to resume from yet: starting from the beginning."
+            if resume is None
+            else f"resuming from {resume} (step {step})."
+        )
+    os.environ[RESUMED_FROM] = str(resume or "")
+    return resume
+
+
+def _part() -> None:
+    """Leave the other ranks: what follows is the first one's alone, and no collective may wait for the others."""
+    if dist.is_available() and dist.is_initialized():
+        dist.barrier()
+        dist.destroy_process_group()
+
+
+def _cached(session: Session) -> Data:
+    """The data with features computed before training, where that gives what computing them in each step would."""
+    predictor, data = session.predictor, session.data
+    if not isinstance(predictor, FrozenFrontEnd) or data.varies or not fits(data, predictor.features):
+        return data
+    cached = CachedFeatures(data, predictor.features, batch_size=64, workers=session.settings.workers)
+    start = time.perf_counter()
+    count = cached.compute()
+    seconds = time.perf_counter() - start
+    session.console.print(
+        f"features of {count} samples computed once in {seconds:.1f} s ({1e3 * seconds / max(1, count):.2g} ms each)"
+    )
+    return cached
+
+
+def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
+    chosen = dict(run.settings.trainer)
+    check_trainer_keys(chosen, set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"})
+    patience = chosen.get("patience")
+    callbacks: list[pl.Callback] = [
+        Report(run.tracker, chosen.get("log_every_steps") or 10),
+        keep,
+        StopAtBatch(run.stopper, keep),
+    ]
+    if patience:
+        callbacks.append(EarlyStopping("validation/loss", patience=patience, check_finite=True))
+    terminal = Console(stderr=True).is_terminal
+    if terminal:
+        callbacks.append(RichProgressBar())
+    arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
+    defaults = {"enable_progress_bar": terminal, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    return pl.Trainer(
+        **{**defaults, **arguments},
+        logger=False,
+        enable_checkpointing=False,
+        callbacks=callbacks,
+        plugins=[WholeCheckpoints()],
+        use_distributed_sampler=False,
+        default_root_dir=run.folder,
+    )

@@ -1,0 +1,269 @@
+"""A session: threads, device, and all parts of a command, built and matched before a step is trained."""
+
+import ctypes
+import logging
+import platform
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from rich.console import Console
+
+from framework.configuration.assembly import (
+    Resolved,
+    build_data,
+    build_metrics,
+    build_objectives,
+    build_outliers,
+    build_predictor,
+    citations,
+    require_outliers,
+)
+from framework.configuration.config import Config
+from framework.configuration.schema import resolve
+from framework.configuration.settings import Settings
+from framework.data import Batch, Data
+from framework.errors import CheckpointError, ConfigError
+from framework.evaluation.splits import on_device
+from framework.metric import Metric
+from framework.model import Predictor, fitted_models
+from framework.objective import Objective
+from framework.prediction import Prediction
+from framework.runs.loading import PREFIX, description, load_with_description
+from framework.runs.run import Run, first_rank
+from framework.target import Target
+from framework.training.batches import Batches, seed_step
+from framework.training.checkpoint import WholeCheckpoints
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+
+
+@dataclass
+class Session:
+    """What a mode works with.
+
+    Attributes:
+        parts: every plugin with every parameter, as they were built.
+        target: what is predicted.
+        data: prepared, unless only a user's own files are read.
+        outliers: prepared, where a metric reads them.
+        predictor: untrained, or as loaded.
+        objectives: of the training loss.
+        metrics: fresh, in the order asked for.
+        device: where the predictor is evaluated.
+        console: for people; says nothing in ranks other than the first.
+    """
+
+    settings: Settings
+    parts: Resolved
+    target: Target
+    data: Data
+    outliers: Data | None
+    predictor: Predictor
+    objectives: Sequence[Objective]
+    metrics: Sequence[Metric]
+    device: torch.device
+    console: Console
+
+    def batches(self, data: Data | None = None) -> Batches:
+        """Of the session's data, or of what stands in for them."""
+        chosen = self.settings
+        return Batches(
+            data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed
+        )
+
+    def description(self) -> dict[str, Any]:
+        """What a checkpoint holds beside the weights."""
+        return description(self.parts, self.data)
+
+    def record(self, run: Run) -> None:
+        """Tell the run what it is fed, and leave what to cite with it."""
+        for role, data in (("data", self.data), ("outliers", self.outliers)):
+            if data is not None:
+                tags = {f"{role}.{key}": value for key, value in data.fingerprint().items()}
+                tags |= {
+                    f"{role}.synthetic": str(data.synthetic).lower(),
+                    f"{role}.skipped": str(data.skipped),
+                }
+                run.tracker.set_tags(tags)
+        record_citations(run, self.parts)
+
+    def save_model(self, run: Run) -> None:
+        """Leave weights and description with the run, for `framework.load`."""
+        path = run.checkpoints / "model.ckpt"
+        state = {f"{PREFIX}{key}": value.cpu() for key, value in self.predictor.state_dict().items()}
+        WholeCheckpoints().save_checkpoint({"framework": self.description(), "state_dict": state}, path)
+        run.tracker.log_artifact(path, "checkpoints")
+
+
+def record_citations(run: Run, parts: Resolved) -> None:
+    """Write what to cite into the run folder and the store."""
+    path = run.folder / "citations.bib"
+    if first_rank():
+        path.write_text("\n\n".join(dict.fromkeys(citations(parts).values())) + "\n", encoding="utf-8")
+    run.tracker.log_artifact(path)
+
+
+def begin(settings: Settings) -> Console:
+    """Set this process up: threads, memory, what Lightning prints. Where to print."""
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    keep_memory()
+    quiet()
+    return Console(quiet=not first_rank())
+
+
+def for_training(config: Config) -> Session:
+    """Everything built from the config; the data prepared, the metrics tried on a prediction.
+
+    Raises:
+        ConfigError: a part is missing or does not fit another.
+        DataError: as `Data.prepare`.
+    """
+    console = begin(config.settings)
+    parts = config.parts
+    data = build_data(parts)
+    data.prepare()
+    outliers = build_outliers(parts, data)
+    metrics = build_metrics(parts, data.target)
+    objectives = build_objectives(parts)
+    predictor = build_predictor(
+        parts, data.target, data.input_shape, config.settings.seed, columns=data.columns
+    )
+    if fitted_models(predictor) and objectives:
+        raise ConfigError(
+            f"density_head={parts['density_head']['name']} is fitted at once and has no gradient, which objectives "
+            "work by. Leave objective out."
+        )
+    found = Session(
+        config.settings,
+        parts,
+        data.target,
+        data,
+        outliers,
+        predictor,
+        objectives,
+        metrics,
+        torch.device("cpu"),
+        console,
+    )
+    rehearse(found)
+    return found
+
+
+@torch.no_grad()
+def rehearse(session: Session) -> None:
+    """Give every metric two predictions of the untrained model, so that one which cannot read them says so now.
+
+    Raises:
+        UserError: what the metric says.
+    """
+    if fitted_models(session.predictor):
+        return  # predicts nothing before it is fitted
+    batch = next(iter(session.batches().val_dataloader()))
+    some: Batch = {name: tensor[:2] for name, tensor in batch.items()}
+    seed_step(session.settings.seed, 0, "rehearsal")
+    training = session.predictor.training
+    density = session.predictor.eval()(some["input"])
+    session.predictor.train(training)
+    prediction = Prediction(density, some, session.settings.samples)
+    for metric in session.metrics:
+        metric.clone().update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
+
+
+def for_trained(config: Config, *, prepare: bool = True) -> Session:
+    """The model of `checkpoint`, with the data, outliers and metrics that the command line names, or else its own.
+
+    Without `prepare` the data can only read a user's own files: nothing is generated or loaded for that.
+
+    Raises:
+        ConfigError: no checkpoint is named, or a metric wants outliers and there are none.
+        CheckpointError: there is none, or the data does not fit the model.
+    """
+    console = begin(config.settings)
+    if config.settings.checkpoint is None:
+        raise ConfigError(
+            f"mode={config.mode} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
+        )
+    predictor, described = load_with_description(config.settings.checkpoint, uri=config.settings.logger.uri)
+    return around(config, predictor, described, config.settings.checkpoint, console, prepare=prepare)
+
+
+def around(
+    config: Config,
+    predictor: Predictor,
+    described: Mapping[str, Any],
+    source: str,
+    console: Console,
+    *,
+    prepare: bool = True,
+) -> Session:
+    """The session of a predictor that is there already, described by the checkpoint `source`; see `for_trained`."""
+    parts: Resolved = {**described["config"]}
+    for group in ("data", "outliers"):
+        if config.values.get(group):
+            parts[group] = resolve("data", config.values[group], group)
+    if config.values.get("metric"):
+        chosen = config.values["metric"]
+        parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
+    require_outliers(parts)
+    parts["data"] = resolve("data", parts["data"])
+    data = build_data(parts)
+    outliers = None
+    if prepare:
+        data.prepare()
+        require_fit(data, described, source)
+        outliers = build_outliers(parts, data)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
+    metrics = build_metrics(parts, target) if prepare else []
+    return Session(config.settings, parts, target, data, outliers, predictor, [], metrics, device, console)
+
+
+def require_fit(data: Data, described: Mapping[str, Any], source: str) -> None:
+    """Refuse data that the model of `source` was not made for.
+
+    Raises:
+        CheckpointError: inputs of another shape, or other targets.
+    """
+    target = described["target"]
+    wanted = tuple(described["input_shape"]), target["kind"], tuple(target["names"])
+    found = data.input_shape, data.target.kind, data.target.names
+    if wanted != found:
+        raise CheckpointError(
+            f"{source} reads inputs of shape {wanted[0]} and predicts {wanted[1]} {wanted[2]}, but the "
+            f"data has inputs of shape {found[0]} and targets {found[1]} {found[2]}. Give the data it was trained on."
+        )
+
+
+def calibrate(session: Session) -> None:
+    """Fit what is not trained by gradient, on the validation set."""
+    session.predictor.eval().to(session.device)
+    seed_step(session.settings.seed, 0, "calibrate")
+    session.predictor.calibrate(on_device(session.batches().val_dataloader(), session.device))
+
+
+def keep_memory() -> None:
+    """Let glibc keep freed memory: a training step frees and asks for the same megabytes again and again.
+
+    Without it each step pays for thousands of page faults, a quarter of a small network's time. Elsewhere than on
+    glibc nothing happens.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        library = ctypes.CDLL(None)
+        library.mallopt(M_MMAP_THRESHOLD, 1 << 30)
+        library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def quiet() -> None:
+    """Lightning's notices about hardware it did not find, and a deprecation inside it, tell our user nothing."""
+    for name in ("pytorch_lightning", "lightning_fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")
+    warnings.filterwarnings("ignore", message=".*does not have many workers", module="pytorch_lightning")
+    # ours is resumable, by another way than the one Lightning looks for
+    warnings.filterwarnings(
+        "ignore", message=".*your dataloader is not resumable", module="pytorch_lightning"
+    )

@@ -1,0 +1,202 @@
+"""Several ranks that train as one process would: noise and batch statistics are those of the whole batch."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, final
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch import distributed as dist
+from torch.overrides import TorchFunctionMode
+
+DROPOUTS = {
+    F.dropout, F.alpha_dropout, F.dropout1d, F.dropout2d, F.dropout3d, F.feature_alpha_dropout,
+}  # fmt: skip
+FACTORIES: set[Callable[..., Tensor]] = {torch.rand, torch.randn}
+LIKE: dict[Callable[..., Tensor], Callable[..., Tensor]] = {
+    torch.rand_like: torch.rand, torch.randn_like: torch.randn,
+}  # fmt: skip
+IN_PLACE = {
+    getattr(Tensor, f"{name}_")
+    for name in (
+        "normal",
+        "uniform",
+        "bernoulli",
+        "exponential",
+        "log_normal",
+        "cauchy",
+        "geometric",
+        "random",
+    )
+}
+
+
+@dataclass(frozen=True)
+class Share:
+    """A rank's part of a batch: rows `start` to `start + count` of `whole`."""
+
+    start: int
+    count: int
+    whole: int
+
+
+def share(count: int, device: torch.device) -> Share:
+    """Of this rank, which has `count` rows; every rank calls it."""
+    counts = [torch.zeros((), dtype=torch.int64, device=device) for _ in range(dist.get_world_size())]
+    dist.all_gather(counts, torch.tensor(count, device=device))
+    sizes = [int(one) for one in counts]
+    return Share(sum(sizes[: dist.get_rank()]), count, sum(sizes))
+
+
+def summed(value: Tensor) -> Tensor:
+    """The sum over all ranks, without a gradient; every rank calls it."""
+    total = value.detach().clone()
+    dist.all_reduce(total)
+    return total
+
+
+def gathered(rows: list[int]) -> list[list[int]]:
+    """Of each rank, in their order; every rank calls it."""
+    found: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(found, rows)
+    return found
+
+
+class _Sum(torch.autograd.Function):
+    """The sum over ranks; a rank's gradient is the sum of what all ranks make of it."""
+
+    @staticmethod
+    def forward(context: Any, value: Tensor) -> Tensor:
+        return summed(value)
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> Tensor:
+        return summed(gradients[0])
+
+
+@final
+class WholeBatch(TorchFunctionMode):
+    """While active, what is drawn for a rank's rows is drawn for the whole batch, and the rank keeps its rows.
+
+    All ranks seed their generators alike; so each row gets the noise that one process would give it. The first
+    dimension of as many items as the rank has rows is taken for the batch; what is drawn in a shape without one is the
+    same on all ranks. Batch norm in training takes its statistics from the rows of all ranks.
+    """
+
+    def __init__(self, rows: Share) -> None:
+        super().__init__()
+        self.rows = rows
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Iterable[type], args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func in DROPOUTS:
+            return self._dropout(func, *args, **kwargs)
+        if func is F.batch_norm:
+            return self._batch_norm(*args, **kwargs)
+        if func in FACTORIES:
+            size = kwargs.pop("size", None) or (args[0] if args and not isinstance(args[0], int) else args)
+            return self._kept(size, lambda shape: func(shape, **kwargs))
+        if func is torch.randint:
+            bounds = [part for part in args if isinstance(part, int)]
+            bounds += [kwargs.pop(key) for key in ("low", "high") if key in kwargs]
+            size = kwargs.pop("size") if "size" in kwargs else args[-1]
+            return self._kept(size, lambda shape: torch.randint(*bounds, shape, **kwargs))
+        if func in LIKE:
+            like = {"dtype": args[0].dtype, "device": args[0].device, **kwargs}
+            return self._kept(args[0].shape, lambda shape: LIKE[func](shape, **like))
+        if func in IN_PLACE:
+            tensor, rest = args[0], args[1:]
+            with torch.no_grad():
+                return tensor.copy_(
+                    self._kept(tensor.shape, lambda shape: func(tensor.new_empty(shape), *rest, **kwargs))
+                )
+        if func is torch.normal and any(isinstance(part, Tensor) for part in args):
+            mean, std = (torch.as_tensor(part) for part in (*args, *kwargs.values()))
+            mean, std = torch.broadcast_tensors(mean, std)
+            return mean + std * self._kept(mean.shape, lambda shape: mean.new_empty(shape).normal_())
+        if func in (torch.bernoulli, Tensor.bernoulli) and not args[1:]:
+            return self._padded_bernoulli(args[0], **kwargs)
+        return func(*args, **kwargs)
+
+    def _axis(self, shape: Iterable[int]) -> int | None:
+        """The dimension of the batch; None where there is none, or nothing to share."""
+        found = [axis for axis, size in enumerate(shape) if size == self.rows.count]
+        return found[0] if found and self.rows.count < self.rows.whole else None
+
+    def _kept(self, size: Iterable[int], draw: Callable[[list[int]], Tensor]) -> Tensor:
+        """The rank's rows of what `draw` gives in the shape of the whole batch."""
+        shape = list(size)
+        axis = self._axis(shape)
+        if axis is None:
+            return draw(shape)
+        shape[axis] = self.rows.whole
+        return draw(shape).narrow(axis, self.rows.start, self.rows.count).contiguous()
+
+    def _padded_bernoulli(self, probability: Tensor, **keywords: Any) -> Tensor:
+        def draw(shape: list[int]) -> Tensor:
+            axis = self._axis(probability.shape)
+            if axis is None:
+                return torch.bernoulli(probability, **keywords)
+            whole = probability.new_full(shape, 0.5)
+            whole.narrow(axis, self.rows.start, self.rows.count).copy_(probability)
+            return torch.bernoulli(whole, **keywords)
+
+        return self._kept(probability.shape, draw)
+
+    def _dropout(
+        self,
+        func: Callable[..., Tensor],
+        input: Tensor,
+        p: float = 0.5,
+        training: bool = True,
+        inplace: bool = False,
+    ) -> Tensor:
+        axis = self._axis(input.shape)
+        if not training or p == 0 or axis is None:
+            return func(input, p, training, inplace)
+        shape = list(input.shape)
+        shape[axis] = self.rows.whole
+        # of the other ranks' rows only the noise is needed, which does not depend on what they hold
+        whole = input.new_zeros(shape)
+        whole = torch.cat(
+            [
+                whole.narrow(axis, 0, self.rows.start),
+                input,
+                whole.narrow(axis, 0, self.rows.whole - self.rows.start - self.rows.count),
+            ],
+            axis,
+        )
+        return func(whole, p, True).narrow(axis, self.rows.start, self.rows.count)
+
+    def _batch_norm(
+        self,
+        input: Tensor,
+        running_mean: Tensor | None,
+        running_var: Tensor | None,
+        weight: Tensor | None = None,
+        bias: Tensor | None = None,
+        training: bool = False,
+        momentum: float = 0.1,
+        eps: float = 1e-5,
+    ) -> Tensor:
+        """With mean and (biased) variance over all ranks (Ioffe & Szegedy 2015, Algorithm 1)."""
+        if not training:
+            return F.batch_norm(input, running_mean, running_var, weight, bias, False, momentum, eps)
+        total: Callable[[Tensor], Tensor] = _Sum.apply  # type: ignore[assignment]
+        across = [axis for axis in range(input.dim()) if axis != 1]
+        count = self.rows.whole * input[0, 0].numel()
+        like = [1, -1, *[1] * (input.dim() - 2)]
+        mean = total(input.sum(across)) / count
+        centred = input - mean.reshape(like)
+        variance = total(centred.square().sum(across)) / count
+        if running_mean is not None and running_var is not None:
+            with torch.no_grad():
+                running_mean.lerp_(mean.to(running_mean), momentum)
+                running_var.lerp_((variance * count / max(1, count - 1)).to(running_var), momentum)
+        scaled = centred * (variance + eps).rsqrt().reshape(like)
+        if weight is not None:
+            scaled = scaled * weight.reshape(like)
+        return scaled if bias is None else scaled + bias.reshape(like)
