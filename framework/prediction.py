@@ -8,8 +8,7 @@ from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.distributions.class_probabilities import class_probabilities
-from framework.distributions.density import marginal, median
-from framework.distributions.monte_carlo import Estimate, estimate
+from framework.distributions.protocol import Estimate, estimate, marginal, median
 
 Split = Literal["test", "outliers"]
 """Where inputs come from: the test split, or data that belongs to nothing the model was trained on."""

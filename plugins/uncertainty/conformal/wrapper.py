@@ -13,10 +13,10 @@ from torch.distributions import Distribution
 
 from framework.calibration.validation import densities, repeatable, require_numbers
 from framework.data import Batch
-from framework.distributions.prediction_set import PredictionSet, Score
 from framework.errors import UserError
 from framework.model import Predictor
 from framework.uncertainty import Uncertainty
+from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
 SEED = 71
 """Of the split into halves."""
