@@ -62,7 +62,7 @@ COLUMNS = {
 
 
 class IndependentPoints:
-    """Ordinary Monte Carlo in the place of framework.distributions.monte_carlo.NormalPoints."""
+    """Ordinary Monte Carlo in the place of plugins.density_head.latent.monte_carlo.NormalPoints."""
 
     def __init__(
         self,
@@ -161,8 +161,7 @@ def points(kind: str) -> Iterator[None]:
         yield
         return
     with (
-        patch("plugins.density_head.latent.scvae.density.NormalPoints", IndependentPoints),
-        patch("plugins.density_head.latent.cvae.density.NormalPoints", IndependentPoints),
+        patch("plugins.density_head.latent.density.NormalPoints", IndependentPoints),
     ):
         yield
 

@@ -43,7 +43,7 @@ class Prediction:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """The same with its Monte Carlo error and the samples it took; exact of most densities."""
+        """The same with its Monte Carlo error and the samples it took: 0 where nothing is drawn, NaN if not known."""
         return estimate(self.density, self.target)
 
     @cached_property

@@ -74,7 +74,7 @@ def region_probabilities(
 ) -> Float[Tensor, "batch region"]:
     """Masses of the regions that edges cut a line or a circle into, float64; see `regions`.
 
-    Exact where `distributions.cdf` or `distributions.circular_moments` are, otherwise shares of `samples` draws.
+    Exact where `protocol.cdf`, `protocol.arc` or `circular_moments` are, otherwise shares of `samples` draws.
 
     Args:
         density: of one real or one angle, batch_shape (batch,).

@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class Conformal(Uncertainty):
-    """Densities as they are, each with a set (distributions.prediction_set) that holds the target with 1 - miscoverage.
+    """Densities as they are, each with a set (`prediction_set.py`) that holds the target with 1 - miscoverage.
 
     On data that is exchangeable with the validation set a new target lies in its set with a probability of at least
     1 - α, and of at most 1 - α + 1/(n + 1) where no two of the n scores are equal, on average over both, however wrong
