@@ -21,7 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.schema import build
 from framework.datasets.images import blurred, picture
-from framework.distributions.density import circular_grid, marginal
+from framework.distributions.density import circular_grid
+from framework.distributions.protocol import marginal
 from framework.model import Predictor
 from framework.reports.table import aggregate, csv, markdown
 from framework.runs.loading import load_with_description

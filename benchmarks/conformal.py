@@ -22,9 +22,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.data import Batch
-from framework.distributions.prediction_set import PredictionSet
 from framework.model import Predictor
 from framework.target import Target
+from plugins.uncertainty.conformal.prediction_set import PredictionSet
 
 SPLITS, POOL = 200, 2000
 CLASSES, ANGLE = Target("class", ("upper", "lower")), Target("angle", ("azimuth",))

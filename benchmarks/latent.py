@@ -21,10 +21,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
-from framework.distributions.monte_carlo import NormalPoints, estimate, lattice, normal_quantile
+from framework.distributions.closed_forms import normal_quantile
+from framework.distributions.protocol import estimate
 from framework.evaluation.work_precision import front, run_times
 from framework.reports import table
 from framework.target import Target
+from plugins.density_head.latent.monte_carlo import NormalPoints, lattice
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -60,7 +62,7 @@ COLUMNS = {
 
 
 class IndependentPoints:
-    """Ordinary Monte Carlo in the place of framework.distributions.monte_carlo.NormalPoints."""
+    """Ordinary Monte Carlo in the place of plugins.density_head.latent.monte_carlo.NormalPoints."""
 
     def __init__(
         self,
@@ -159,8 +161,7 @@ def points(kind: str) -> Iterator[None]:
         yield
         return
     with (
-        patch("plugins.density_head.latent.scvae.density.NormalPoints", IndependentPoints),
-        patch("plugins.density_head.latent.cvae.density.NormalPoints", IndependentPoints),
+        patch("plugins.density_head.latent.density.NormalPoints", IndependentPoints),
     ):
         yield
 

@@ -18,7 +18,7 @@ from machine import machine
 
 import framework
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import median
+from framework.distributions.protocol import median
 from plugins.data.bodies.default_body import default_body
 
 HERE = Path(__file__).parent

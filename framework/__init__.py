@@ -37,7 +37,7 @@ class _Moved(MetaPathFinder, Loader):
         for old, new in {
             "cache": "storage.cache",
             "camera": "geometry.camera",
-            "cdf": "distributions.cdf",
+            "cdf": "distributions.protocol",
             "circular": "distributions.circular",
             "circular_moments": "distributions.circular_moments",
             "class_probabilities": "distributions.class_probabilities",
@@ -48,17 +48,19 @@ class _Moved(MetaPathFinder, Loader):
             "images": "datasets.images",
             "meshes": "geometry.meshes",
             "module_flags": "calibration.module_flags",
-            "monte_carlo": "distributions.monte_carlo",
             "nan": "distributions.checks",
             "nearest": "geometry.nearest",
-            "normals": "distributions.normals",
-            "prediction_set": "distributions.prediction_set",
+            "normals": "distributions.protocol",
             "raw_numbers": "heads.parameters",
             "rearranged": "distributions.batch_shapes",
             "rotation": "geometry.rotation",
             "temper": "distributions.tempering",
             "validation": "calibration.validation",
         }.items()
+    } | {
+        # went home to the one family that uses them
+        "framework.monte_carlo": "plugins.density_head.latent.monte_carlo",
+        "framework.prediction_set": "plugins.uncertainty.conformal.prediction_set",
     }
 
     def find_spec(

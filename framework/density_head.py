@@ -23,9 +23,9 @@ class DensityHead(nn.Module, ABC):
     The density is a `torch.distributions.Distribution` (build it with `validate_args=False`; the head has checked)
     with `batch_shape == raw.shape[:-1]`; its `event_shape` is `(len(target.names),)` for angles and reals, and `()`
     for classes. It has `log_prob` (nats), `sample`, `entropy` (nats) and `mode`. Angles are radians and read modulo
-    2π; the `support` of their density is `distributions.density.circular`. Densities over several numbers register
-    `marginal`, and those whose expected absolute deviation has a closed-form minimiser register `median` (both in
-    framework.distributions.density).
+    2π; the `support` of their density is `distributions.circular.circular`. What else a density may be asked stands on
+    one page, framework.distributions.protocol: over several numbers it registers `marginal`, and `estimate` with
+    `exactly` where its log_prob draws nothing; the rest has defaults that claim nothing they do not know.
 
     Raw numbers may be anything finite, however large; the head maps them to a density whose log_prob is finite
     wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw numbers

@@ -8,8 +8,7 @@ from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.distributions.class_probabilities import class_probabilities
-from framework.distributions.density import marginal, median
-from framework.distributions.monte_carlo import Estimate, estimate
+from framework.distributions.protocol import Estimate, estimate, marginal, median
 
 Split = Literal["test", "outliers"]
 """Where inputs come from: the test split, or data that belongs to nothing the model was trained on."""
@@ -44,7 +43,7 @@ class Prediction:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """The same with its Monte Carlo error and the samples it took; exact of most densities."""
+        """The same with its Monte Carlo error and the samples it took: 0 where nothing is drawn, NaN if not known."""
         return estimate(self.density, self.target)
 
     @cached_property

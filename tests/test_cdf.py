@@ -9,10 +9,9 @@ from torch.distributions import Independent, MultivariateNormal, Normal, Student
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.cdf import arc, cdf, turn
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.density import Mixture, marginal
-from framework.distributions.normals import mahalanobis, normals
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import arc, cdf, mahalanobis, marginal, normals, turn
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 

@@ -15,7 +15,8 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import angular_distance
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.density import Mixture, marginal
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import marginal
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 from plugins.metric.crps.score import crps, fair, mean_angular_distance, mean_distance

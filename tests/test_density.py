@@ -7,15 +7,9 @@ import pytest
 import torch
 from torch.distributions import Distribution, Independent, Normal, constraints
 
-from framework.distributions.density import (
-    Mixture,
-    circular,
-    circular_entropy,
-    circular_grid,
-    marginal,
-    median,
-    pick,
-)
+from framework.distributions.circular import circular
+from framework.distributions.density import Mixture, circular_entropy, circular_grid
+from framework.distributions.protocol import marginal, median, pick
 from framework.errors import UserError
 
 

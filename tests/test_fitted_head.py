@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
-from framework.distributions.density import Mixture, marginal, median, pick
-from framework.distributions.normals import mahalanobis, normals
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import mahalanobis, marginal, median, normals, pick
 from framework.distributions.tempering import temper
 from plugins.density_head.trees.fitted_head import IndependentNormals, single, take_shapes
 

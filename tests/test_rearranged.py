@@ -7,7 +7,8 @@ import torch
 from torch.distributions import Categorical, Independent, Normal
 
 from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.density import Mixture, marginal, median, pick
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import marginal, median, pick
 from framework.testing.metrics import Cardioid
 
 

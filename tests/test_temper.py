@@ -9,14 +9,15 @@ from torch.distributions import Categorical, Independent, MultivariateNormal, No
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.circular import wrap
-from framework.distributions.density import Mixture, circular
-from framework.distributions.monte_carlo import SampledMixture, estimate
-from framework.distributions.tempering import CircularPower, temper, tempered
+from framework.distributions.circular import circular, wrap
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import estimate, tempered
+from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 from framework.testing.quadrature import cells
+from plugins.density_head.latent.monte_carlo import SampledMixture
 
 ANGLE, ANGLES = Target("angle", ("azimuth",)), Target("angle", ("azimuth", "elevation", "tilt"))
 REALS, CLASSES = Target("real", ("x", "y", "z")), Target("class", ("a", "b", "c"))
@@ -196,7 +197,7 @@ def test_the_bound_of_a_cvae_is_that_of_its_tempered_components():
     """Weight by weight: log p(φ|z)^(1/T) + log p(z) - log q(z), of points that are the untempered density's."""
     density = density_of("cvae", ANGLE, batch=(3,), samples=40, hidden=8)
     value = torch.tensor([[0.2], [1.0], [-2.0]], dtype=torch.float64)
-    networks, noise = density.networks, density.noise(torch.arange(3), 0, density.effort.first).flatten(0, 1)
+    networks, noise = density.latent, density.points(torch.arange(3), 0, density.effort.first).flatten(0, 1)
     posterior = networks.posterior(value)
     z = posterior.at(noise)
     component = networks.component(networks.decode(z))

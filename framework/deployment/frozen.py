@@ -18,7 +18,7 @@ from torch.distributions import Categorical, Distribution
 
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
-from framework.distributions.density import median
+from framework.distributions.protocol import median
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.runs.loading import load_with_description
 

@@ -7,7 +7,20 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.density import marginal, median, pick
+from framework.distributions.protocol import (
+    Estimate,
+    Normals,
+    arc,
+    cdf,
+    estimate,
+    mahalanobis,
+    marginal,
+    median,
+    normals,
+    peaks,
+    pick,
+    tempered,
+)
 
 
 class Stacked(Distribution):
@@ -45,10 +58,12 @@ class Stacked(Distribution):
         return -1 - len(self.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        count = len(self.densities)
-        wide = value.expand(*value.shape[: self._axis], count, *self.event_shape)
-        parts = zip(self.densities, wide.unbind(self._axis), strict=True)
-        return torch.stack([density.log_prob(part) for density, part in parts], -1)
+        return torch.stack([density.log_prob(part) for density, part in self.apart(value)], -1)
+
+    def apart(self, value: Tensor) -> list[tuple[Distribution, Tensor]]:
+        """Each density, and of values (*sample, *batch, K or 1, *event) those that are its own."""
+        wide = value.expand(*value.shape[: self._axis], len(self.densities), *self.event_shape)
+        return list(zip(self.densities, wide.unbind(self._axis), strict=True))
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape)
@@ -93,10 +108,15 @@ class Reshaped(Distribution):
         return found.expand(-1, *self.batch_shape) if expand else found
 
     def log_prob(self, value: Tensor) -> Tensor:
+        flat, shape = self.inner(value)
+        return self.density.log_prob(flat).reshape(shape)
+
+    def inner(self, value: Tensor) -> tuple[Tensor, torch.Size]:
+        """Values (*sample, *batch, *event) in the batch_shape of the density inside, and the answer's shape."""
         whole = torch.broadcast_shapes(value.shape, torch.Size((*self.batch_shape, *self.event_shape)))
         lead = whole[: len(whole) - len(self.batch_shape) - len(self.event_shape)]
         flat = value.expand(whole).reshape(*lead, *self.density.batch_shape, *self.event_shape)
-        return self.density.log_prob(flat).reshape(*lead, *self.batch_shape)
+        return flat, torch.Size((*lead, *self.batch_shape))
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape)
@@ -120,6 +140,16 @@ def _(density: Reshaped, index: int) -> Reshaped:
     return Reshaped(marginal(density.density, index), density.batch_shape)
 
 
+@tempered.register
+def _(density: Stacked, temperature: Tensor) -> Distribution:
+    return Stacked([tempered(one, temperature) for one in density.densities])
+
+
+@tempered.register
+def _(density: Reshaped, temperature: Tensor) -> Distribution:
+    return Reshaped(tempered(density.density, temperature), density.batch_shape)
+
+
 @median.register
 def _(density: Stacked, samples: int) -> Tensor:
     axis = -1 - len(density.event_shape)
@@ -129,6 +159,91 @@ def _(density: Stacked, samples: int) -> Tensor:
 @median.register
 def _(density: Reshaped, samples: int) -> Tensor:
     return median(density.density, samples).reshape(*density.batch_shape, *density.event_shape)
+
+
+@estimate.register
+def _(density: Stacked, value: Tensor) -> Estimate:
+    parts = [estimate(one, part) for one, part in density.apart(value)]
+    return Estimate(*(torch.stack(fields, -1) for fields in zip(*parts, strict=True)))
+
+
+@estimate.register
+def _(density: Reshaped, value: Tensor) -> Estimate:
+    flat, shape = density.inner(value)
+    return estimate(density.density, flat).each(lambda field: field.reshape(shape))
+
+
+@cdf.register
+def _(density: Stacked, value: Tensor) -> Tensor | None:
+    return _stacked([cdf(one, part) for one, part in density.apart(value)])
+
+
+@cdf.register
+def _(density: Reshaped, value: Tensor) -> Tensor | None:
+    flat, shape = density.inner(value)
+    return _folded(cdf(density.density, flat), shape)
+
+
+@arc.register
+def _(density: Stacked, start: Tensor, end: Tensor) -> Tensor | None:
+    both = zip(density.apart(start), density.apart(end), strict=True)
+    return _stacked([arc(one, first, last) for (one, first), (_, last) in both])
+
+
+@arc.register
+def _(density: Reshaped, start: Tensor, end: Tensor) -> Tensor | None:
+    start, end = torch.broadcast_tensors(start, end)
+    flat, shape = density.inner(start)
+    return _folded(arc(density.density, flat, density.inner(end)[0]), shape)
+
+
+@mahalanobis.register
+def _(density: Stacked, value: Tensor) -> Tensor | None:
+    return _stacked([mahalanobis(one, part) for one, part in density.apart(value)])
+
+
+@mahalanobis.register
+def _(density: Reshaped, value: Tensor) -> Tensor | None:
+    flat, shape = density.inner(value)
+    return _folded(mahalanobis(density.density, flat), shape)
+
+
+@normals.register
+def _(density: Stacked) -> Normals | None:
+    parts = [part for part in map(normals, density.densities) if part is not None]
+    if len(parts) < len(density.densities) or len({part.mean.shape for part in parts}) > 1:
+        return None
+    return Normals(*(torch.stack(numbers, -2) for numbers in zip(*parts, strict=True)))
+
+
+@normals.register
+def _(density: Reshaped) -> Normals | None:
+    parts = normals(density.density)
+    if parts is None:
+        return None
+    return Normals(*(number.reshape(*density.batch_shape, number.shape[-1]) for number in parts))
+
+
+@peaks.register
+def _(density: Stacked) -> Tensor:
+    found = [peaks(one) for one in density.densities]
+    most = max(len(one) for one in found)
+    same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
+    return torch.stack(same, -1 - len(density.event_shape))
+
+
+@peaks.register
+def _(density: Reshaped) -> Tensor:
+    return peaks(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
+
+
+def _stacked(parts: list[Tensor | None]) -> Tensor | None:
+    known = [part for part in parts if part is not None]
+    return torch.stack(known, -1) if len(known) == len(parts) else None
+
+
+def _folded(found: Tensor | None, shape: torch.Size) -> Tensor | None:
+    return None if found is None else found.reshape(shape)
 
 
 @pick.register

@@ -1,10 +1,33 @@
-"""Angles as angles: wrapping, distance, mean, and the exact circular median."""
+"""Angles as angles: their support, wrapping, distance, mean, and the exact circular median."""
 
 import math
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.distributions import constraints
+
+
+class Circular(constraints.Constraint):
+    """Real numbers read as angles, radians modulo 2π, in the last dimension: the support of a density over angles.
+
+    Args:
+        ranges: (lowest, highest) of each angle within [-π, π], radians, of a density that is spread over a chart of
+            something else (rotations, say) and integrates to 1 there; None for a whole turn of each.
+    """
+
+    event_dim = 1
+
+    def __init__(self, ranges: tuple[tuple[float, float], ...] | None = None) -> None:
+        self.ranges = ranges
+        super().__init__()
+
+    def check(self, value: Tensor) -> Tensor:
+        return value.isfinite().all(-1)
+
+
+circular = Circular()
+"""The support of a density over angles, each a whole turn."""
 
 
 def wrap(angle: Tensor) -> Tensor:

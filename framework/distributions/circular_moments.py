@@ -7,7 +7,8 @@ from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.density import Circular, circular_grid
+from framework.distributions.circular import Circular
+from framework.distributions.density import circular_grid
 
 POINTS = (720, 2880)
 """Angles on the grid, and on the finer one that is tried where some density is too narrow for it."""

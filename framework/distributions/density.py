@@ -1,22 +1,43 @@
-"""Densities that no method owns: the mixture, and marginals, medians and quadratures of any density."""
+"""The mixture, which every wrapper and mixture head returns, and quadratures of the density of one angle."""
 
 import math
-from functools import singledispatch
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.distributions import (
-    Categorical,
-    Distribution,
-    Independent,
-    MultivariateNormal,
-    Normal,
-    constraints,
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.circular import Circular, circular, grid
+from framework.distributions.protocol import (
+    Estimate,
+    Normals,
+    arc,
+    cdf,
+    estimate,
+    mahalanobis,
+    marginal,
+    median,
+    normals,
+    peaks,
+    pick,
+    take,
+    with_error,
 )
 
-from framework.distributions.circular import circular_median, grid
-from framework.errors import UserError
+__all__ = [
+    "CHUNK",
+    "Circular",
+    "Mixture",
+    "circular",
+    "circular_entropy",
+    "circular_grid",
+    "marginal",
+    "median",
+    "merged",
+    "pick",
+    "take",
+]  # among them what this file held before the questions had a page of their own
 
 CHUNK = 2**20
 """Component densities evaluated at once without gradient, when one density is asked at many points."""
@@ -56,13 +77,20 @@ class Mixture(Distribution):
         return self.components.enumerate_support(expand)[..., 0]
 
     def log_prob(self, value: Tensor) -> Tensor:
+        parts = self.in_parts(value)
+        if len(parts) > 1:
+            return torch.cat([self.log_prob(part) for part in parts])
+        spread = value.unsqueeze(-1 - len(self.event_shape))
+        return torch.logsumexp(self.log_weights + self.components.log_prob(spread), -1)
+
+    def in_parts(self, value: Tensor) -> Sequence[Tensor]:
+        """Values (*sample, *batch, *event), split along the first dimension where all at once would fill the memory: a
+        grid of angles on many samples of many components."""
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
         rows = max(1, CHUNK // max(1, self.log_weights.numel()))
         if extra > 0 and value.shape[0] > rows and not torch.is_grad_enabled():
-            # a grid of angles on many samples of many components would fill the memory
-            return torch.cat([self.log_prob(part) for part in value.split(rows)])
-        spread = value.unsqueeze(-1 - len(self.event_shape))
-        return torch.logsumexp(self.log_weights + self.components.log_prob(spread), -1)
+            return value.split(rows)
+        return [value]
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -111,94 +139,44 @@ class Mixture(Distribution):
         return (self.log_weights.exp() * surprise).sum(-1)
 
 
-class Circular(constraints.Constraint):
-    """Real numbers read as angles, radians modulo 2π, in the last dimension.
+def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
+    """The estimate of log Σ_k t_k from those of log t_k, up to constants, along the last dimension.
+
+    The terms must be drawn independently of one another. Delta method: the squared relative error of the sum is
+    Σ_k (t_k / Σ_j t_j)² s_k². Samples add up.
 
     Args:
-        ranges: (lowest, highest) of each angle within [-π, π], radians, of a density that is spread over a chart of
-            something else (rotations, say) and integrates to 1 there; None for a whole turn of each.
+        parts: errors, samples and so on of each term, (*items, K).
+        log_terms: log t_k, (*items, K).
+        log_sum: (*items,).
     """
-
-    event_dim = 1
-
-    def __init__(self, ranges: tuple[tuple[float, float], ...] | None = None) -> None:
-        self.ranges = ranges
-        super().__init__()
-
-    def check(self, value: Tensor) -> Tensor:
-        return value.isfinite().all(-1)
-
-
-circular = Circular()
-"""The support of a density over angles, each a whole turn."""
+    with torch.no_grad():
+        whole = log_sum.unsqueeze(-1)
+        share = torch.where(whole == -math.inf, 1.0, (log_terms - whole).exp())
+        error = parts.standard_error
+        # what adds nothing adds no error, not even an infinite one; an unknown error stays unknown
+        silent = (error == 0) | ((share == 0) & ~error.isnan())
+        error = torch.where(silent, 0.0, share * error).square().sum(-1).sqrt()
+    return with_error(log_sum, error, parts.samples.sum(-1), parts.unresolved.any(-1))
 
 
-@singledispatch
-def pick(density: Distribution, index: Tensor) -> Distribution:
-    """Of a density with batch_shape (*batch, K) the one at `index` (*sample, *batch) of the last batch dimension.
-
-    A density with parameters registers its own, which gathers them: `@pick.register`. Without it everything is drawn
-    and all but one of K draws thrown away.
-    """
-    return _Picked(density, index)
-
-
-class _Picked(Distribution):
-    """Samples of one component each, by drawing all."""
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-
-    def __init__(self, density: Distribution, index: Tensor) -> None:
-        self.density = density
-        self.index = index
-        super().__init__(index.shape, density.event_shape, validate_args=False)
-
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        lead = self.index.shape[: self.index.dim() - len(self.density.batch_shape) + 1]
-        drawn = self.density.sample(torch.Size(sample_shape) + lead)  # (*sample, *lead, *batch, K, *event)
-        index = self.index.expand((*sample_shape, *self.index.shape))
-        axis = index.dim()
-        index = index.reshape(*index.shape, 1, *(1,) * len(self.event_shape))
-        return drawn.gather(axis, index.expand((*index.shape[: axis + 1], *self.event_shape))).squeeze(axis)
+@estimate.register
+def _(density: Mixture, value: Tensor) -> Estimate:
+    """Of independent components; of one component its own, to the last bit."""
+    several = density.in_parts(value)
+    if len(several) > 1:
+        return joined([estimate(density, part) for part in several])
+    parts = estimate(density.components, value.unsqueeze(-1 - len(density.event_shape)))
+    if density.log_weights.shape[-1] == 1:
+        return parts.each(lambda field: field.squeeze(-1))
+    error = parts.standard_error.masked_fill(density.log_weights == -math.inf, 0.0)
+    log_terms = density.log_weights + parts.log_mean
+    return merged(parts._replace(standard_error=error), log_terms, torch.logsumexp(log_terms, -1))
 
 
-@pick.register
-def _(density: Categorical, index: Tensor) -> Distribution:
-    return Categorical(logits=take(density.logits, index), validate_args=False)
-
-
-@pick.register
-def _(density: Independent, index: Tensor) -> Distribution:
-    base = density.base_dist
-    if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
-        return _Picked(density, index)
-    loc, scale = (take(parameter, index) for parameter in (base.loc, base.scale))
-    return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
-
-
-def take(parameter: Tensor, index: Tensor) -> Tensor:
-    """`parameter` (*batch, K, number) at `index` (*sample, *batch) of K: (*sample, *batch, number)."""
-    lead = index.shape[: index.dim() - parameter.dim() + 2]
-    wide = parameter.expand((*lead, *parameter.shape))
-    return wide.gather(-2, index[..., None, None].expand(*index.shape, 1, parameter.shape[-1])).squeeze(-2)
-
-
-@singledispatch
-def marginal(density: Distribution, index: int) -> Distribution:
-    """The density of number `index` of the target alone; keeps an event dimension of one.
-
-    A density over several numbers registers its own: `@marginal.register`.
-
-    Raises:
-        UserError: the density has not said how.
-    """
-    if density.event_shape == (1,) and index == 0:
-        return density
-    raise UserError(
-        f"{type(density).__name__} has no marginal for one of its {tuple(density.event_shape)} numbers. "
-        "Register one with `framework.distributions.density.marginal.register`, or leave out the "
-        "metric or picture that needs it."
-    )
+def joined(parts: Sequence[Estimate]) -> Estimate:
+    """Of several batches one, along the first dimension."""
+    return Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
 
 @marginal.register
@@ -206,44 +184,56 @@ def _(density: Mixture, index: int) -> Distribution:
     return Mixture(density.log_weights, marginal(density.components, index))
 
 
-@marginal.register
-def _(density: Independent, index: int) -> Distribution:
-    if density.event_shape == (1,) and index == 0:
-        return density
-    if not isinstance(density.base_dist, Normal):
-        raise UserError(f"No marginal is known for Independent({type(density.base_dist).__name__}).")
-    here = slice(index, index + 1)
-    base = Normal(density.base_dist.loc[..., here], density.base_dist.scale[..., here], validate_args=False)
-    return Independent(base, 1, validate_args=False)
-
-
-@marginal.register
-def _(density: MultivariateNormal, index: int) -> MultivariateNormal:
-    if density.event_shape == (1,) and index == 0:
-        return density
-    here = slice(index, index + 1)
-    scale = density.variance[..., here].sqrt().unsqueeze(-1)
-    return MultivariateNormal(density.loc[..., here], scale_tril=scale, validate_args=False)
-
-
-@singledispatch
-def median(density: Distribution, samples: int) -> Tensor:
-    """The point of least expected absolute deviation, number by number (eq. 3.23), from `samples` draws (3.24).
-
-    A density that knows it in closed form registers its own: `@median.register`, and draws nothing.
-    """
-    if density.has_enumerate_support:
-        return density.mode  # of classes: a label is right or wrong, and nothing lies between
-    drawn = density.sample(torch.Size((samples,)))
-    if isinstance(density.support, Circular):
-        return circular_median(drawn)
-    return drawn.median(0).values
-
-
 @median.register
-def _(density: MultivariateNormal, samples: int) -> Tensor:
-    # each number's marginal is symmetric about its mean
-    return density.loc
+def _(density: Mixture, samples: int) -> Tensor:
+    """Of one component its own; otherwise of draws, as by default."""
+    if density.log_weights.shape[-1] == 1:
+        return median(density.components, samples).squeeze(-1 - len(density.event_shape))
+    return median.dispatch(Distribution)(density, samples)
+
+
+@cdf.register
+def _(density: Mixture, value: Tensor) -> Tensor | None:
+    found = cdf.dispatch(Distribution)(density, value)
+    if found is not None:
+        return found
+    return _mixed(density, cdf(density.components, value.unsqueeze(-2)))
+
+
+@arc.register
+def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
+    return _mixed(density, arc(density.components, start.unsqueeze(-2), end.unsqueeze(-2)))
+
+
+def _mixed(density: Mixture, parts: Tensor | None) -> Tensor | None:
+    if parts is None:
+        return None
+    weights = density.log_weights.double().softmax(-1)  # float32's sum to 1 but for 1e-7
+    return torch.where(weights > 0, weights * parts, 0.0).sum(-1).clamp(0, 1)
+
+
+@normals.register
+def _(density: Mixture) -> Normals | None:
+    parts = normals(density.components)  # (*batch, K, k)
+    if parts is None:
+        return None
+    # again: float32's sum to 1 but for 1e-7
+    log_weights = density.log_weights.double().log_softmax(-1).unsqueeze(-1) + parts.log_weights
+    return Normals(*(number.flatten(-2) for number in (log_weights, parts.mean, parts.scale)))
+
+
+@mahalanobis.register
+def _(density: Mixture, value: Tensor) -> Tensor | None:
+    if density.log_weights.shape[-1] > 1:
+        return None
+    found = mahalanobis(density.components, value.unsqueeze(-2))
+    return None if found is None else found.squeeze(-1)
+
+
+@peaks.register
+def _(density: Mixture) -> Tensor:
+    found = peaks(density.components).movedim(-1 - len(density.event_shape), 0)  # (K, peak, *batch, *event)
+    return found.flatten(0, 1)
 
 
 def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Tensor]:

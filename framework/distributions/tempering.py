@@ -1,25 +1,16 @@
 """Densities raised to a power 1/T and normalised: broader than before for T > 1, narrower below."""
 
 import math
-from functools import singledispatch
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import (
-    Categorical,
-    Distribution,
-    Independent,
-    MultivariateNormal,
-    Normal,
-    constraints,
-)
+from torch.distributions import Categorical, Distribution, constraints
 
-from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.circular import grid, wrap
-from framework.distributions.density import Circular, Mixture
-from framework.distributions.monte_carlo import SampledMixture
+from framework.distributions.circular import Circular, grid, wrap
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import Estimate, estimate, peaks, tempered, with_error
 from framework.errors import UserError
 
 POINTS, MOST_POINTS = 1024, 2**15
@@ -48,13 +39,8 @@ def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distributio
     return tempered(density, temperature)
 
 
-@singledispatch
-def tempered(density: Distribution, temperature: Tensor) -> Distribution:
-    """What `temper` returns for each type of density; others register theirs: `@tempered.register`.
-
-    Without a registration classes are enumerated, and the density of one angle that runs over the whole turn is
-    normalised on a grid.
-    """
+@tempered.register(Distribution)
+def _(density: Distribution, temperature: Tensor) -> Distribution:
     if density.has_enumerate_support and density.event_shape == ():
         return tempered_classes(density, temperature)
     support = density.support if tuple(density.event_shape) == (1,) else None
@@ -63,17 +49,27 @@ def tempered(density: Distribution, temperature: Tensor) -> Distribution:
     raise UserError(
         f"No temperature is known for {type(density).__name__} over {tuple(density.event_shape)} numbers: p^(1/T) has "
         "no normaliser in closed form that the framework knows. Register it with "
-        "`framework.distributions.tempering.tempered.register`, "
+        "`framework.distributions.protocol.tempered.register`, "
         "or leave out the wrapper that changes the temperature."
     )
 
 
-def tempered_classes(density: Distribution, temperature: Tensor) -> Categorical:
+@tempered.register
+def _(density: Mixture, temperature: Tensor) -> Distribution:
+    """Of classes the whole mixture. Otherwise its components are tempered and their weights kept: Σ w_k p_k raised to
+    a power has no normaliser in closed form, while this is normalised as its components are, is p at T = 1, and of one
+    component is the same. It keeps apart what the components say of different modes."""
+    if density.has_enumerate_support:
+        return tempered_classes(density, temperature)
+    return Mixture(density.log_weights, tempered(density.components, temperature))
+
+
+def tempered_classes(density: Distribution, temperature: Tensor) -> "RescaledClasses":
     """p_k^(1/T) / Σ_j p_j^(1/T): logits divided by T (Guo et al. 2017, eq. 9), of any density over classes."""
     log_prob = log_probabilities(density)
     # the largest first, so that differences and not sizes are rounded; a class that is ruled out stays so
     heights = log_prob - log_prob.amax(-1, keepdim=True)
-    return Categorical(logits=divided(heights, temperature).log_softmax(-1), validate_args=False)
+    return RescaledClasses(divided(heights, temperature).log_softmax(-1), density, 1 / temperature)
 
 
 def log_probabilities(density: Distribution) -> Float[Tensor, "*batch label"]:
@@ -87,50 +83,40 @@ def divided(log_density: Tensor, temperature: Tensor) -> Tensor:
     return torch.where(ruled_out, -math.inf, log_density.masked_fill(ruled_out, 0.0) / temperature)
 
 
-@tempered.register
-def _(density: Mixture, temperature: Tensor) -> Distribution:
-    """Of classes the whole mixture. Otherwise its components are tempered and their weights kept: Σ w_k p_k raised to
-    a power has no normaliser in closed form, while this is normalised as its components are, is p at T = 1, and of one
-    component is the same. It keeps apart what the components say of different modes."""
-    if density.has_enumerate_support:
-        return tempered_classes(density, temperature)
-    return Mixture(density.log_weights, tempered(density.components, temperature))
+class RescaledClasses(Categorical):
+    """Classes whose log-probabilities are `slope` times those of another density, plus constants, normalised.
+
+    Args:
+        logits: of the classes, (*batch, label).
+        density: the other one, whose Monte Carlo error follows.
+        slope: a scalar, 1/T of a temperature.
+    """
+
+    def __init__(self, logits: Float[Tensor, "*batch label"], density: Distribution, slope: Tensor) -> None:
+        self.density = density
+        self.slope = slope
+        super().__init__(logits=logits, validate_args=False)
 
 
-@tempered.register
-def _(density: SampledMixture, temperature: Tensor) -> Distribution:
-    """Component by component, also of classes, so that its log-density stays an estimate with its error."""
-    components = tempered(density.components, temperature)
-    return SampledMixture(density.log_weights, components, density.replicates)
+@estimate.register
+def _(density: RescaledClasses, value: Tensor) -> Estimate:
+    """At most this error: of log q_k = a log p_k - log Σ_j p_j^a + constants, errors e_j of log p_j make the error
+    a (e_k - Σ_j q_j e_j), and they may go together in any way: a ((1 - q_k) s_k + Σ_{j≠k} q_j s_j)."""
+    log_prob = density.log_prob(value)
+    with torch.no_grad():
+        found = estimate(density.density, density.density.enumerate_support())
+        share = density.probs.movedim(-1, 0)
+        part = torch.where(found.standard_error == 0, 0.0, share * found.standard_error)
+        own = torch.where(found.standard_error == 0, 0.0, (1 - share) * found.standard_error)
+        error = density.slope.abs().to(log_prob) * (own + part.sum(0) - part)
+        label = value.long().expand(log_prob.shape).unsqueeze(-1)
 
+        def of_label(each: Tensor) -> Tensor:
+            each = each.expand(share.shape).movedim(0, -1)
+            return each.expand(*log_prob.shape, each.shape[-1]).gather(-1, label).squeeze(-1)
 
-@tempered.register
-def _(density: Stacked, temperature: Tensor) -> Distribution:
-    return Stacked([tempered(one, temperature) for one in density.densities])
-
-
-@tempered.register
-def _(density: Reshaped, temperature: Tensor) -> Distribution:
-    return Reshaped(tempered(density.density, temperature), density.batch_shape)
-
-
-@tempered.register
-def _(density: Independent, temperature: Tensor) -> Distribution:
-    # the power of a product is the product of the powers
-    base = tempered(density.base_dist, temperature)
-    return Independent(base, density.reinterpreted_batch_ndims, validate_args=False)
-
-
-@tempered.register
-def _(density: Normal, temperature: Tensor) -> Distribution:
-    # exp(-d²/2σ²)^(1/T) = exp(-d²/2σ²T)
-    return Normal(density.loc, density.scale * temperature.sqrt(), validate_args=False)
-
-
-@tempered.register
-def _(density: MultivariateNormal, temperature: Tensor) -> Distribution:
-    scale = density.scale_tril * temperature.sqrt()
-    return MultivariateNormal(density.loc, scale_tril=scale, validate_args=False)
+        told = [of_label(each) for each in (error, found.samples, found.unresolved)]
+    return with_error(log_prob, *told)
 
 
 class CircularPower(Distribution):
@@ -157,7 +143,7 @@ class CircularPower(Distribution):
         self.start = density.mode.detach() if density.batch_shape.numel() else density.sample()
         points = POINTS
         while True:
-            log_prob = self._log_prob_at(points)  # (points, *batch), the first at the mode
+            log_prob = self.density.log_prob(self.around(points))  # (points, *batch)
             self.top = log_prob[0]
             self.powers = divided(log_prob - self.top, temperature)
             log_mean, coarse = (self.powers[::every].logsumexp(0) + math.log(every) for every in (1, 2))
@@ -169,9 +155,10 @@ class CircularPower(Distribution):
                 raise UserError(
                     f"{type(density).__name__} at temperature {float(temperature.detach()):g} is too narrow for a grid "
                     f"of {MOST_POINTS} angles (its mass is uncertain by {off.max().item():.2g} nats). Register "
-                    "its power with `framework.distributions.tempering.tempered.register`, or raise the temperature's "
+                    "its power with `framework.distributions.protocol.tempered.register`, or raise the temperature's "
                     "lower bound."
                 )
+        self.points = points
         self.log_normaliser = log_mean + math.log(2 * math.pi / points)
 
     @property
@@ -183,8 +170,12 @@ class CircularPower(Distribution):
         return self.density.mode
 
     def log_prob(self, value: Tensor) -> Tensor:
+        return self.power_of(self.density.log_prob(value))
+
+    def power_of(self, log_prob: Tensor) -> Tensor:
+        """log_prob where that of p is `log_prob`."""
         # below the mode's, so that large log-densities do not cancel
-        return divided(self.density.log_prob(value) - self.top, self.temperature) - self.log_normaliser
+        return divided(log_prob - self.top, self.temperature) - self.log_normaliser
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -207,7 +198,24 @@ class CircularPower(Distribution):
         # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
         return self.log_normaliser - (mass * self.powers.clamp(min=-1e4)).sum(0)
 
-    def _log_prob_at(self, points: int) -> Tensor:
+    def around(self, points: int) -> Tensor:
+        """Angles of the grid, (points, *batch, 1), the first at the mode."""
         turn = grid(points, dtype=self.start.dtype, device=self.start.device) + math.pi
-        ahead = turn.reshape(points, *(1,) * self.start.dim())
-        return self.density.log_prob(self.start + ahead)
+        return self.start + turn.reshape(points, *(1,) * self.start.dim())
+
+
+@estimate.register
+def _(density: CircularPower, value: Tensor) -> Estimate:
+    """At most this error: those of p and of its normaliser may be of the same draws, and add up."""
+    found = estimate(density.density, value)
+    log_prob = density.power_of(found.log_mean)
+    with torch.no_grad():
+        around = estimate(density.density, density.around(density.points)).standard_error
+        of_normaliser = torch.where(around == 0, 0.0, density.powers.softmax(0) * around).sum(0)
+        error = (found.standard_error + of_normaliser) / density.temperature.to(log_prob)
+    return with_error(log_prob, error, found.samples, found.unresolved)
+
+
+@peaks.register
+def _(density: CircularPower) -> Tensor:
+    return peaks(density.density)  # a power rises and falls with the density

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import angular_distance, grid
-from framework.distributions.density import marginal, median
+from framework.distributions.protocol import marginal, median
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import HeadSubject
 from framework.testing.quadrature import cells, counted, density_at, side

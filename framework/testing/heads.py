@@ -13,7 +13,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead, Fitted
-from framework.distributions.density import Circular, Mixture, median
+from framework.distributions.circular import Circular
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import median
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import HeadRow

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution, MultivariateNormal, constraints
 
-from framework.distributions.density import circular, marginal, median, pick, take
+from framework.distributions.circular import circular
+from framework.distributions.protocol import estimate, exactly, marginal, median, pick, take
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target
@@ -52,7 +53,7 @@ class Cardioid(Distribution):
         return (near.clamp(min=1e-12).log() - math.log(2 * math.pi)).sum(-1)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        shape = self._extended_shape(torch.Size(sample_shape))
+        shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         # with t = tan(θ/2) the density of strength 1 is ∝ 1/(1+t²)²: √3 t is Student's with 3 degrees of freedom
         normal = torch.randn(4, *shape, dtype=self.location.dtype)
         found = self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
@@ -66,6 +67,9 @@ class Cardioid(Distribution):
         # log 2π - (1/2π) ∫ (1 + s cos d) log(1 + s cos d) = log 4π - 1 + r - log(1 + r) with r = √(1 - s²)
         root = (1 - self.strength.square()).sqrt()
         return self.event_shape[0] * (math.log(4 * math.pi) - 1 + root - torch.log1p(root))
+
+
+estimate.register(Cardioid, exactly)
 
 
 @marginal.register

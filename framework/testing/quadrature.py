@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.density import Circular
+from framework.distributions.circular import Circular
 
 POINTS = {1: 1020, 2: 252, 3: 60}
 """Grid points a side by the number of angles; spectrally exact for densities that the grid resolves."""

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.data import Batch
-from framework.distributions.density import Circular
+from framework.distributions.circular import Circular
 from framework.model import Predictor
 from framework.target import Target
 from framework.testing.densities import integral, samples_follow_log_prob

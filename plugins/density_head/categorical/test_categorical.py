@@ -4,7 +4,8 @@ import torch
 from scipy import special
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import Mixture, median
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.target import Target
 from plugins.density_head.categorical.rows import FIVE, TWO

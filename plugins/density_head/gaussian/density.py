@@ -8,9 +8,19 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.density import marginal, median, pick, take
-from framework.distributions.normals import Normals, mahalanobis, normals, one_normal
-from framework.distributions.tempering import tempered
+from framework.distributions.protocol import (
+    Normals,
+    estimate,
+    exactly,
+    mahalanobis,
+    marginal,
+    median,
+    normals,
+    one_normal,
+    pick,
+    take,
+    tempered,
+)
 
 
 class Gaussian(Distribution):
@@ -79,7 +89,7 @@ class Gaussian(Distribution):
         return -(standard.square() / 2 + self.scale.log() + math.log(2 * math.pi) / 2).sum(-1)
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        shape = self._extended_shape(torch.Size(sample_shape))
+        shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         noise = torch.randn(shape, dtype=self.scale.dtype, device=self.scale.device) * self.scale
         if self.coefficients is not None:
             noise = (self._mixing @ noise.unsqueeze(-1)).squeeze(-1)
@@ -87,6 +97,9 @@ class Gaussian(Distribution):
 
     def entropy(self) -> Tensor:
         return (self.scale.log() + (1 + math.log(2 * math.pi)) / 2).sum(-1)
+
+
+estimate.register(Gaussian, exactly)
 
 
 @marginal.register

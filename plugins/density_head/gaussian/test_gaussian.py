@@ -4,7 +4,7 @@ import torch
 from scipy import stats
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import marginal, pick
+from framework.distributions.protocol import marginal, pick
 from framework.errors import ConfigError
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.circular import grid
-from framework.distributions.density import Circular, marginal, pick, take
-from framework.distributions.tempering import tempered
+from framework.distributions.circular import Circular, grid
+from framework.distributions.protocol import estimate, exactly, marginal, pick, take, tempered
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
 VOLUME = 8 * math.pi**2
@@ -75,7 +74,7 @@ class MatrixFisher(Distribution):
         return (of_rotation + _log_volume(exact[..., 1])).to(self.dtype)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        shape = self._extended_shape(torch.Size(sample_shape))
+        shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         aligned = functions.sample(self.frame.falls.expand(shape))
         return quaternions.viewpoint(self.frame.turn(aligned)).to(self.dtype)
 
@@ -148,6 +147,10 @@ class Angle(Distribution):
 
 def _log_volume(elevation: Tensor) -> Tensor:
     return torch.log(torch.cos(elevation).abs()) - math.log(VOLUME)
+
+
+estimate.register(MatrixFisher, exactly)
+estimate.register(Angle, exactly)  # by quadrature, which draws nothing
 
 
 @marginal.register

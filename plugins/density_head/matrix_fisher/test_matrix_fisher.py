@@ -7,7 +7,8 @@ import torch
 from scipy import stats
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import Mixture, circular_grid, marginal, median, pick
+from framework.distributions.density import Mixture, circular_grid
+from framework.distributions.protocol import marginal, median, pick
 from framework.errors import ConfigError
 from framework.geometry.rotation import viewpoint_rotation
 from framework.target import Target

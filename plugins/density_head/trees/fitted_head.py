@@ -7,7 +7,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-from framework.distributions.density import median
+from framework.distributions.protocol import median
 from framework.errors import ConfigError, UserError
 from framework.target import Target
 

@@ -6,8 +6,20 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.density import Circular, circular_entropy, marginal, median, pick
-from framework.distributions.tempering import tempered, tempered_classes
+from framework.distributions.circular import Circular
+from framework.distributions.density import circular_entropy, merged
+from framework.distributions.protocol import (
+    Estimate,
+    arc,
+    estimate,
+    marginal,
+    median,
+    peaks,
+    pick,
+    tempered,
+    turn,
+)
+from framework.distributions.tempering import tempered_classes
 
 
 class Floored(Distribution):
@@ -41,8 +53,12 @@ class Floored(Distribution):
         return self.density.enumerate_support(expand)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        above = self.density.log_prob(value) + math.log1p(-self.weight)
-        return torch.logaddexp(above, torch.full_like(above, math.log(self.weight) + self.log_uniform))
+        return self.floored(self.density.log_prob(value))[0]
+
+    def floored(self, log_prob: Tensor) -> tuple[Tensor, Tensor]:
+        """log_prob where that of p is `log_prob`, and the part of it that is p's: log (1 - γ) p."""
+        above = log_prob + math.log1p(-self.weight)
+        return torch.logaddexp(above, torch.full_like(above, math.log(self.weight) + self.log_uniform)), above
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -70,6 +86,27 @@ class Floored(Distribution):
 def _(density: Floored, index: int) -> Floored:
     share = density.log_uniform / density.event_shape[0]
     return Floored(marginal(density.density, index), density.weight, share)
+
+
+@estimate.register
+def _(density: Floored, value: Tensor) -> Estimate:
+    found = estimate(density.density, value)
+    log_sum, above = density.floored(found.log_mean)
+    # the floor is exact
+    return merged(found.each(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
+
+
+@arc.register
+def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
+    inside = arc(density.density, start, end)
+    if inside is None:
+        return None
+    return (1 - density.weight) * inside + density.weight * turn(start, end).squeeze(-1) / (2 * math.pi)
+
+
+@peaks.register
+def _(density: Floored) -> Tensor:
+    return peaks(density.density)
 
 
 @median.register

@@ -5,9 +5,18 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints, register_kl
 
-from framework.distributions.cdf import arc, turn
-from framework.distributions.density import circular, marginal, median, pick, take
-from framework.distributions.tempering import tempered
+from framework.distributions.circular import circular
+from framework.distributions.protocol import (
+    arc,
+    estimate,
+    exactly,
+    marginal,
+    median,
+    pick,
+    take,
+    tempered,
+    turn,
+)
 from plugins.density_head.von_mises import functions, integrals
 
 
@@ -46,11 +55,14 @@ class VonMises(Distribution):
         return functions.log_prob(value, self.location, self.concentration).sum(-1)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        shape = self._extended_shape(torch.Size(sample_shape))
+        shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         return functions.sample(self.location.expand(shape), self.concentration.expand(shape))
 
     def entropy(self) -> Tensor:
         return functions.entropy(self.concentration).sum(-1)
+
+
+estimate.register(VonMises, exactly)
 
 
 @marginal.register

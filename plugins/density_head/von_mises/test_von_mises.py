@@ -13,7 +13,7 @@ from scipy import optimize, stats
 from torch.distributions import kl_divergence
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import marginal, median, pick
+from framework.distributions.protocol import marginal, median, pick
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.heads import values

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import CircularMoments, circular_moments
 from framework.distributions.class_probabilities import class_probabilities, require_labels
-from framework.distributions.density import Circular
-from framework.distributions.normals import mahalanobis, normals
+from framework.distributions.protocol import mahalanobis, normals
 
 EQUAL = {torch.float32: 1e-6, torch.float64: 1e-12}
 """Densities that differ by a smaller part are equally dense, by their number type: rounding must not decide on a

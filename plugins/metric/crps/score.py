@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.circular import angular_distance, wrap
+from framework.distributions.circular import Circular, angular_distance, wrap
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.density import CHUNK, Circular
-from framework.distributions.normals import Normals, normals
+from framework.distributions.density import CHUNK
+from framework.distributions.protocol import Normals, normals
 
 REPLICATES = 8
 """Independent parts of the draws, from which the error of an estimate is taken."""

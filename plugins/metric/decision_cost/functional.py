@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.cdf import arc, cdf, turn
 from framework.distributions.checks import refuse_nan
+from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.density import Circular
+from framework.distributions.protocol import arc, cdf, turn
 
 NOTHING = 1e-9
 """Masses of arcs from a grid below this are rounding, and count as 0: no cost is so large that it may decide."""
@@ -74,7 +74,7 @@ def region_probabilities(
 ) -> Float[Tensor, "batch region"]:
     """Masses of the regions that edges cut a line or a circle into, float64; see `regions`.
 
-    Exact where `distributions.cdf` or `distributions.circular_moments` are, otherwise shares of `samples` draws.
+    Exact where `protocol.cdf`, `protocol.arc` or `circular_moments` are, otherwise shares of `samples` draws.
 
     Args:
         density: of one real or one angle, batch_shape (batch,).

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
-from framework.distributions.monte_carlo import Estimate
+from framework.distributions.protocol import Estimate
 from framework.metric import Metric
 from framework.prediction import Prediction
 
@@ -19,7 +19,8 @@ class LogLikelihood(Metric):
 
     Of densities whose log_prob is a Monte Carlo estimate also: the mean without its first-order bias, the standard
     error that the sampling alone gives it, the samples an item took (mean and most), and how many items did not reach
-    the tolerance asked for. Where a single replicate says nothing of its error, both are NaN.
+    the tolerance asked for. Where a single replicate says nothing of its error, both are NaN. Of a density that has
+    not said whether its log_prob draws, the error alone, NaN.
     """
 
     bibtex = """@article{gneiting2007strictly,
@@ -103,7 +104,7 @@ def summary(
     }
     debiased, variance, samples, above, most = sampling
     if samples == 0:
-        return found
+        return found if variance == 0 or not seen else found | {f"{name}_mc_error": variance}
     return found | {
         f"{name}_debiased": debiased / count,
         # the items' points are independent: the variance of a mean

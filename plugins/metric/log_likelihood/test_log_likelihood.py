@@ -12,7 +12,7 @@ from sklearn.metrics import log_loss
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.monte_carlo import Estimate, estimate
+from framework.distributions.protocol import Estimate, estimate, exactly
 from framework.errors import UserError
 from framework.prediction import Prediction
 from plugins.metric.log_likelihood.metric import LogLikelihood, merged_moments, moments_of
@@ -29,6 +29,16 @@ class Known(Distribution):
 
     def log_prob(self, value):
         return self.values
+
+
+estimate.register(Known, exactly)
+
+
+class Untold(Known):
+    """The same by one who has not said whether log_prob draws."""
+
+
+estimate.register(Untold, estimate.dispatch(Distribution))
 
 
 class Drawn(Known):
@@ -155,6 +165,18 @@ def drawn(values):
 
 def test_exact_densities_have_nothing_more_to_say():
     assert set(measured([1.0, 2.0])) == {"log_likelihood", "log_likelihood_sem"}
+
+
+def test_a_density_that_has_not_said_whether_it_draws_has_an_error_that_is_not_known():
+    metric, negative = LogLikelihood(), build("metric", resolve("metric", "nll"))
+    for values in ([1.0, 2.0], [6.0]):
+        log_prob = torch.tensor(values, dtype=torch.float64)
+        for one in (metric, negative):
+            one.update(Prediction(Untold(log_prob), {"target": torch.zeros(len(log_prob), 1)}))
+    found = metric.compute()
+    assert found["log_likelihood"] == 3 and negative.compute()["nll"] == -3
+    assert set(found) == {"log_likelihood", "log_likelihood_sem", "log_likelihood_mc_error"}
+    assert found["log_likelihood_mc_error"].isnan() and negative.compute()["nll_mc_error"].isnan()
 
 
 def test_estimates_tell_their_error_and_their_samples():

@@ -7,10 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.cdf import arc, cdf, turn
-from framework.distributions.circular import circular_mean
+from framework.distributions.circular import Circular, circular_mean
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.density import Circular
+from framework.distributions.protocol import arc, cdf, turn
 
 
 def transform(density: Distribution, value: Float[Tensor, "batch 1"], samples: int) -> Float[Tensor, "batch"]:

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework.distributions.prediction_set import PredictionSet
+from framework.distributions.protocol import prediction_set
 from framework.errors import UserError
 from framework.metric import Metric
 from framework.prediction import Prediction
@@ -54,13 +54,13 @@ class PredictionSetMetric(Metric):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
-        sets = prediction.density
         if len(prediction.target) == 0:
             return
-        if not isinstance(sets, PredictionSet):
+        sets = prediction_set(prediction.density)
+        if sets is None:
             raise UserError(
-                f"prediction_set judges sets, but the model predicts a {type(sets).__name__}, which has none. Put "
-                "conformal last among the wrappers, uncertainty=[..., conformal], or leave this metric out."
+                f"prediction_set judges sets, but the model predicts a {type(prediction.density).__name__}, which has "
+                "none. Put conformal last among the wrappers, uncertainty=[..., conformal], or leave this metric out."
             )
         size = sets.size()
         broken = (size.isnan() | prediction.log_prob.isnan()).nonzero().flatten()

@@ -11,7 +11,8 @@ from scipy.stats import uniform, vonmises
 from torch.distributions import Categorical, Distribution, VonMises
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import circular, marginal
+from framework.distributions.circular import circular
+from framework.distributions.protocol import marginal
 from framework.errors import ConfigError, DataError
 from framework.prediction import Prediction
 from framework.target import Target

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.density import Circular
-from framework.distributions.monte_carlo import normal_quantile
+from framework.distributions.circular import Circular
+from framework.distributions.closed_forms import normal_quantile
 
 DRAWS = 16
 """Targets that a divergence of a continuous density is estimated from, for each of the batch."""

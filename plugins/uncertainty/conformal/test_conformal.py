@@ -12,11 +12,11 @@ from torch.distributions import Categorical
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
-from framework.distributions.prediction_set import PredictionSet
 from framework.errors import ConfigError, UserError
 from framework.model import Predictor
 from framework.target import Target
 from framework.testing.metrics import Cardioid
+from plugins.uncertainty.conformal.prediction_set import PredictionSet
 from plugins.uncertainty.conformal.wrapper import halves, threshold
 
 CLASSES, ANGLE = Target("class", ("upper", "lower")), Target("angle", ("azimuth",))

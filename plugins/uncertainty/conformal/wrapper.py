@@ -13,10 +13,10 @@ from torch.distributions import Distribution
 
 from framework.calibration.validation import densities, repeatable, require_numbers
 from framework.data import Batch
-from framework.distributions.prediction_set import PredictionSet, Score
 from framework.errors import UserError
 from framework.model import Predictor
 from framework.uncertainty import Uncertainty
+from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
 SEED = 71
 """Of the split into halves."""
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class Conformal(Uncertainty):
-    """Densities as they are, each with a set (distributions.prediction_set) that holds the target with 1 - miscoverage.
+    """Densities as they are, each with a set (`prediction_set.py`) that holds the target with 1 - miscoverage.
 
     On data that is exchangeable with the validation set a new target lies in its set with a probability of at least
     1 - α, and of at most 1 - α + 1/(n + 1) where no two of the n scores are equal, on average over both, however wrong

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import median
+from framework.distributions.protocol import median
 from framework.errors import ConfigError, UserError
 from framework.geometry.clouds import denormalised, sizes
 from framework.runs.loading import load_with_description

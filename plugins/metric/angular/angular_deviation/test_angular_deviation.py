@@ -7,7 +7,7 @@ from scipy.stats import sem
 from torch.distributions import Distribution
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import median
+from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.prediction import Prediction
 from framework.target import Target

@@ -8,7 +8,7 @@ from torch import nn
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.density import median
+from framework.distributions.protocol import median
 from framework.encoder import Encoder
 from framework.errors import ConfigError, UserError
 from framework.evaluation.cost import measure

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Distribution
 
 from framework.calibration.newton import minimise
 from framework.calibration.validation import densities, repeatable, require_numbers
 from framework.data import Batch
-from framework.distributions.tempering import log_probabilities
+from framework.distributions.tempering import RescaledClasses, log_probabilities
 from framework.model import Predictor
 from framework.target import Target
 from framework.uncertainty import Uncertainty
@@ -75,7 +75,7 @@ class Platt(Uncertainty):
             return density
         log_prob = log_probabilities(density)
         logits = self.slope * log_prob.double().clamp(min=LEAST) + self.biases
-        return Categorical(logits=logits.log_softmax(-1).to(log_prob.dtype), validate_args=False)
+        return RescaledClasses(logits.log_softmax(-1).to(log_prob.dtype), density, self.slope)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         return self.model.loss(inputs, target)

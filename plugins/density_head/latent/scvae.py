@@ -1,6 +1,7 @@
-"""The simplified conditional variational autoencoder."""
+"""The simplified conditional variational autoencoder: its decoder on one batch, and the head."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
@@ -11,14 +12,53 @@ from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
-from framework.distributions.monte_carlo import Effort
+from framework.distributions.protocol import tempered
 from framework.heads.parameters import require_finite, require_trained
 from framework.target import Target
 from plugins.density_head.latent.decoder import LatentDecoder
-from plugins.density_head.latent.scvae.density import Networks, SCVAEDensity, sampled_mixture
+from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity, sampled_mixture
+from plugins.density_head.latent.monte_carlo import Effort
 
-MODERATE = {"name": "von_mises", "floor": 1.0}
-"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
+
+@dataclass(frozen=True)
+class Networks(Latent):
+    """The decoder on one batch of inputs x; z is the noise itself.
+
+    Attributes:
+        raw: what it reads of each input, (*batch, size).
+        decode: (raw, z), broadcast against each other → the component's raw numbers (*batch, number).
+        component: raw numbers → p(φ|x,z).
+        center: zeros, (*batch, latent), of the number type of z.
+        width: activations one decoded z holds in memory.
+    """
+
+    raw: Tensor
+    decode: Callable[[Tensor, Tensor], Tensor]
+    component: Callable[[Tensor], Distribution]
+    center: Tensor
+    width: int
+
+    def central(self) -> Distribution:
+        return self.component(self.decode(self.raw, self.center))
+
+    def numbers(self, noise: Tensor) -> Tensor:
+        return self._decoded(noise.movedim(0, 1).reshape(*self.raw.shape[:-1], len(noise), noise.shape[-1]))
+
+    def _decoded(self, z: Float[Tensor, "*batch sample latent"]) -> Float[Tensor, "*batch sample number"]:
+        raw = self.raw.unsqueeze(-2)
+        return torch.cat([self.decode(raw, part) for part in z.split(self.at_once(z.shape[-2]), -2)], -2)
+
+    def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
+        raw = self.raw.reshape(-1, self.raw.shape[-1])[items]
+        return self.component(self.decode(raw, noise)).log_prob(value)
+
+    def sample(self, count: int) -> Tensor:
+        like = self.center
+        z = torch.randn(*like.shape[:-1], count, like.shape[-1], dtype=like.dtype, device=like.device)
+        return self.component(self._decoded(z)).sample().movedim(like.dim() - 1, 0)
+
+    def tempered(self, temperature: Tensor) -> "Networks":
+        return replace(self, component=lambda raw: tempered(self.component(raw), temperature))
 
 
 class SCVAEHead(DensityHead):
@@ -76,11 +116,12 @@ class SCVAEHead(DensityHead):
             number = self.decode(raw, z)
             weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
             return Mixture(weights, self.component(number))
-        networks = Networks(raw, self.decoder, self.component, self.latent, self.hidden, kind)
+        center = torch.zeros(*raw.shape[:-1], self.latent, dtype=kind, device=raw.device)
+        networks = Networks(raw, self.decoder, self.component, center, self.hidden)
         effort = Effort(self.samples, self.tolerance)
         if self.tolerance is None:
             return sampled_mixture(networks, networks.points(effort), effort)
-        return SCVAEDensity(networks, effort)
+        return LatentDensity(networks, effort)
 
     def decode(
         self, raw: Float[Tensor, "*batch size"], z: Float[Tensor, "*batch sample latent"]

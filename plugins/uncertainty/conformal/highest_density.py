@@ -2,16 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from functools import singledispatch
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.circular import grid, wrap
-from framework.distributions.density import Circular, Mixture
+from framework.distributions.batch_shapes import Reshaped
+from framework.distributions.circular import Circular, grid, wrap
+from framework.distributions.protocol import peaks
 
 FOLD = 12
 """Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
@@ -23,31 +22,6 @@ PEAKS, CANDIDATES = 8, 64
 """Peaks that get nodes of their own, and among how many they are chosen."""
 BISECTIONS = 52
 """Halvings of a cell: its ends are as exact as the number type."""
-
-
-@singledispatch
-def peaks(density: Distribution) -> Float[Tensor, "peak *batch_and_event"]:
-    """Where the density may be highest: its mode, of a mixture those of all components."""
-    return density.mode.unsqueeze(0)
-
-
-@peaks.register
-def _(density: Mixture) -> Tensor:
-    found = peaks(density.components).movedim(-1 - len(density.event_shape), 0)  # (K, peak, *batch, *event)
-    return found.flatten(0, 1)
-
-
-@peaks.register
-def _(density: Stacked) -> Tensor:
-    found = [peaks(one) for one in density.densities]
-    most = max(len(one) for one in found)
-    same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
-    return torch.stack(same, -1 - len(density.event_shape))
-
-
-@peaks.register
-def _(density: Reshaped) -> Tensor:
-    return peaks(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
 
 
 @dataclass(frozen=True)

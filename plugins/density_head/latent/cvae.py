@@ -1,24 +1,124 @@
-"""The conditional variational autoencoder head."""
+"""The conditional variational autoencoder: its networks, its two bounds as functions, and the head."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
-from framework.distributions.monte_carlo import Effort
+from framework.distributions.protocol import tempered
 from framework.heads.parameters import require_finite, require_trained
 from framework.target import Target
-from plugins.density_head.latent.cvae.density import CVAEDensity, Gaussian, Networks, evidence_bound
 from plugins.density_head.latent.decoder import LARGEST_FEATURE, LatentDecoder
+from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity
+from plugins.density_head.latent.monte_carlo import Effort
 
 LARGEST_LOG_SCALE = 7.0
 """Standard deviations of z stay within e^±7, so that no ratio of two of them overflows."""
-MODERATE = {"name": "von_mises", "floor": 1.0}
-"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A diagonal Gaussian over z: mean and log standard deviation, (*batch, latent)."""
+
+    mean: Tensor
+    log_scale: Tensor
+
+    def draw(self, count: int) -> Tensor:
+        """z of shape (count, *batch, latent), differentiable in the parameters."""
+        return self.at(torch.randn(count, *self.mean.shape, dtype=self.mean.dtype, device=self.mean.device))
+
+    def at(self, noise: Tensor) -> Tensor:
+        """z at standard normal numbers (*sample, *batch, latent)."""
+        return self.mean + self.log_scale.exp() * noise
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return self.log_prob_at((z - self.mean) * torch.exp(-self.log_scale))
+
+    def log_prob_at(self, noise: Tensor) -> Tensor:
+        """log_prob of `at(noise)`, without the cancellation in z - mean where the mean is large."""
+        return -(noise.square() / 2 + self.log_scale + math.log(2 * math.pi) / 2).sum(-1)
+
+
+def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
+    """KL(first || second), nats, (*batch,), exactly 0 of equals (Kingma & Welling 2014, appendix B)."""
+    log_ratio = 2 * (first.log_scale - second.log_scale)
+    shift = (first.mean - second.mean) * torch.exp(-second.log_scale)
+    return ((torch.expm1(log_ratio) - log_ratio + shift.square()) / 2).sum(-1)
+
+
+@dataclass(frozen=True)
+class Networks(Latent):
+    """The networks of one batch of inputs x.
+
+    Attributes:
+        prior: p(z|x), of shape (*batch, latent).
+        posterior: φ of shape (*sample, *batch, *event) → q(z|x,φ) of shape (*sample, *batch, latent).
+        decode: z of shape (*sample, *batch, latent) → the component's raw numbers (*sample, *batch, number).
+        component: raw numbers → p(φ|x,z).
+        rows: indices (rows,) into the flattened batch → the networks of these inputs.
+        width: activations one decoded z holds in memory.
+    """
+
+    prior: Gaussian
+    posterior: Callable[[Tensor], Gaussian]
+    decode: Callable[[Tensor], Tensor]
+    component: Callable[[Tensor], Distribution]
+    rows: Callable[[Tensor], "Networks"]
+    width: int
+
+    @property
+    def center(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.prior.mean
+
+    def central(self) -> Distribution:
+        return self.component(self.decode(self.center))
+
+    def numbers(self, noise: Tensor) -> Tensor:
+        z = self.prior.at(noise.reshape(len(noise), *self.center.shape))
+        return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
+
+    def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
+        return importance_log_weights(self.rows(items), value, noise)
+
+    def sample(self, count: int) -> Tensor:
+        step = self.at_once(count)
+        parts = [
+            self.component(self.decode(self.prior.draw(min(step, count - done)))).sample()
+            for done in range(0, count, step)
+        ]
+        return torch.cat(parts)
+
+    def tempered(self, temperature: Tensor) -> "Networks":
+        return replace(
+            self,
+            component=lambda raw: tempered(self.component(raw), temperature),
+            rows=lambda index: self.rows(index).tempered(temperature),
+        )
+
+
+def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> Tensor:
+    """log p(φ|x,z) p(z|x) / q(z|x,φ), nats, of z ~ q at standard normal `noise` (terms of eq. 3.19).
+
+    Shapes: value (*sample, *batch, *event), noise (*draw, *sample, *batch, latent), result (*draw, *sample, *batch).
+    """
+    posterior = networks.posterior(value)
+    z = posterior.at(noise)
+    likelihood = networks.component(networks.decode(z)).log_prob(value)
+    return likelihood + networks.prior.log_prob(z) - posterior.log_prob_at(noise)
+
+
+def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
+    """Lower bound on log p(φ|x), nats: the first term by `samples` draws, the second exactly (eq. 3.17)."""
+    posterior = networks.posterior(value)
+    likelihood = networks.component(networks.decode(posterior.draw(samples))).log_prob(value)
+    return likelihood.mean(0) - kl_divergence(posterior, networks.prior)
 
 
 class CVAEHead(DensityHead):
@@ -78,9 +178,9 @@ class CVAEHead(DensityHead):
         self.decoder = LatentDecoder(latent, hidden, component.size)
         self.size = 2 * hidden + self.decoder.size
 
-    def forward(self, raw: Float[Tensor, "*batch size"]) -> CVAEDensity:
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> LatentDensity:
         effort = Effort(self.training_samples) if self.training else Effort(self.samples, self.tolerance)
-        return CVAEDensity(self.networks(raw), effort)
+        return LatentDensity(self.networks(raw), effort)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         return -evidence_bound(self.networks(raw), target, self.training_samples)

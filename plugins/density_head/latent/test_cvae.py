@@ -10,22 +10,22 @@ from torch.distributions import kl_divergence as torch_kl_divergence
 
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
-from framework.distributions.density import Mixture, marginal
-from framework.distributions.monte_carlo import estimate
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import estimate, marginal
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.densities import integral, marginals, median_is_best, samples_follow_log_prob
 from framework.testing.finding import examined, require
 from framework.testing.heads import values
-from plugins.density_head.latent.cvae import density as module
-from plugins.density_head.latent.cvae.density import (
+from plugins.density_head.latent import density as module
+from plugins.density_head.latent.cvae import (
+    CVAEHead,
     Gaussian,
     evidence_bound,
     importance_log_weights,
     kl_divergence,
 )
-from plugins.density_head.latent.cvae.head import CVAEHead
-from plugins.density_head.latent.cvae.rows import ONE, SMALL, TWO
+from plugins.density_head.latent.rows import ONE, SMALL, TWO
 
 
 def head(config=SMALL, target=ONE):

@@ -10,14 +10,14 @@ from torch.distributions import Categorical, Independent, MultivariateNormal, No
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
-from framework.distributions.density import Mixture, circular_grid, marginal, median
-from framework.distributions.highest_density import Line
-from framework.distributions.monte_carlo import SampledMixture, estimate
-from framework.distributions.prediction_set import PredictionSet
+from framework.distributions.density import Mixture, circular_grid
+from framework.distributions.protocol import estimate, marginal, median
 from framework.distributions.tempering import temper
 from framework.errors import UserError
 from framework.target import Target
 from framework.testing.metrics import Cardioid
+from plugins.uncertainty.conformal.highest_density import Line
+from plugins.uncertainty.conformal.prediction_set import PredictionSet
 
 EVERYTHING = torch.tensor(math.inf, dtype=torch.float64)
 TURN = 2 * math.pi
@@ -79,9 +79,12 @@ def test_the_density_is_kept_to_the_last_bit(kind, score):
 
 
 def test_estimates_and_marginals_are_those_of_the_density():
-    components = Cardioid(torch.randn(4, 16, 1))
-    sampled = SampledMixture(torch.zeros(4, 16), components, 8)
+    head = build_head("scvae").eval()
+    head.samples = 16
+    with torch.no_grad():
+        sampled = head(torch.randn(4, head.size))
     found = estimate(PredictionSet(sampled, hot(1.0), "density"), torch.zeros(4, 1))
+    assert (found.standard_error > 0).all()
     assert torch.equal(found.standard_error, estimate(sampled, torch.zeros(4, 1)).standard_error)
     several = PredictionSet(Cardioid(torch.randn(4, 3)), hot(1.0), "density")
     assert type(marginal(several, 1)) is Cardioid

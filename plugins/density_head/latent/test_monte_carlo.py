@@ -6,20 +6,20 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal
 
-from framework.distributions import monte_carlo
-from framework.distributions.monte_carlo import (
+from framework.distributions.closed_forms import normal_quantile
+from framework.distributions.protocol import estimate
+from framework.errors import ConfigError
+from plugins.density_head.latent import monte_carlo
+from plugins.density_head.latent.monte_carlo import (
     Effort,
     NormalPoints,
     SampledMixture,
-    estimate,
     estimate_log_mean,
     estimated,
     estimated_error,
     lattice,
-    normal_quantile,
     rows_of,
 )
-from framework.errors import ConfigError
 
 CPU = torch.device("cpu")
 ITEMS = 60
@@ -271,16 +271,6 @@ def test_nothing_is_estimated_of_no_items():
 
         found = estimate_log_mean(nothing, 0, effort, at_once=10, device=CPU)
         assert found.log_mean.shape == found.samples.shape == (0,)
-
-
-def test_a_density_is_exact_unless_it_says_otherwise():
-    density = Independent(Normal(torch.zeros(4, 1), torch.ones(4, 1)), 1)
-    value = torch.randn(4, 1)
-    found = estimate(density, value)
-    assert torch.equal(found.log_mean, density.log_prob(value))
-    assert torch.equal(found.debiased, found.log_mean)
-    assert found.standard_error.tolist() == found.samples.tolist() == [0] * 4
-    assert not found.unresolved.any()
 
 
 def test_a_sampled_mixture_tells_its_error():

@@ -10,10 +10,11 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.batch_shapes import Reshaped
-from framework.distributions.density import Circular, Mixture, marginal, median
-from framework.distributions.highest_density import Ends, Line
-from framework.distributions.monte_carlo import Estimate, estimate
+from framework.distributions.circular import Circular
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import ValueSet, marginal, prediction_set
 from framework.errors import UserError
+from plugins.uncertainty.conformal.highest_density import Ends, Line
 
 Score = Literal["density", "mass"]
 FEW = 8
@@ -22,7 +23,7 @@ DRAWS = 1000
 """Of each density over several numbers, whose sets have no ends to find."""
 
 
-class PredictionSet(Mixture):
+class PredictionSet(Mixture, ValueSet):
     """A density, to the last bit, and the set of values whose score is at most a threshold.
 
     Scores grow as a value is less expected:
@@ -225,14 +226,9 @@ def _among(log_prob: Tensor, drawn: Float[Tensor, "draw *batch"]) -> Tensor:
     return found.movedim(-1, 0).reshape(log_prob.shape)
 
 
-@estimate.register
-def _(density: PredictionSet, value: Tensor) -> Estimate:
-    return estimate(density.density, value)
-
-
-@median.register
-def _(density: PredictionSet, samples: int) -> Tensor:
-    return median(density.density, samples)
+@prediction_set.register
+def _(density: PredictionSet) -> PredictionSet:
+    return density
 
 
 @marginal.register

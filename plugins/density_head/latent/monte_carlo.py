@@ -3,14 +3,16 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, singledispatch
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.density import CHUNK, Mixture
+from framework.distributions.closed_forms import normal_quantile
+from framework.distributions.density import Mixture, joined
+from framework.distributions.protocol import Estimate, estimate, marginal, tempered
 from framework.errors import ConfigError
 
 REPLICATES = 8
@@ -21,36 +23,6 @@ GENERATOR = 1267
 """Of the lattice; chosen by measured variance (benchmarks/latent.md)."""
 LARGEST_KEPT = 2**22
 """Numbers of normal points that a density holds (16 MiB in float32); more are computed anew for every value."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """log E w of each item as S samples tell it; all shaped alike, nats where not said otherwise.
-
-    Attributes:
-        log_mean: log of the mean weight; in expectation below the truth by about standard_error²/2 (Jensen).
-        debiased: log_mean + standard_error²/2.
-        standard_error: of log_mean; 0 of an exact number, NaN where one replicate says nothing of it, infinite where
-            all weights were 0.
-        samples: S, int64; 0 of an exact number.
-        unresolved: bool, true where a tolerance was asked for and not reached.
-    """
-
-    log_mean: Float[Tensor, "*items"]
-    debiased: Float[Tensor, "*items"]
-    standard_error: Float[Tensor, "*items"]
-    samples: Int[Tensor, "*items"]
-    unresolved: Bool[Tensor, "*items"]
-
-    def reshape(self, shape: tuple[int, ...]) -> "Estimate":
-        """The same numbers in another shape."""
-        return Estimate(
-            self.log_mean.reshape(shape),
-            self.debiased.reshape(shape),
-            self.standard_error.reshape(shape),
-            self.samples.reshape(shape),
-            self.unresolved.reshape(shape),
-        )
 
 
 @dataclass(frozen=True)
@@ -92,18 +64,6 @@ class Effort:
         return 1 << (math.ceil(self.samples / REPLICATES) - 1).bit_length()
 
 
-@singledispatch
-def estimate(density: Distribution, value: Tensor) -> Estimate:
-    """The log-density at `value` with its Monte Carlo error; one whose log_prob is sampled registers its own.
-
-    The default takes log_prob for exact: error 0 of 0 samples.
-    """
-    log_prob = density.log_prob(value)
-    nothing = torch.zeros_like(log_prob)
-    samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
-    return Estimate(log_prob, log_prob, nothing, samples, samples > 0)
-
-
 class SampledMixture(Mixture):
     """A mixture whose components stand for all of p(φ|x,z): one at each point z, with equal weights.
 
@@ -120,13 +80,24 @@ class SampledMixture(Mixture):
 
 @estimate.register
 def _(density: SampledMixture, value: Tensor) -> Estimate:
-    extra = value.dim() - len(density.batch_shape) - len(density.event_shape)
-    rows = max(1, CHUNK // max(1, density.log_weights.numel()))
-    if extra > 0 and value.shape[0] > rows and not torch.is_grad_enabled():
-        return _joined([estimate(density, part) for part in value.split(rows)])
+    parts = density.in_parts(value)
+    if len(parts) > 1:
+        return joined([estimate(density, part) for part in parts])
     log_weights = density.components.log_prob(value.unsqueeze(-1 - len(density.event_shape)))
     log_weights = log_weights.unflatten(-1, (density.replicates, -1))
     return estimated(torch.logsumexp(log_weights, -1).movedim(-1, 0), log_weights.shape[-1])
+
+
+@marginal.register
+def _(density: SampledMixture, index: int) -> Distribution:
+    return SampledMixture(density.log_weights, marginal(density.components, index), density.replicates)
+
+
+@tempered.register
+def _(density: SampledMixture, temperature: Tensor) -> Distribution:
+    """Component by component, also of classes, so that its log-density stays an estimate with its error."""
+    components = tempered(density.components, temperature)
+    return SampledMixture(density.log_weights, components, density.replicates)
 
 
 def estimated(log_sums: Float[Tensor, "replicate *items"], count: int) -> Estimate:
@@ -189,7 +160,8 @@ def estimate_log_mean(
         more = wanting & ~found.log_mean.isnan()
         if effort.replicates * done * 2 > MOST:
             more = torch.zeros_like(more)
-        finished.append((rows[~more], _picked(found, ~more, unresolved=wanting[~more])))
+        found = found._replace(unresolved=wanting)
+        finished.append((rows[~more], found.each(lambda field, chosen=~more: field[chosen])))
         if not more.any():
             break
         rows = rows[more]
@@ -197,7 +169,7 @@ def estimate_log_mean(
         log_sums = torch.logaddexp(log_sums[:, more], further)
         done *= 2
     order = torch.cat([rows for rows, _ in finished]).argsort()
-    return _picked(_joined([part for _, part in finished]), order)
+    return joined([part for _, part in finished]).each(lambda field: field[order])
 
 
 def _log_sums(
@@ -219,28 +191,6 @@ def _log_sums(
             total = part if total is None else torch.logaddexp(total, part)
         parts.append(total)
     return torch.cat(parts, -1)
-
-
-def _joined(parts: list[Estimate]) -> Estimate:
-    """Of several batches one, along the first dimension."""
-    return Estimate(
-        torch.cat([part.log_mean for part in parts]),
-        torch.cat([part.debiased for part in parts]),
-        torch.cat([part.standard_error for part in parts]),
-        torch.cat([part.samples for part in parts]),
-        torch.cat([part.unresolved for part in parts]),
-    )
-
-
-def _picked(found: Estimate, index: Tensor, unresolved: Tensor | None = None) -> Estimate:
-    """Those at `index`."""
-    return Estimate(
-        found.log_mean[index],
-        found.debiased[index],
-        found.standard_error[index],
-        found.samples[index],
-        found.unresolved[index] if unresolved is None else unresolved,
-    )
 
 
 def rows_of(
@@ -316,8 +266,3 @@ def lattice(
     # below 2^20, so that products with up to 32 digits are exact
     vector = [pow(GENERATOR, power, 2**20) for power in range(dimensions)]
     return torch.remainder(inverse[:, None] * torch.tensor(vector, dtype=torch.float64, device=device), 1.0)
-
-
-def normal_quantile(place: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """z with Φ(z) = place; places of [0, 1) closer to an end than float64 tells apart become ±8.2, never infinite."""
-    return torch.special.ndtri(place.clamp(2.0**-54, 1 - 2.0**-53))

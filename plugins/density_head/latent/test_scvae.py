@@ -6,11 +6,11 @@ import torch
 from framework.configuration.schema import build, resolve
 from framework.distributions.circular import grid
 from framework.distributions.density import Mixture
-from framework.distributions.monte_carlo import estimate
+from framework.distributions.protocol import estimate
 from framework.errors import ConfigError
 from framework.testing.heads import values
-from plugins.density_head.latent.scvae import density as module
-from plugins.density_head.latent.scvae.rows import ONE, SMALL, TWO
+from plugins.density_head.latent import density as module
+from plugins.density_head.latent.rows import ONE, SMALL, TWO
 
 
 def head(config=SMALL, target=ONE):

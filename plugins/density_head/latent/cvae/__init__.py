@@ -1,1 +1,0 @@
-"""Conditional variational autoencoder (thesis §3.5.2)."""

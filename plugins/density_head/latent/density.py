@@ -1,0 +1,176 @@
+"""The density of a latent-variable head: ∫ p(φ|x,z) p(z|x) dz, with as many samples as its error asks for."""
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.protocol import Estimate, estimate, marginal, median, tempered
+from plugins.density_head.latent.monte_carlo import (
+    Effort,
+    NormalPoints,
+    SampledMixture,
+    estimate_log_mean,
+    rows_of,
+)
+
+CHUNK = 2**22
+"""Most hidden activations held at once without gradient (16 MiB in float32)."""
+MODERATE = {"name": "von_mises", "floor": 1.0}
+"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
+
+
+class Latent(ABC):
+    """p(φ|x,z) and z for one batch of inputs x; a standard normal vector, the noise, says which z.
+
+    Attributes:
+        component: raw numbers (*batch, number) → p(φ|x,z).
+        center: z of the prior at noise 0, (*batch, latent).
+        width: activations one decoded z holds in memory.
+    """
+
+    component: Callable[[Tensor], Distribution]
+    center: Tensor
+    width: int
+
+    @abstractmethod
+    def central(self) -> Distribution:
+        """The component at noise 0, batch_shape (*batch)."""
+
+    @abstractmethod
+    def numbers(self, noise: Float[Tensor, "sample item latent"]) -> Float[Tensor, "*batch sample number"]:
+        """The component's raw numbers at z of the prior; without gradient chunk by chunk."""
+
+    @abstractmethod
+    def log_weights(
+        self, value: Tensor, items: Int[Tensor, "row"], noise: Float[Tensor, "*draw row latent"]
+    ) -> Float[Tensor, "*draw row"]:
+        """log of weights whose mean is p(φ|x), nats, of values (row, *event) and these items of the flattened batch."""
+
+    @abstractmethod
+    def sample(self, count: int) -> Tensor:
+        """`count` values of each item, (count, *batch, *event), each with a fresh z."""
+
+    @abstractmethod
+    def tempered(self, temperature: Tensor) -> "Latent":
+        """The same with tempered components."""
+
+    @property
+    def items(self) -> int:
+        return self.center.shape[:-1].numel()
+
+    def points(self, effort: Effort, kept: int = 0) -> NormalPoints:
+        """Noise of every item."""
+        dtype, device = self.center.dtype, self.center.device
+        dimensions = self.center.shape[-1]
+        return NormalPoints(self.items, effort.replicates, dimensions, dtype=dtype, device=device, kept=kept)
+
+    def at_once(self, count: int) -> int:
+        """How many of `count` z of every item to decode together; under gradient all of them."""
+        if torch.is_grad_enabled():
+            return max(1, count)
+        return max(1, CHUNK // (max(1, self.items) * self.width))
+
+
+def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> SampledMixture:
+    """A component at each of S points, with equal weights (eq. 3.21)."""
+    items = torch.arange(latent.items, device=latent.center.device)
+    number = latent.numbers(points(items, 0, effort.first).flatten(0, 1))
+    weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
+    return SampledMixture(weights, latent.component(number), effort.replicates)
+
+
+class LatentDensity(Distribution):
+    """p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
+
+    `log_prob` is the log of a mean weight at points z that are drawn once: a function of φ, with respect to the draw in
+    expectation below the truth, rising to it with the samples. With a tolerance it doubles the samples of each value
+    until the estimated error is below. `sample` draws a fresh z for every value. `entropy`, `mode`, `median` and
+    `marginal` are of `mixture`.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    has_rsample = False
+
+    def __init__(self, latent: Latent, effort: Effort) -> None:
+        self.latent = latent
+        self.effort = effort
+        # drawn now, so that nothing depends on what is asked first
+        self.points = latent.points(effort, kept=effort.first)
+        self._fixed = Effort(effort.samples)
+        self._mixture_points = latent.points(self._fixed)
+        self._example = latent.central()
+        self.has_enumerate_support = self._example.has_enumerate_support
+        super().__init__(self._example.batch_shape, self._example.event_shape, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return self._example.support  # pyright: ignore[reportReturnType]
+
+    def enumerate_support(self, expand: bool = True) -> Tensor:
+        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        return self._example.enumerate_support(expand)
+
+    @cached_property
+    def mixture(self) -> SampledMixture:
+        """Equal weights on S components with z from the prior: decoded on first use, then kept."""
+        return sampled_mixture(self.latent, self._mixture_points, self._fixed)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return estimate(self, value).log_mean
+
+    @torch.no_grad()
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape)
+        if shape.numel() == 0 or self.batch_shape.numel() == 0:
+            return self._example.sample(shape)
+        return self.latent.sample(shape.numel()).reshape(shape + self.batch_shape + self.event_shape)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.mixture.mode
+
+    def entropy(self) -> Tensor:
+        return self.mixture.entropy()
+
+
+@estimate.register
+def _(density: LatentDensity, value: Tensor) -> Estimate:
+    values, items, shape = rows_of(value, density.batch_shape, density.event_shape)
+    latent = density.latent
+
+    def log_weights(rows: Tensor, start: int, count: int) -> Tensor:
+        return latent.log_weights(values[rows], items[rows], density.points(items[rows], start, count))
+
+    at_once = CHUNK // latent.width
+    found = estimate_log_mean(
+        log_weights, len(items), density.effort, at_once=at_once, device=latent.center.device
+    )
+    return found.each(lambda field: field.reshape(shape))
+
+
+@marginal.register
+def _(density: LatentDensity, index: int) -> Distribution:
+    return marginal(density.mixture, index)
+
+
+@median.register
+def _(density: LatentDensity, samples: int) -> Tensor:
+    return median(density.mixture, samples)
+
+
+@tempered.register
+def _(density: LatentDensity, temperature: Tensor) -> LatentDensity:
+    """Component by component, at the same points."""
+    changed = copy.copy(density)
+    changed.__dict__.pop("mixture", None)  # that of the untempered components, where it was asked for
+    changed.latent = density.latent.tempered(temperature)
+    changed._example = tempered(density._example, temperature)
+    if temperature.requires_grad:
+        changed.effort = density._fixed  # what a tolerance draws in rounds would all be held
+    return changed

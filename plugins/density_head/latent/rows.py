@@ -1,0 +1,148 @@
+"""Rows of the contract: CVAEs, with their sums written out in NumPy sample by sample."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from scipy import special, stats
+from torch import nn
+
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.finding import SEED
+from framework.testing.rows import Case, HeadRow
+from plugins.density_head.latent.cvae import LARGEST_LOG_SCALE, CVAEHead
+from plugins.density_head.latent.decoder import LatentDecoder
+from plugins.density_head.latent.monte_carlo import Effort, NormalPoints
+from plugins.density_head.latent.scvae import SCVAEHead
+
+ONE, TWO = Target("angle", ("azimuth",)), Target("angle", ("azimuth", "elevation"))
+CLASSES = Target("class", ("a", "b", "c"))
+SMALL = {"latent": 2, "hidden": 16, "training_samples": 5, "samples": 50}
+
+
+def component(head: CVAEHead | SCVAEHead, number: np.ndarray, value: np.ndarray) -> float:
+    """One component's log-density; its own rows check it."""
+    return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
+
+
+def through(layers: nn.Sequential, numbers: np.ndarray) -> np.ndarray:
+    """What a network of linear layers and rectifiers makes of a vector."""
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            numbers = layer.weight.detach().numpy() @ numbers + layer.bias.detach().numpy()
+        else:
+            numbers = np.maximum(numbers, 0)
+    return numbers
+
+
+def decoded(decoder: LatentDecoder, raw: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The component's raw numbers at one z (plugins.density_head.latent.decoder), layer by layer."""
+    features, shared, turned = np.split(raw, np.cumsum(decoder.parts)[:2])
+    spread = decoder.spread.detach().numpy() + turned.reshape(decoder.spread.shape)
+    layer = features + decoder.from_latent.weight.detach().numpy() @ z
+    return through(decoder.body, layer) + shared + spread @ z
+
+
+def gaussian(layers: nn.Sequential, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of z."""
+    mean, log_scale = np.split(through(layers, numbers), 2)
+    return mean, np.exp(LARGEST_LOG_SCALE * np.tanh(log_scale / LARGEST_LOG_SCALE))
+
+
+def log_weights(
+    head: CVAEHead | SCVAEHead, raw: np.ndarray, value: np.ndarray, noise: np.ndarray
+) -> list[float]:
+    """log of the importance weights of one item (eq. 3.19) at standard normal noise (sample, latent); of a simplified
+    CVAE the noise is z, and the weights are the terms of eq. 3.21."""
+    if isinstance(head, SCVAEHead):
+        return [component(head, decoded(head.decoder, raw, one), value) for one in noise]
+    for_prior, for_posterior, for_decoder = np.split(raw, [head.hidden, 2 * head.hidden])
+    prior = gaussian(head.prior, for_prior)
+    seen = head.from_value.weight.detach().numpy() @ np.concatenate([np.cos(value), np.sin(value)])
+    posterior = gaussian(head.posterior, for_posterior + seen)
+    found = []
+    for one in noise:
+        z = posterior[0] + posterior[1] * one
+        ratio = (stats.norm.logpdf(z, *prior) - stats.norm.logpdf(z, *posterior)).sum()
+        found.append(component(head, decoded(head.decoder, for_decoder, z), value) + ratio)
+    return found
+
+
+def stiff(head: DensityHead) -> Iterator[Case]:
+    """Ordinary raw numbers, and hard ones.
+
+    Of a CVAE large: narrow components, a narrow prior, an encoder that misses it. Of a simplified one narrow components
+    and targets far from all of them.
+    """
+    assert isinstance(head, CVAEHead | SCVAEHead)
+    generator = torch.Generator().manual_seed(7)
+    ordinary = torch.randn(4, head.size, generator=generator)
+    value = 3 * torch.randn(4, head.component.size // 3, generator=generator).double()
+    if isinstance(head, CVAEHead):
+        name, hard = "large", 8 * ordinary.double()
+    else:
+        name, hard = "narrow and far", ordinary.clone()
+        hard[:, head.hidden :] *= 10
+    effort, latent = Effort(head.samples), head.decoder.spread.shape[-1]
+    for case, raw in {"ordinary": ordinary.double(), name: hard.double()}.items():
+        torch.manual_seed(SEED)  # as before the density is built
+        points = NormalPoints(4, effort.replicates, latent, dtype=torch.float64, device=raw.device)
+        noise = points(torch.arange(4), 0, effort.first).flatten(0, 1).numpy()
+        terms = [
+            log_weights(head, raw[item].numpy(), value[item].numpy(), noise[:, item]) for item in range(4)
+        ]
+        log_prob = special.logsumexp(np.array(terms) - math.log(head.samples), axis=1)
+        yield Case(case, raw, value, torch.tensor(np.array(log_prob), dtype=torch.float64))
+
+
+DRAWN = {"median": 0.02}
+"""Of 2000 draws."""
+BOUND = {
+    "integral": "log_prob is a lower bound, loose with an untrained encoder; test_cvae.py integrates the mixture",
+    "samples follow log_prob": "they follow the mixture, and log_prob is a bound on it",
+    "entropy": "that of the mixture",
+    "mode": "that of the mixture",
+    "median": "that of the mixture",
+    "marginals": "those of the mixture",
+}
+ADAPTIVE_BOUND = {
+    **BOUND,
+    "float32 against float64": "either may stop a round of samples before the other",
+    "finite for any raw numbers": "slow: most of them take every sample there is; the other rows see them",
+}
+ADAPTIVE = {
+    "float32 against float64": "either may stop a round of samples before the other",
+    "samples follow log_prob": "the samples do not depend on the tolerance",
+    "entropy": "that of the mixture",
+    "median": "that of the mixture",
+}
+MIXTURES = {**SMALL, "component": {"name": "mixture", "components": 2}}
+OF_CLASSES = {**SMALL, "component": {"name": "categorical"}}
+TOLERANT = {**SMALL, "latent": 1, "tolerance": 0.05}
+
+ROWS = {
+    "cvae": (
+        HeadRow("one angle", ONE, SMALL, cases=stiff, leave_out=BOUND),
+        HeadRow("two angles", TWO, SMALL, cases=stiff, leave_out=BOUND),
+        HeadRow("mixtures", ONE, MIXTURES, leave_out=BOUND),
+        HeadRow("classes", CLASSES, OF_CLASSES, leave_out=BOUND),
+        HeadRow("to 0.05 nats", ONE, TOLERANT, leave_out=ADAPTIVE_BOUND),
+    ),
+    "scvae": (
+        HeadRow("one angle", ONE, SMALL, cases=stiff, limits=DRAWN),
+        HeadRow("two angles", TWO, SMALL, cases=stiff),
+        HeadRow(
+            "one sample",
+            ONE,
+            {**SMALL, "samples": 1, "training_samples": 1},
+            cases=stiff,
+            # nothing is averaged: what float32 rounds of the one z, times a narrow component's slope, stays (7e-6)
+            limits={**DRAWN, "log_prob, float32": 1e-5},
+        ),
+        HeadRow("mixtures", ONE, MIXTURES, limits=DRAWN),
+        HeadRow("classes", CLASSES, OF_CLASSES),
+        HeadRow("to 0.05 nats", ONE, TOLERANT, limits={"integral": 0.05, "mode": 0.3}, leave_out=ADAPTIVE),
+    ),
+}

@@ -1,1 +1,0 @@
-"""Simplified conditional variational autoencoder (thesis §3.5.2)."""
