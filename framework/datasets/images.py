@@ -20,6 +20,7 @@ from rich.progress import Progress
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 
@@ -210,6 +211,49 @@ def load(
     return Crops([crops[index] for index in good], **kept), reasons
 
 
+def load_splits(
+    crops: Mapping[str, Sequence[Crop]],
+    fields: Mapping[str, Mapping[str, Tensor]],
+    faults: Sequence[DataError] = (),
+    *,
+    skip_unreadable: bool,
+    generated_in: Path | None = None,
+) -> tuple[dict[str, Fields | Crops], int]:
+    """Every split's data set of the crops that can be read, and how many samples cannot.
+
+    Args:
+        crops, fields: by the split's name.
+        faults: of samples whose labels could not be read.
+        generated_in: the cache folder of generated images; None: they are the user's.
+
+    Raises:
+        DataError: samples cannot be read and are not to be skipped; names the first ten.
+    """
+    every = [crop for chosen in crops.values() for crop in chosen]
+    total = len(faults) + len(every)
+    in_memory = not every or fit_in_memory(total, every[0].side, every[0].channels)
+    loaded = {
+        split: load(chosen, fields[split], f"the {split} images", in_memory=in_memory)
+        for split, chosen in crops.items()
+    }
+    faults = [*faults, *(fault for _, bad in loaded.values() for fault in bad)]
+    if faults and not skip_unreadable:
+        remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
+        if generated_in is not None:
+            remedy = f"Delete {generated_in}: the data are generated anew."
+        raise DataError(fault_message(faults, total, remedy))
+    return {split: table for split, (table, _) in loaded.items()}, len(faults)
+
+
+def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Tensor]:
+    """The fields "target" (radians in [-π, π), one column a name) and "group" (0) of samples with these angles."""
+    turned = [[(angle + math.pi) % (2 * math.pi) - math.pi for angle in row] for row in angles]
+    return {
+        "target": torch.tensor(turned, dtype=torch.float32).reshape(len(angles), len(names)),
+        "group": torch.zeros(len(angles), dtype=torch.int64),
+    }
+
+
 def unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
     """A user's own images, "input" and "index", in their order.
 
@@ -240,6 +284,23 @@ def listed(items: Sequence[object]) -> str:
     if len(items) > 10:
         lines.append(f"and {len(items) - 10} more")
     return "".join(f"\n  {line}" for line in lines)
+
+
+def varied(batch: Batch, signs: Sequence[float], jitter: float) -> Batch:
+    """A training batch whose images are varied as `augmented` does; with `signs`, half of them are mirrored too.
+
+    A mirror image's angles are those of the image times `signs`, one number (1 or -1) an angle.
+    """
+    if not signs and not jitter:
+        return batch
+    target = batch["target"]
+    mirrored = (torch.rand(len(target)) < 0.5) & bool(signs)
+    turned = target * torch.tensor(signs or 1.0).to(target)
+    return {
+        **batch,
+        "input": augmented(batch["input"], mirrored, jitter),
+        "target": torch.where(mirrored.to(target.device)[:, None], turned, target),
+    }
 
 
 def augmented(
