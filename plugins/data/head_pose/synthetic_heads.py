@@ -89,7 +89,7 @@ class Conditions(NamedTuple):
 
 
 def person(random: Generator) -> Person:
-    """Anybody."""
+    """A random person: head shape, skin, hair and what is worn, drawn from the generator."""
     tone = int(random.integers(5))
     long_hair, bald, hat = random.random() < 0.3, random.random() < 0.1, random.random() < 0.15
     covered = long_hair and not bald

@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.errors import DataError
+from plugins.data.head_pose.archive import wrong_layout
 from plugins.data.head_pose.labelled_images import SPLIT_SEED, Labelled
 
+FOLDER = "TownCentreHeadImages"
 TRAIN_SHARE, VALIDATION_SHARE = 0.8, 0.1
 
 
@@ -37,12 +39,8 @@ def find_heads(root: Path) -> Found:
     """All heads in a root, in the order of their names.
 
     Raises:
-        DataError: the folder is missing, or holds no folder with label files.
+        DataError: it holds no folder with label files.
     """
-    if not root.is_dir():
-        raise DataError(
-            f"data.root = {root}: no such folder; wanted the unpacked TownCentreHeadImages, or null."
-        )
     found = Found([], 0, [])
     invalid, labels = 0, 0
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
@@ -61,12 +59,7 @@ def find_heads(root: Path) -> Found:
             except DataError as error:
                 found.faults.append(error)
     if not labels:
-        inner = root / "TownCentreHeadImages"
-        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
-        raise DataError(
-            f"data.root = {root} is not laid out as TownCentreHeadImages: no folder in it holds a label file "
-            f"`<image>.txt`.{hint}"
-        )
+        raise wrong_layout(root, FOLDER, "folder in it holds a label file `<image>.txt`")
     return found._replace(invalid=invalid)
 
 
