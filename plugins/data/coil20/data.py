@@ -1,4 +1,4 @@
-"""COIL-20, real objects on a turntable; the contract is framework.data's."""
+"""Reads COIL-20, real objects on a turntable; the contract is framework.data's."""
 
 import hashlib
 import math
@@ -107,7 +107,7 @@ class COIL20(Data):
         return {**batch, "input": images.augmented(batch["input"], never, self.jitter)}
 
     def _interpolated(self, batch: Batch) -> Batch:
-        """The same objects, each turned by up to half a step between two training views."""
+        """Turn each object of a batch by up to half a step between two training views."""
         target = batch["target"]
         shift = (torch.rand(len(target), 1, device=target.device) - 0.5) * math.radians(self.every)
         turned = target + shift

@@ -1,4 +1,4 @@
-"""Where the images of a head pose data set lie: in the unpacked archive, or drawn into the cache in its layout."""
+"""Finds the images of a data set: in the unpacked archive, or drawn into the cache in the archive's layout."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Archive(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """The folder `root` of a user, or where that is None so many images drawn from a seed."""
+    """A user's folder `root` or, where that is None, a folder of so many images drawn from a seed."""
 
     archive: Archive
     root: str | None
@@ -46,7 +46,7 @@ class Source:
     seed: int
 
     def folder(self) -> Path:
-        """The folder to read; it is drawn now unless it is there.
+        """Check the user's folder, or draw the images unless they are there; the folder to read.
 
         Raises:
             DataError: the user's folder is missing or lacks a part, or the cache cannot be written or holds something
@@ -70,7 +70,7 @@ class Source:
         return generated.generated(place, mark, lambda root: self.archive.draw(root, self.images, self.seed))
 
     def generated_in(self) -> Path | None:
-        """The cache folder that holds what was drawn; None for a user's folder."""
+        """Name the cache folder that holds what was drawn; None for a user's folder."""
         return cache.folder(self.archive.name) if self.root is None else None
 
     def fingerprint(self, synthetic: bool) -> dict[str, str]:
@@ -94,7 +94,7 @@ class Source:
 
 
 def wrong_layout(root: Path, folder: str, missing: str) -> DataError:
-    """What to raise for a folder that does not hold what the archive unpacks to `folder`."""
+    """Make the complaint about a root that does not hold what the archive unpacks to `folder`."""
     inner = root / folder
     hint = f"Did you mean {inner}?" if inner.is_dir() else "Unpack the whole archive there."
     return DataError(f"data.root = {root} is not laid out as {folder}: no {missing}. {hint}")
@@ -107,7 +107,7 @@ def draw_train_and_test(
     what: str,
     draw: Callable[[int], tuple[str, NDArray[np.uint8], Label]],
 ) -> dict[str, list[Label]]:
-    """Write so many JPEG images into train/ and test/; the labels of both, in the images' order.
+    """Write so many JPEG images into train/ and test/, and give the labels of both in the images' order.
 
     Args:
         train_share: share of the images, the first ones, that are for training.

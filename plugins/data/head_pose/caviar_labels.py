@@ -1,4 +1,4 @@
-"""The folder of the CAVIAR crops and its label file, `or_label.mat`: MATLAB 5.
+"""Reads and writes the label file of the CAVIAR crops, `or_label.mat`: MATLAB 5.
 
 Its struct arrays `or_label_train` and `or_label_test` have one element an image, whose fields are by their order gaze
 (degrees), x, y, size and name without suffix; what the fields are called does not matter.
@@ -30,7 +30,7 @@ class Label(NamedTuple):
 
 
 def read_labels(file: Path) -> dict[str, list[Label]]:
-    """The labels of "train" and "test", in the file's order.
+    """Read the labels of "train" and "test", in the file's order.
 
     Raises:
         DataError: the file cannot be read, lacks a struct array, or one of its elements is no label.

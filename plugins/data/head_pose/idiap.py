@@ -99,13 +99,13 @@ class Idiap(Data):
 
 
 def pose(random: np.random.Generator) -> Pose:
-    """Where a person at a table looks, mostly forwards and down."""
+    """Draw where a person at a table looks, mostly forwards and down."""
     pan, tilt, roll = random.normal((0, -8, 0), (35, 14, 10)).clip((-90, -60, -45), (90, 45, 45))
     return Pose(float(pan), float(tilt), float(roll))
 
 
 def people(seed: int) -> list[Person]:
-    """Who sits there, in both splits: frames of the same recordings."""
+    """Draw who sits there; the same people are in both splits, as in frames of the same recordings."""
     return [synthetic_heads.person(np.random.default_rng([seed, 1, number])) for number in range(PEOPLE)]
 
 

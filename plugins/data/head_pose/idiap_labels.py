@@ -1,4 +1,4 @@
-"""The folder of the IDIAP crops and its label file, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
+"""Reads and writes the label file of the IDIAP crops, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
 
 In it the groups `or_label_train` and `or_label_test` are struct arrays: each of their fields pan, tilt, roll and name
 holds one reference an image, to a number or to UTF-16 text.
@@ -30,7 +30,7 @@ class Label(NamedTuple):
 
 
 def read_labels(file: Path, angles_in: Literal["radians", "degrees"]) -> dict[str, list[Label]]:
-    """The labels of "train" and "test", in the file's order, angles in radians.
+    """Read the labels of "train" and "test", in the file's order, angles in radians.
 
     Raises:
         DataError: it is no such file, a field is missing or of another length, or the angles are not `angles_in`.
@@ -68,7 +68,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
-    """What a field's references lead to; a struct of one element holds its value itself."""
+    """Read what a field's references lead to; a struct of one element holds its value itself."""
     values = field[()]
     if field.dtype != h5py.ref_dtype:
         return [values]

@@ -1,4 +1,4 @@
-"""Whole images with angles, in three splits: what a data set does once it knows which image has which label."""
+"""Reads whole images with angles in three splits, once a data set knows which image has which label."""
 
 import hashlib
 import math
@@ -18,7 +18,7 @@ from framework.errors import DataError
 
 SPLITS = Splits._fields
 SPLIT_SEED = 13
-"""That of the thesis authors' code, for NumPy's legacy generator."""
+"""The seed of the thesis authors' code, for NumPy's legacy generator."""
 
 
 class Labelled(NamedTuple):
@@ -48,7 +48,7 @@ class Reading:
         return Crop(file, None, 0.0, self.image_size, blur=self.test_blur if split == "test" else 0.0)
 
     def own(self, files: Sequence[Path]) -> Fields | Crops:
-        """A user's own files without labels, turned as their EXIF entries say."""
+        """Read a user's own files without labels, turned as their EXIF entries say."""
         return images.unlabelled(
             [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
         )
@@ -69,7 +69,7 @@ class Loaded(NamedTuple):
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
-    """Validation and test halves of what was published as one test set, as the thesis authors' code draws them."""
+    """Halve what was published as one test set into validation and test, as the thesis authors' code does."""
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]
     return shuffled[: len(samples) // 2], shuffled[len(samples) // 2 :]

@@ -22,7 +22,7 @@ from plugins.data.head_pose.towncentre_labels import FOLDER, by_person, find_hea
 
 SIDE = 50  # pixels
 EACH = 8
-"""Images of a person."""
+"""So many images show the same person."""
 CONDITIONS = Conditions(
     pixels=(20, 46), height=(0.5, 0.66), offset=0.05, blur=0.9, noise=0.05, clutter=6, occluded=0.12
 )
@@ -97,7 +97,7 @@ class TownCentre(Data):
 
 
 def pose(heading: float, random: np.random.Generator) -> Pose:
-    """Where a person looks who walks towards `heading`, degrees."""
+    """Draw where a person looks who walks towards `heading`, degrees."""
     pan = heading + random.normal(0, 35)
     return Pose(float(pan), float(random.normal(0, 6)), float(random.normal(0, 4)))
 

@@ -1,4 +1,4 @@
-"""The folders of the TownCentre heads: one a person, and in it for each image a text file with its label.
+"""Reads the folders of the TownCentre heads: one a person, and in it for each image a text file with its label.
 
 `<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0; the image is the other file whose name
 starts with `<stem>`, and the second of the parts of its name that `_` separates is the person's number.
@@ -36,7 +36,7 @@ class Found(NamedTuple):
 
 
 def find_heads(root: Path) -> Found:
-    """All heads in a root, in the order of their names.
+    """Find all heads in a root, in the order of their names.
 
     Raises:
         DataError: it holds no folder with label files.
@@ -64,7 +64,7 @@ def find_heads(root: Path) -> Found:
 
 
 def read_label(file: Path) -> tuple[float, bool]:
-    """Pan in degrees, and whether the image may be used.
+    """Read pan in degrees, and whether the image may be used.
 
     Raises:
         DataError: the file cannot be read, or its lines are others.
@@ -85,7 +85,7 @@ def read_label(file: Path) -> tuple[float, bool]:
 
 
 def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
-    """The image of a label: of those that start with its stem, the one that does not go on with a digit."""
+    """Find the image of a label: of those that start with its stem, the one that does not go on with a digit."""
     stem = text.removesuffix(".txt")
     names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:
@@ -107,7 +107,7 @@ def _person(image: Path) -> int:
 
 
 def by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
-    """The splits by person, 80, 10 and 10 % of them, as the thesis authors' code draws them."""
+    """Split the people, 80, 10 and 10 % of them, as the thesis authors' code does."""
     people = np.unique([head.person for head in heads])
     drawn = np.random.RandomState(SPLIT_SEED).rand(len(people))
     share = dict(zip(people.tolist(), drawn.tolist(), strict=True))
@@ -124,5 +124,5 @@ def _split(share: float) -> str:
 
 
 def label_text(pan: float, valid: bool) -> str:
-    """A label file's content; `pan` in degrees."""
+    """Write the content of a label file; `pan` in degrees."""
     return f"pan = {pan:+.2f}\nvalid = {int(valid)}\n"

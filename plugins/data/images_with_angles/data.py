@@ -1,4 +1,4 @@
-"""A user's own images and angles; the contract is framework.data's."""
+"""Reads a user's own images and angles; the contract is framework.data's."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""PASCAL3D+ as labelled crops; the contract is framework.data's."""
+"""Reads PASCAL3D+ as labelled crops; the contract is framework.data's."""
 
 import hashlib
 from collections import Counter
@@ -27,7 +27,7 @@ from plugins.data.pascal3d.layout import CLASSES, Annotation
 
 SPLIT_SEED = 13  # that of the thesis authors' code
 MIRRORED = (-1.0, 1.0, -1.0)
-"""Times azimuth, elevation and tilt: where the mirror image of a mirror-symmetric object shows that object."""
+"""A mirror image of a mirror-symmetric object multiplies azimuth, elevation and tilt by these."""
 
 
 class Sample(NamedTuple):
@@ -55,7 +55,7 @@ class Framing:
         return Crop(annotation.image, annotation.box, self.margin, self.image_size)
 
     def scale(self, box: Box) -> float:
-        """Pixels of the input for each pixel of the picture."""
+        """Say how many pixels of the input show one pixel of the picture."""
         left, top, right, bottom = box
         return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
 
@@ -138,7 +138,7 @@ class Pascal3D(Data):
         self._digest = _digest(samples)
 
     def _roots(self) -> dict[str, Path]:
-        """Every class and where its data lie; they are generated here where no root is given."""
+        """Find where the data of every class lie, and generate them where no root is given."""
         for category in self.categories:
             if category not in CLASSES:
                 raise DataError(
@@ -166,7 +166,7 @@ class Pascal3D(Data):
         include_occluded: bool,
         faults: list[DataError],
     ) -> Iterator[Annotation]:
-        """The objects of a split that the protocol keeps; what cannot be read is added to `faults`."""
+        """Read the objects of a split that the protocol keeps; what cannot be read is added to `faults`."""
         names = [(source, name) for source, file in lists for name in layout.read_list(root / file)]
         for source, name in dict.fromkeys(names):
             try:
@@ -234,7 +234,7 @@ class Pascal3D(Data):
 
 
 def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
-    """Why the protocol leaves an object out; None: it does not."""
+    """Say why the protocol leaves an object out; None where it does not."""
     if annotation.angles is None:
         return "without a fine label"
     if annotation.difficult:
@@ -245,7 +245,7 @@ def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | N
 
 
 def validation_files(annotations: Sequence[Annotation], share: float) -> set[Path]:
-    """The files held out of training: whole images, so that no image is in both splits."""
+    """Choose the files held out of training: whole images, so that no image is in both splits."""
     files = sorted({annotation.file for annotation in annotations})
     order = np.random.default_rng(SPLIT_SEED).permutation(len(files))
     return {files[index] for index in order[: round(share * len(files))]}
@@ -266,7 +266,7 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
 
 
 def _digest(samples: Mapping[str, Sequence[Sample]]) -> str:
-    """A hash over the names, boxes and labels of every split."""
+    """Hash the names, boxes and labels of every split."""
     digest = hashlib.sha256()
     for split, chosen in samples.items():
         for annotation, _ in chosen:
