@@ -13,7 +13,12 @@ from framework.target import Target
 
 Batch = dict[str, Tensor]
 """Named fields of a batch, first dimension the samples: "input"; "target" (radians for angles); "index", int64, the
-sample's number in its split; "group", int64 index into `Data.groups`; and what a plugin adds, said in its README."""
+sample's number in its split; "group", int64 index into `Data.groups`; and what a plugin adds, said in its README.
+
+Optional is "symmetry", int64, set by a data set that knows it (generated objects, say) and read by the pictures of
+densities: n where the object looks the same after 1/n of a turn about its vertical axis, so that n values of the
+first angle are equally right; 1 where none is, as where the field is missing; 0 where any turn looks the same, so that
+there is no direction."""
 
 
 class Splits(NamedTuple):

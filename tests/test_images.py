@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from framework.datasets import images
-from framework.datasets.images import Crop, augmented, picture, square
+from framework.datasets.images import Crop, augmented, picture, square, varied
 from framework.errors import DataError
 
 
@@ -225,6 +225,24 @@ def test_augmented_against_scipy() -> None:
 def test_augmented_takes_an_empty_batch() -> None:
     none = torch.empty((0, 3, 8, 8), dtype=torch.uint8)
     assert augmented(none, torch.empty(0, dtype=torch.bool), 0.1).shape == (0, 3, 8, 8)
+
+
+def test_augmentation_mirrors_half_of_a_batch_and_signs_its_angles() -> None:
+    torch.manual_seed(0)
+    pixels = torch.randint(0, 256, (200, 3, 8, 8), dtype=torch.uint8)
+    batch = {"input": pixels, "target": torch.rand(200, 2) + 0.1, "index": torch.arange(200)}
+    result = varied(batch, (-1.0, 1.0), 0.0)
+    flipped = (255 * result["input"] - pixels.flip(-1)).abs().amax((1, 2, 3)) < 0.01
+    same = (255 * result["input"] - pixels).abs().amax((1, 2, 3)) < 0.01
+    assert torch.all(same ^ flipped)
+    assert 70 < int(flipped.sum()) < 130
+    expected = torch.where(flipped[:, None], batch["target"] * torch.tensor([-1.0, 1.0]), batch["target"])
+    assert torch.equal(result["target"], expected)
+    assert result["index"] is batch["index"]
+    assert varied(batch, (), 0.0) is batch
+    shaken = varied(batch, (), 0.1)
+    assert torch.equal(shaken["target"], batch["target"])
+    assert not torch.equal(255 * shaken["input"], pixels.float())
 
 
 def test_picture_of_grey_and_of_floating_point_images() -> None:

@@ -388,19 +388,35 @@ def test_a_metric_of_the_results_ranks_its_own_way(
         comparison.rank(tmp_path, given, [], "acuracy")
 
 
-def test_jobs_of_two_commands_in_one_folder_are_told_apart(tmp_path: Path) -> None:
-    given = [["x=1", "size=32"], ["x=1", "size=16"], ["x=1"]]
-    for number, overrides in enumerate(given):
-        results = {"method": "m", "data": "d", "seed": 0, "milliseconds_per_sample": number + 1.0}
-        home = tmp_path / str(number)
+def compared(folder: Path, *jobs: tuple[str, list[str]]) -> list[dict[str, str]]:
+    """The lines of comparison.csv of completed jobs, whose data and overrides are given; the first took 1 ms."""
+    for number, (data, overrides) in enumerate(jobs):
+        results = {"method": "m", "data": data, "seed": 0, "milliseconds_per_sample": number + 1.0}
+        home = folder / str(number)
         home.mkdir()
         (home / "results.json").write_text(json.dumps({**results, "columns": {}, "better": {}}))
         (home / "job.json").write_text(json.dumps({"status": "completed", "overrides": overrides}))
-    comparison.summarise(tmp_path, given[1:2])
-    with (tmp_path / "comparison.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    comparison.summarise(folder, [jobs[1][1]])
+    with (folder / "comparison.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_jobs_of_two_commands_in_one_folder_are_told_apart(tmp_path: Path) -> None:
+    rows = compared(tmp_path, ("d", ["x=1", "size=32"]), ("d", ["x=1", "size=16"]), ("d", ["x=1"]))
     assert [row["size"] for row in rows] == ["32", "16", ""]
     assert [float(row["milliseconds_per_sample"]) for row in rows] == [1.0, 2.0, 3.0]
+
+
+def test_what_the_data_column_says_already_is_left_out(tmp_path: Path) -> None:
+    jobs = [(kind, [f"data.kind={kind}", f"size={size}"]) for kind in ("a", "b") for size in (8, 16)]
+    rows = compared(tmp_path, *jobs)
+    assert [(row["data"], row["size"]) for row in rows] == [("a", "8"), ("a", "16"), ("b", "8"), ("b", "16")]
+    assert "kind" not in rows[0]
+
+
+def test_a_key_that_varies_within_the_data_is_shown(tmp_path: Path) -> None:
+    rows = compared(tmp_path, ("a", ["kind=x"]), ("a", ["kind=y"]), ("b", ["kind=x"]))
+    assert [row["kind"] for row in rows] == ["x", "y", "x"]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """From constructor signatures to checked configs: every fault becomes a sentence."""
 
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -37,6 +38,25 @@ class Toy(Encoder):
         return inputs
 
 
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """A value: its fields are keys of the config."""
+
+    side: Annotated[int, Field(ge=8)] = 48
+    label: str
+    inner: Encoder | None = None
+
+
+class Framed(Toy):
+    """A class of one value, whose default changes one of the value's own."""
+
+    def __init__(
+        self, input_shape: tuple[int, ...], *, width: int = 2, frame: Frame = Frame(side=75, label="as given")
+    ) -> None:
+        super().__init__(input_shape, width=width)
+        self.frame = frame
+
+
 class Demanding(Toy):
     """Asks the framework for something nobody has."""
 
@@ -46,7 +66,7 @@ class Demanding(Toy):
 
 @pytest.fixture(autouse=True)
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
-    classes = {"toy": Toy, "demanding": Demanding}
+    classes = {"toy": Toy, "demanding": Demanding, "framed": Framed}
 
     def load(group: str, name: str) -> type:
         if name not in classes:
@@ -100,6 +120,20 @@ def test_parts_are_resolved_and_built_with_the_same_context() -> None:
 def test_a_fault_becomes_a_sentence(config: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         resolve("encoder", config)
+
+
+def test_the_fields_of_a_value_are_keys_beside_the_others() -> None:
+    assert resolve("encoder", "framed") == {
+        "name": "framed", "width": 2, "side": 75, "label": "as given", "inner": None,
+    }  # fmt: skip
+    config = resolve("encoder", {"name": "framed", "label": "mine", "inner": "toy"})
+    built = build("encoder", config, input_shape=(1,))
+    assert (built.width, built.frame.side, built.frame.label) == (2, 75, "mine")
+    assert isinstance(built.frame.inner, Toy)  # a part within a value
+    with pytest.raises(ConfigError, match=r"encoder\.side = 4"):
+        resolve("encoder", {"name": "framed", "side": 4})
+    with pytest.raises(ConfigError, match=r"encoder\.frame: unknown key"):
+        resolve("encoder", {"name": "framed", "frame": {"side": 80}})
 
 
 def test_a_constructor_that_asks_for_the_unknown_is_told_what_there_is() -> None:

@@ -3,7 +3,9 @@
 The rule of constructors: parameters before `*` come from the framework and are filled by name (`target`,
 `input_shape`, `model`); keyword-only parameters come from the config, are checked against their annotations
 and have their defaults there. A keyword-only parameter annotated with an abstract base is a *part*: the config
-names it, it is built from that base's registry and arrives ready.
+names it, it is built from that base's registry and arrives ready. One annotated with a dataclass of keyword-only
+fields is a *value*: its fields stand in the config beside the other keys, and it arrives made of them; the
+parameter's own default, where it has one, gives the keys their defaults.
 """
 
 import inspect
@@ -11,6 +13,7 @@ import re
 import types
 import typing
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from functools import cache
 from typing import Any
 
@@ -99,6 +102,8 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
                 f"it may ask for: {', '.join(context) or 'nothing'}. Keyword-only parameters come from the config."
             )
         given.append(context[parameter.name])
+    for key, kind in _values(cls).items():
+        values[key] = kind(**{field: values.pop(field) for field in _signature(kind)})
     return cls(*given, **values)
 
 
@@ -154,7 +159,10 @@ def parts(cls: type) -> dict[str, Part]:
 def _model(cls: type) -> type[BaseModel]:
     fields: dict[str, Any] = {}
     for name, (annotation, default) in _signature(cls).items():
-        fields[name] = (Any if name in parts(cls) else annotation, default)
+        fields[name] = (
+            Any if name in parts(cls) else annotation,
+            Field() if default is inspect.Parameter.empty else default,
+        )
     return create_model(
         cls.__name__,
         __config__=ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=()),
@@ -163,13 +171,30 @@ def _model(cls: type) -> type[BaseModel]:
 
 
 def _signature(cls: type) -> dict[str, tuple[Any, Any]]:
-    hints = typing.get_type_hints(cls.__init__, include_extras=True)
+    """Annotation and default of every key that `cls` has in the config."""
     found = {}
-    for parameter in inspect.signature(cls.__init__).parameters.values():
-        if parameter.kind is parameter.KEYWORD_ONLY:
-            default = parameter.default if parameter.default is not parameter.empty else Field()
-            found[parameter.name] = (hints.get(parameter.name, Any), default)
+    for name, (annotation, default) in _keywords(cls).items():
+        if name in _values(cls):
+            fields = _signature(annotation)
+            found |= {key: (kind, getattr(default, key, own)) for key, (kind, own) in fields.items()}
+        else:
+            found[name] = annotation, default
     return found
+
+
+def _values(cls: type) -> dict[str, type]:
+    keywords = _keywords(cls).items()
+    return {name: kind for name, (kind, _) in keywords if isinstance(kind, type) and is_dataclass(kind)}
+
+
+def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
+    """Annotation and default of every keyword-only parameter."""
+    hints = typing.get_type_hints(cls.__init__, include_extras=True)
+    return {
+        parameter.name: (hints.get(parameter.name, Any), parameter.default)
+        for parameter in inspect.signature(cls.__init__).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    }
 
 
 def _positional(cls: type) -> list[inspect.Parameter]:

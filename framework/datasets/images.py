@@ -1,4 +1,4 @@
-"""Images on the way to a network: reading files, square crops, data sets of crops, augmentation, pictures."""
+"""Reads image files, cuts squares out of them, makes data sets of the squares, and varies, blurs and shows them."""
 
 import math
 import os
@@ -20,13 +20,14 @@ from rich.progress import Progress
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 
 READERS = min(8, os.cpu_count() or 1)
-"""Threads that decode at once."""
+"""So many threads decode at once."""
 IN_MEMORY = 2 * 2**30
-"""Bytes of crops up to which they are kept in memory."""
+"""Crops of up to so many bytes are kept in memory."""
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom in pixels from the outer corner: (0, 0, width, height) is the whole image."""
@@ -55,7 +56,7 @@ class Crop:
     blur: float = 0.0
 
     def read(self) -> UInt8[Tensor, "channels side side"]:
-        """The pixels.
+        """Read the file and cut the square out of it.
 
         Raises:
             DataError: the file is missing, is no image, is cut short, or the box lies outside the image.
@@ -87,7 +88,7 @@ class Crop:
 
 @contextmanager
 def opened(file: Path) -> Iterator[Image.Image]:
-    """An image file for the time of decoding it.
+    """Open an image file for the time of decoding it.
 
     Raises:
         DataError: the file is missing, is no image, or is cut short; names it.
@@ -107,7 +108,7 @@ def opened(file: Path) -> Iterator[Image.Image]:
 
 
 def _plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
-    """Decoded to RGB or grey with eight bits, whatever it was stored as; the transparent becomes white."""
+    """Decode an image to RGB or grey with eight bits, however it was stored; transparent pixels become white."""
     whole = ImageOps.exif_transpose(image) if upright else image
     if whole.mode == "F":
         raise ValueError("its pixels are floating-point numbers of unknown range; wanted 8 or 16 bits")
@@ -119,7 +120,7 @@ def _plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
 
 
 def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
-    """The square around a box, (channels, side, side), low-pass filtered; None: the box is empty.
+    """Cut out the square around a box, (channels, side, side), low-pass filtered; None where the box is empty.
 
     The box is first clipped to the image. Where the square reaches beyond it, border pixels are repeated.
     """
@@ -149,7 +150,7 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
 
 
 def clipped(box: Box, size: tuple[int, int]) -> Box | None:
-    """The part of a box within an image of (width, height); None: there is none, or it is not finite."""
+    """Cut a box at the borders of an image of (width, height); None where nothing is left, or it is not finite."""
     if not all(map(math.isfinite, box)):
         return None
     width, height = map(float, size)
@@ -158,7 +159,7 @@ def clipped(box: Box, size: tuple[int, int]) -> Box | None:
 
 
 class Crops(Dataset[dict[str, Tensor]]):
-    """Crops that are read when they are asked for, beside fields that are in memory.
+    """Reads each crop when it is asked for; the other fields are in memory.
 
     Items raise a DataError where a file cannot be read.
     """
@@ -177,7 +178,7 @@ class Crops(Dataset[dict[str, Tensor]]):
 def load(
     crops: Sequence[Crop], fields: Mapping[str, Tensor], what: str, *, in_memory: bool
 ) -> tuple[Fields | Crops, list[DataError]]:
-    """A data set of the crops that can be read ("input", their `fields`, "index"), and the others' faults.
+    """Make a data set of the crops that can be read ("input", their `fields`, "index"), and list the others' faults.
 
     In memory everything is decoded now. Otherwise only the files' headers are read, and damage further on
     shows when a crop is used. A progress bar says that `what` is read, on a terminal.
@@ -210,8 +211,51 @@ def load(
     return Crops([crops[index] for index in good], **kept), reasons
 
 
+def load_splits(
+    crops: Mapping[str, Sequence[Crop]],
+    fields: Mapping[str, Mapping[str, Tensor]],
+    faults: Sequence[DataError] = (),
+    *,
+    skip_unreadable: bool,
+    generated_in: Path | None = None,
+) -> tuple[dict[str, Fields | Crops], int]:
+    """Make a data set of each split's crops that can be read, and count the samples that cannot.
+
+    Args:
+        crops, fields: by the split's name.
+        faults: of samples whose labels could not be read.
+        generated_in: the cache folder of generated images; None: they are the user's.
+
+    Raises:
+        DataError: samples cannot be read and are not to be skipped; names the first ten.
+    """
+    every = [crop for chosen in crops.values() for crop in chosen]
+    total = len(faults) + len(every)
+    in_memory = not every or fit_in_memory(total, every[0].side, every[0].channels)
+    loaded = {
+        split: load(chosen, fields[split], f"the {split} images", in_memory=in_memory)
+        for split, chosen in crops.items()
+    }
+    faults = [*faults, *(fault for _, bad in loaded.values() for fault in bad)]
+    if faults and not skip_unreadable:
+        remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
+        if generated_in is not None:
+            remedy = f"Delete {generated_in}: the data are generated anew."
+        raise DataError(fault_message(faults, total, remedy))
+    return {split: table for split, (table, _) in loaded.items()}, len(faults)
+
+
+def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Tensor]:
+    """Make "target" (radians in [-π, π), a column for each name) and "group" (0) of samples with these angles."""
+    turned = [[(angle + math.pi) % (2 * math.pi) - math.pi for angle in row] for row in angles]
+    return {
+        "target": torch.tensor(turned, dtype=torch.float32).reshape(len(angles), len(names)),
+        "group": torch.zeros(len(angles), dtype=torch.int64),
+    }
+
+
 def unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
-    """A user's own images, "input" and "index", in their order.
+    """Make a data set, "input" and "index", of a user's own images in their order.
 
     Raises:
         DataError: there are none, or some cannot be read; names the first ten.
@@ -230,24 +274,41 @@ def fit_in_memory(crops: int, side: int, channels: int) -> bool:
 
 
 def fault_message(faults: Sequence[DataError], total: int, remedy: str) -> str:
-    """How many samples cannot be read, at most ten of the reasons, and what to do."""
+    """Say how many samples cannot be read, at most ten of the reasons, and what to do."""
     return f"{len(faults)} of {total} samples cannot be read:{listed(faults)}\n{remedy}"
 
 
 def listed(items: Sequence[object]) -> str:
-    """At most ten of the items, each on a line of its own, and how many more there are."""
+    """List at most ten of the items, each on a line of its own, and say how many more there are."""
     lines = [str(item) for item in items[:10]]
     if len(items) > 10:
         lines.append(f"and {len(items) - 10} more")
     return "".join(f"\n  {line}" for line in lines)
 
 
+def varied(batch: Batch, signs: Sequence[float], jitter: float) -> Batch:
+    """Vary the images of a training batch as `augmented` does and, where there are `signs`, mirror half of them.
+
+    A mirrored image's angles are multiplied by `signs`, 1 or -1 for each angle.
+    """
+    if not signs and not jitter:
+        return batch
+    target = batch["target"]
+    mirrored = (torch.rand(len(target)) < 0.5) & bool(signs)
+    turned = target * torch.tensor(signs or 1.0).to(target)
+    return {
+        **batch,
+        "input": augmented(batch["input"], mirrored, jitter),
+        "target": torch.where(mirrored.to(target.device)[:, None], turned, target),
+    }
+
+
 def augmented(
     images: Shaped[Tensor, "batch channels height width"], mirrored: Bool[Tensor, "batch"], jitter: float
 ) -> Float[Tensor, "batch channels height width"]:
-    """Images varied at random, values 0…1, on their device.
+    """Vary images at random; the values are 0…1, on the images' device.
 
-    Those `mirrored` names are reflected left to right. Every image is shifted and scaled by up to `jitter` of
+    Those that `mirrored` marks are reflected left to right. Every image is shifted and scaled by up to `jitter` of
     its side (linear interpolation, border pixels repeated), made brighter or darker by up to `jitter`, and
     its contrast changed by up to twice that. Random numbers come from torch's global CPU generator.
     """
@@ -257,7 +318,8 @@ def augmented(
     sign = 1 - 2 * mirrored.to("cpu", torch.float32)
     rows = _positions(height, scale, amount[1] * height).to(images.device)
     columns = _positions(width, sign * scale, amount[2] * width).to(images.device)
-    # Whole lines are copied fastest: columns are interpolated as rows of the transposed image.
+    # Whole lines are copied fastest: columns are interpolated as rows of the transposed image. kornia's warp_affine
+    # agrees to 0.01 grey levels and takes twice to five times as long (batches of 48 to 75 pixels, one thread).
     image = _interpolated(images.transpose(2, 3), columns)
     image = _interpolated(image.transpose(2, 3), rows)
 
@@ -268,14 +330,14 @@ def augmented(
 
 
 def _positions(length: int, scale: Tensor, shift: Tensor) -> Float[Tensor, "batch length"]:
-    """Where each of `length` pixels comes from: scaled about the middle, kept within the image."""
+    """Say where each of `length` pixels comes from: scaled about the middle, kept within the image."""
     middle = (length - 1) / 2
     offset = torch.arange(length, dtype=torch.float32) - middle
     return (middle + shift[:, None] + scale[:, None] * offset).clamp(0, length - 1)
 
 
 def _interpolated(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor:
-    """Each image's lines at fractional `rows`, as float32."""
+    """Interpolate each image's lines at fractional `rows`, as float32."""
     batch, channels, height, width = images.shape
     lines = images.reshape(-1, width)
     plane = height * torch.arange(batch * channels, device=images.device).view(batch, channels, 1)
@@ -291,7 +353,7 @@ def _interpolated(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor
 def blurred(
     images: Shaped[Tensor, "*batch height width"], deviation: float
 ) -> Shaped[Tensor, "*batch height width"]:
-    """Images convolved with a Gaussian of standard deviation `deviation` pixels, 0 or more; 0: the images themselves.
+    """Convolve images with a Gaussian of standard deviation `deviation` pixels; 0 gives the images themselves.
 
     The kernel ends at four deviations and sums to 1; beyond the border the image is mirrored about its edge
     (d c b a | a b c d | d c b a). The result has the images' type; whole numbers are rounded.
@@ -302,12 +364,14 @@ def blurred(
     height, width = images.shape[-2:]
     down = _smoothing(height, deviation).to(exact)
     across = _smoothing(width, deviation).to(exact)
-    smooth = down @ exact @ across.mT  # separable: G(x, y) = g(x) g(y)
+    # Separable: G(x, y) = g(x) g(y). Two products of matrices cost the same whatever the deviation; kornia's
+    # gaussian_blur2d takes 2 to 70 times as long, has not this border, and refuses kernels larger than the image.
+    smooth = down @ exact @ across.mT
     return smooth if images.is_floating_point() else smooth.round_().to(images.dtype)
 
 
 def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
-    """The Gaussian filter of a line of `length` pixels as a matrix, float64."""
+    """Write the Gaussian filter of a line of `length` pixels as a matrix, float64."""
     reach = int(4 * deviation + 0.5)
     offsets = torch.arange(-reach, reach + 1)
     weights = (-0.5 * (offsets.double() / deviation).square()).exp()
@@ -319,7 +383,7 @@ def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
 
 
 def picture(image: Tensor) -> NDArray[np.uint8]:
-    """One image (channels, height, width), uint8 or float in 0…1, as (height, width, 3) uint8."""
+    """Turn one image (channels, height, width), uint8 or float in 0…1, into (height, width, 3) uint8."""
     pixels = image.detach().cpu()
     if pixels.is_floating_point():
         pixels = (255 * pixels.clamp(0, 1)).round().to(torch.uint8)

@@ -1,4 +1,4 @@
-"""Reading MATLAB 5 files that may be damaged.
+"""Reads MATLAB 5 files that may be damaged.
 
 SciPy's reader can crash the process on a file with a wrong byte in it (seen with SciPy 1.17). So the file's outline
 is checked first: what MATLAB compressed has a checksum, and of what is not compressed every element must be of a
@@ -21,7 +21,7 @@ PLAIN_TYPES = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
 
 
 def read_variables(file: Path, names: list[str]) -> dict[str, Any]:
-    """The named variables of a file that is whole, structs as `scipy.io.matlab.mat_struct`, squeezed.
+    """Read the named variables of a file that is whole, structs as `scipy.io.matlab.mat_struct`, squeezed.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -75,7 +75,7 @@ def _check_element(content: bytes, kind: int, start: int, end: int, order: str) 
 
 
 def _element(content: bytes, position: int, limit: int, order: str) -> tuple[int, int, int]:
-    """Type, first byte and end of the data of the element at `position`, which lies before `limit`."""
+    """Read the tag of the element at `position`: its type, and the first byte and end of its data, before `limit`."""
     if position + 8 > limit:
         raise ValueError(f"the file ends within an element at byte {position}")
     kind, size = struct.unpack_from(f"{order}II", content, position)

@@ -68,7 +68,8 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         # also those of another command's jobs in this folder: what tells rows apart must be told
         keys = _varied([*overrides, *(row["overrides"] for row in rows)])
         rows = [{**dict.fromkeys(keys), **row} for row in rows]
-        by = ["method", "data", *(key for key in keys if key not in ("seed", "experiment", "data.category"))]
+        shown = (key for key in keys if key not in ("seed", "experiment") and not _repeats_data(rows, key))
+        by = ["method", "data", *shown]
         columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
         # a column that no job has a number for says nothing (what only some classes have, say)
         columns = {
@@ -228,6 +229,12 @@ def _varied(overrides: Sequence[Sequence[str]]) -> list[str]:
             key, _, value = override.lstrip("+~").partition("=")
             seen.setdefault(key, set()).add(value)
     return [key for key, values in seen.items() if len(values) > 1]
+
+
+def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
+    """Whether the column `key` varies but adds nothing to the column `data`, each value of which has one of `key`."""
+    pairs = {(row["data"], row[key]) for row in rows}
+    return len({value for _, value in pairs}) > 1 and len({data for data, _ in pairs}) == len(pairs)
 
 
 def _picture(rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path) -> list[Path]:

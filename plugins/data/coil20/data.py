@@ -1,4 +1,4 @@
-"""COIL-20, real objects on a turntable; the contract is framework.data's."""
+"""Reads COIL-20, real objects on a turntable; the contract is framework.data's."""
 
 import hashlib
 import math
@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets import images
 from framework.datasets.fields import Fields
 from framework.datasets.images import Crop
@@ -69,7 +69,9 @@ class COIL20(Data):
         self.groups = GROUPS
         self.synthetic = False
         self.skipped = 0
-        self._tables = [self._table(views, alike, split == number) for number in range(3)]
+        self._tables = {
+            name: self._table(views, alike, split == number) for number, name in enumerate(Splits._fields)
+        }
         self._training = training
         self._weights = spline_weights(VIEWS // stride)
         self._alike = [number + 1 for number in alike.nonzero()[:, 0].tolist()]
@@ -88,14 +90,8 @@ class COIL20(Data):
             index=torch.arange(objects * count),
         )
 
-    def train(self) -> Dataset[Batch]:
-        return self._tables[0]
-
-    def validation(self) -> Dataset[Batch]:
-        return self._tables[1]
-
-    def test(self) -> Dataset[Batch]:
-        return self._tables[2]
+    def splits(self) -> Splits:
+        return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return images.unlabelled(
@@ -111,7 +107,7 @@ class COIL20(Data):
         return {**batch, "input": images.augmented(batch["input"], never, self.jitter)}
 
     def _interpolated(self, batch: Batch) -> Batch:
-        """The same objects, each turned by up to half a step between two training views."""
+        """Turn each object of a batch by up to half a step between two training views."""
         target = batch["target"]
         shift = (torch.rand(len(target), 1, device=target.device) - 0.5) * math.radians(self.every)
         turned = target + shift
@@ -126,16 +122,11 @@ class COIL20(Data):
         }
 
     def fingerprint(self) -> Mapping[str, str]:
-        sizes = {
-            name: str(len(table))
-            for name, table in zip(("train", "validation", "test"), self._tables, strict=True)
-        }
-        alike = " ".join(map(str, self._alike))
         return {
             "root": str(self.root),
             "version": "COIL-20",
-            **sizes,
-            "look_alikes": alike,
+            **{name: str(len(table)) for name, table in self._tables.items()},
+            "look_alikes": " ".join(map(str, self._alike)),
             "sha256": self._digest,
         }
 

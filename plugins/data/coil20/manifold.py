@@ -7,11 +7,11 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 FINE = 1440
-"""Angles at which the curve is tabulated: every quarter of a degree."""
+"""The curve is tabulated at so many angles: every quarter of a degree."""
 
 
 def spline_weights(views: int) -> Float[Tensor, "fine views"]:
-    """Row i: the weights of equally spaced views in the periodic cubic spline through them, i/FINE of a turn on.
+    """Weigh equally spaced views so that row i is the periodic cubic spline through them at (i + 1/2)/FINE of a turn.
 
     (Murase & Nayar 1995, §2.2, there in an eigenspace; a spline is linear in its points, so the space is no matter.)
     """
@@ -21,7 +21,7 @@ def spline_weights(views: int) -> Float[Tensor, "fine views"]:
 
 
 def look_alikes(views: Float[Tensor, "object view 1 side side"]) -> Bool[Tensor, "object"]:
-    """Whether views half a turn apart are nearer (root mean square) than neighbouring ones, on the mean."""
+    """Find objects whose views half a turn apart are nearer (root mean square, on the mean) than neighbouring ones."""
     flat = views.flatten(2)
     half = (flat - flat.roll(flat.shape[1] // 2, 1)).square().mean(-1).sqrt().mean(-1)
     next_view = (flat - flat.roll(1, 1)).square().mean(-1).sqrt().mean(-1)

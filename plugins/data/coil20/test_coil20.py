@@ -46,7 +46,7 @@ def test_views_angles_and_splits(root):
     views = torch.from_numpy(turntable())
     sizes = []
     seen = torch.zeros(20, 72, dtype=torch.int64)
-    for split, residues in ((coil.train(), {0}), (coil.validation(), {2}), (coil.test(), {1, 3})):
+    for split, residues in zip(coil.splits(), ({0}, {2}, {1, 3}), strict=True):
         sizes.append(len(split))
         batch = split.__getitems__(range(len(split)))
         view = (batch["target"][:, 0].double() / math.radians(5)).round().long() % 72
@@ -65,7 +65,7 @@ def test_the_processed_images_are_read_like_the_matlab_file(root, tmp_path):
     one, other = data(root), data(tmp_path)
     one.prepare()
     other.prepare()
-    assert torch.equal(one.train().fields["input"], other.train().fields["input"])
+    assert torch.equal(one.splits().train.fields["input"], other.splits().train.fields["input"])
     (tmp_path / "obj7__3.png").unlink()
     with pytest.raises(DataError, match=r"obj7__3\.png is missing"):
         data(tmp_path).prepare()
@@ -76,7 +76,7 @@ def test_objects_that_repeat_after_half_a_turn_are_found(tmp_path):
     views[[2, 9]] = turntable(symmetric=True)[[2, 9]]
     coil = data(as_matlab(tmp_path, views))
     coil.prepare()
-    batch = coil.test().fields
+    batch = coil.splits().test.fields
     assert set(batch["object"][batch["group"] == 1].tolist()) == {2, 9}
     assert coil.groups == ("unique", "look-alikes")
     assert coil.fingerprint()["look_alikes"] == "3 10"
@@ -95,7 +95,7 @@ def test_the_spline_passes_through_its_views_and_closes():
 def test_interpolated_views_show_the_object_at_their_angle(root):
     coil = data(root, jitter=0.0)
     coil.prepare()
-    batch = coil.train().__getitems__(range(360))
+    batch = coil.splits().train.__getitems__(range(360))
     torch.manual_seed(0)
     turned = coil.augment(batch)
     shift = torch.remainder(turned["target"] - batch["target"] + math.pi, 2 * math.pi) - math.pi
@@ -114,22 +114,21 @@ def test_interpolated_views_show_the_object_at_their_angle(root):
 def test_without_interpolation_and_jitter_a_batch_stays_as_it_is(root):
     coil = data(root, jitter=0.0, interpolate=False)
     coil.prepare()
-    batch = coil.train().__getitems__([5, 7])
+    batch = coil.splits().train.__getitems__([5, 7])
     assert coil.augment(batch) is batch
 
 
 def test_views_are_resized(root):
     coil = data(root, image_size=48)
     coil.prepare()
-    assert coil.train()[0]["input"].shape == coil.input_shape == (1, 48, 48)
+    assert coil.splits().train[0]["input"].shape == coil.input_shape == (1, 48, 48)
 
 
 @pytest.mark.parametrize("every, training", [(15, 24), (60, 6)])
 def test_other_steps(root, every, training):
     coil = data(root, every=every)
     coil.prepare()
-    assert (len(coil.train()), len(coil.validation())) == (20 * training, 20 * training)
-    assert len(coil.test()) == 20 * (72 - 2 * training)
+    assert [*map(len, coil.splits())] == [20 * training, 20 * training, 20 * (72 - 2 * training)]
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")

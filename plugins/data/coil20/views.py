@@ -1,4 +1,4 @@
-"""Reading COIL-20 as it is distributed: one MATLAB file, or the folder of processed images."""
+"""Reads COIL-20 as it is distributed: one MATLAB file, or the folder of processed images."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ WANTED = (
 
 
 def read_views(root: str | None, side: int) -> UInt8[Tensor, "object view 1 side side"]:
-    """Every view of every object, view k at 5k degrees.
+    """Read every view of every object, view k at 5k degrees.
 
     Raises:
         DataError: no root, neither layout in it, a file missing, unreadable or of another shape.

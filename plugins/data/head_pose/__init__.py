@@ -1,1 +1,1 @@
-"""Head pose from images: IDIAP, TownCentre and CAVIAR."""
+"""Head pose from images: IDIAP, TownCentre and CAVIAR as published, and generators that write their layouts."""

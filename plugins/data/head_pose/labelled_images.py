@@ -1,26 +1,24 @@
-"""Whole images with angles, in three splits: what a loader does once it knows which image has which label."""
+"""Reads whole images with angles in three splits, once a data set knows which image has which label."""
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
+from pydantic import Field
 
-from framework.data import Batch
+from framework.data import Splits
 from framework.datasets import images
 from framework.datasets.fields import Fields
 from framework.datasets.images import Crop, Crops
 from framework.errors import DataError
-from framework.storage import cache
 
-SPLITS = ("train", "validation", "test")
+SPLITS = Splits._fields
 SPLIT_SEED = 13
-"""That of the thesis authors' code, for NumPy's legacy generator."""
+"""The seed of the thesis authors' code, for NumPy's legacy generator."""
 
 
 class Labelled(NamedTuple):
@@ -30,119 +28,90 @@ class Labelled(NamedTuple):
     angles: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Splits:
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How images are read: whole, squared by repeating their border, and scaled.
+
+    Attributes:
+        image_size: side of the square, pixels.
+        test_blur: standard deviation of a Gaussian that blurs the test images, pixels of the square.
+        jitter: how far training images are shifted, scaled and made brighter or darker, as a share.
+        skip_unreadable: leave images out that cannot be read, and count them.
+    """
+
+    image_size: Annotated[int, Field(ge=8, le=1024)] = 50
+    test_blur: Annotated[float, Field(ge=0, le=1024, allow_inf_nan=False)] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08
+    skip_unreadable: bool = False
+
+    def crop(self, file: Path, split: str) -> Crop:
+        return Crop(file, None, 0.0, self.image_size, blur=self.test_blur if split == "test" else 0.0)
+
+    def own(self, files: Sequence[Path]) -> Fields | Crops:
+        """Read a user's own files without labels, turned as their EXIF entries say."""
+        return images.unlabelled(
+            [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
+        )
+
+
+class Loaded(NamedTuple):
     """What can be trained on and tested with.
 
     Attributes:
-        tables: the fields "input" (uint8, colour, side × side), "target" (radians in [-π, π)), "group" (0) and
-            "index" of every split.
+        tables: the fields "input" (uint8, colour), "target" (radians in [-π, π)), "group" (0) and "index" by split.
         skipped: how many images were left out because they could not be read.
-        digest: a hash over the names and labels of every split.
+        fingerprint: the splits' sizes, the test blur, and a hash over names and labels.
     """
 
     tables: Mapping[str, Fields | Crops]
     skipped: int
-    digest: str
-
-    def sizes(self) -> dict[str, str]:
-        return {split: str(len(table)) for split, table in self.tables.items()}
-
-    def fingerprint(
-        self, root: str | None, generator_seed: int, version: str, test_blur: float
-    ) -> dict[str, str]:
-        """What tells one state of a data set from another; `root` None: generated."""
-        return {
-            "root": f"synthetic, seed {generator_seed}" if root is None else root,
-            "version": version,
-            **self.sizes(),
-            "test_blur": str(test_blur),
-            "sha256": self.digest,
-        }
-
-
-def remedy(root: str | None, name: str) -> str:
-    """What to do about unreadable images of the data set `name`, as a sentence; `root` None: generated."""
-    if root is None:
-        return f"Delete {cache.folder(name)}: the data are generated anew."
-    return "Restore them, or set data.skip_unreadable=true to leave them out."
+    fingerprint: dict[str, str]
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
-    """Validation and test halves of what was published as one test set, as the thesis authors' code draws them."""
+    """Halve what was published as one test set into validation and test, as the thesis authors' code does."""
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]
     return shuffled[: len(samples) // 2], shuffled[len(samples) // 2 :]
 
 
-def read_splits(
+def load(
     samples: Mapping[str, Sequence[Labelled]],
-    faults: Sequence[DataError],
+    names: Sequence[str],
+    reading: Reading,
+    faults: Sequence[DataError] = (),
     *,
-    side: int,
-    test_blur: float,
-    skip_unreadable: bool,
-    remedy: str,
+    generated_in: Path | None,
     left_out: str = "",
-) -> Splits:
-    """Read all images, those of the test split blurred by a Gaussian of `test_blur` pixels of the input.
+) -> Loaded:
+    """Read the images of all splits.
 
     Args:
+        names: of the angles.
         faults: labels that could not be read; they count as unreadable images.
-        remedy: what to do about unreadable images, as a sentence.
+        generated_in: the cache folder of generated images; None: they are the user's.
         left_out: what else is missing from the splits, for the complaint about an empty one.
 
     Raises:
         DataError: an angle is not finite, images cannot be read and are not to be skipped, or a split is empty.
     """
     _refuse_wrong_labels(samples)
-    faults = list(faults)
+    tables, skipped = images.load_splits(
+        {split: [reading.crop(sample.file, split) for sample in samples[split]] for split in SPLITS},
+        {split: images.angle_fields([sample.angles for sample in samples[split]], names) for split in SPLITS},
+        faults,
+        skip_unreadable=reading.skip_unreadable,
+        generated_in=generated_in,
+    )
     total = len(faults) + sum(map(len, samples.values()))
-    in_memory = images.fit_in_memory(total, side, 3)
-    tables = {}
-    for split in SPLITS:
-        chosen = samples[split]
-        blur = test_blur if split == "test" else 0.0
-        # whole, and squared by repeating the border
-        crops = [Crop(sample.file, None, 0.0, side, blur=blur) for sample in chosen]
-        angles = [[(a + math.pi) % (2 * math.pi) - math.pi for a in sample.angles] for sample in chosen]
-        fields = {
-            "target": torch.tensor(angles, dtype=torch.float32).reshape(len(chosen), -1 if chosen else 1),
-            "group": torch.zeros(len(chosen), dtype=torch.int64),
-        }
-        tables[split], bad = images.load(crops, fields, f"the {split} images", in_memory=in_memory)
-        faults += bad
-    if faults and not skip_unreadable:
-        raise DataError(images.fault_message(faults, total, remedy))
     for split, table in tables.items():
         if len(table) == 0:
             raise DataError(
-                f"The {split} split is empty ({total} images in all, {len(faults)} unreadable{left_out}). "
+                f"The {split} split is empty ({total} images in all, {skipped} unreadable{left_out}). "
                 "Restore what is missing, or use other data."
             )
-    return Splits(tables, len(faults), _digest(samples))
-
-
-def own(file: Path, side: int) -> Crop:
-    """A user's own image file, turned as its EXIF entry says."""
-    return Crop(file, None, 0.0, side, upright=True)
-
-
-def varied(batch: Batch, names: Sequence[str], mirrored: Sequence[str], jitter: float) -> Batch:
-    """A training batch as `images.augmented` varies it; where `mirrored` names angles, half of it is mirrored too.
-
-    `names` are the target's; the `mirrored` of them change their sign in a mirror image.
-    """
-    if not mirrored and not jitter:
-        return batch
-    chosen = (torch.rand(len(batch["target"])) < 0.5) & bool(mirrored)
-    target: Tensor = batch["target"]
-    signs = torch.tensor([-1.0 if name in mirrored else 1.0 for name in names]).to(target)
-    return {
-        **batch,
-        "input": images.augmented(batch["input"], chosen, jitter),
-        "target": torch.where(chosen.to(target.device)[:, None], target * signs, target),
-    }
+    sizes = {split: str(len(table)) for split, table in tables.items()}
+    return Loaded(tables, skipped, {**sizes, "test_blur": str(reading.test_blur), "sha256": _digest(samples)})
 
 
 def _refuse_wrong_labels(samples: Mapping[str, Sequence[Labelled]]) -> None:

@@ -19,10 +19,10 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 VERSION = 1
-"""Of what is drawn; a change takes a new number, which the marks of generated data hold."""
+"""The version of what is drawn; a change takes a new number, which the marks of generated data hold."""
 Array = NDArray[np.float64]
 SAMPLES = 2
-"""Rays along each side of a pixel."""
+"""So many rays are cast along each side of a pixel."""
 CLOTH, SKIN, HAIR = 0, 1, 2
 EYE, EYE_HEIGHT, MOUTH_HEIGHT = 0.31, 0.12, -0.52
 SKINS = ((0.93, 0.76, 0.66), (0.85, 0.65, 0.52), (0.70, 0.50, 0.38), (0.52, 0.35, 0.26), (0.40, 0.27, 0.20))
@@ -89,7 +89,7 @@ class Conditions(NamedTuple):
 
 
 def person(random: Generator) -> Person:
-    """Anybody."""
+    """A random person: head shape, skin, hair and what is worn, drawn from the generator."""
     tone = int(random.integers(5))
     long_hair, bald, hat = random.random() < 0.3, random.random() < 0.1, random.random() < 0.15
     covered = long_hair and not bald
@@ -124,7 +124,7 @@ def rotation(pose: Pose) -> Array:
 def photograph(
     random: Generator, who: Person, pose: Pose, side: int, conditions: Conditions
 ) -> NDArray[np.uint8]:
-    """A picture of somebody's head, (side, side, 3)."""
+    """Photograph a person's head, (side, side, 3)."""
     pixels = int(random.integers(conditions.pixels[0], conditions.pixels[1] + 1))
     scale = 0.5 * pixels * random.uniform(*conditions.height)  # camera pixels per half height
     middle = 0.5 * pixels + pixels * random.uniform(-1, 1, 2) * conditions.offset
@@ -153,7 +153,7 @@ def rendered(
     light: Array,
     strength: float,
 ) -> Array:
-    """Head, neck and shoulders alone, (pixels, pixels, 4): colour times cover, and cover, 0…1.
+    """Render head, neck and shoulders alone, (pixels, pixels, 4): colour times cover, and cover, 0…1.
 
     Args:
         scale: pixels per half height.
@@ -178,7 +178,7 @@ def rendered(
 
 
 def _ellipsoids(who: Person, head: Array, torso: Array) -> list[tuple[Array, Array, Array, int]]:
-    """Centre, matrix to the unit ball, colour and kind of every part."""
+    """List the centre, the matrix to the unit ball, the colour and the kind of every part."""
     parts: list[tuple[Array, Array, Array, int]] = []
 
     def add(
@@ -315,12 +315,12 @@ def _paint_face(point, look, color):
 
 
 def _muted(random: Generator) -> Array:
-    """A colour (3,) of any brightness and little saturation, as most things have."""
+    """Draw a colour (3,) of any brightness and little saturation, as most things have."""
     return np.clip(random.uniform(0.1, 0.9) + random.normal(0, 0.05, 3), 0, 1)
 
 
 def background(random: Generator, pixels: int, clutter: int) -> Array:
-    """Smooth noise between two colours with up to `clutter` shapes before it, (pixels, pixels, 3)."""
+    """Draw smooth noise between two colours with up to `clutter` shapes before it, (pixels, pixels, 3)."""
     first = _muted(random)
     second = np.clip(first + random.normal(0, 0.2) + random.normal(0, 0.04, 3), 0, 1)
     cells = int(random.integers(2, 7))
@@ -335,7 +335,7 @@ def background(random: Generator, pixels: int, clutter: int) -> Array:
 
 
 def _hidden(random: Generator, picture: Array, middle: Array, scale: float) -> Array:
-    """The picture with something before part of the head; `scale` pixels per half height, `middle` of the head."""
+    """Put something before part of the head, which is at `middle` and has `scale` pixels per half height."""
     pixels = len(picture)
     turn, reach = random.uniform(0, 2 * math.pi), random.uniform(0.8, 1.3)
     place = middle + reach * scale * np.array([0.8 * math.cos(turn), math.sin(turn)])
@@ -344,7 +344,7 @@ def _hidden(random: Generator, picture: Array, middle: Array, scale: float) -> A
 
 
 def _shape(random: Generator, pixels: int, place: Array, size: Array) -> NDArray[np.bool_]:
-    """The mask of an ellipse or rectangle of half lengths `size` about `place` (column, row), turned."""
+    """Mask a turned ellipse or rectangle of half lengths `size` about `place` (column, row)."""
     rows, columns = np.mgrid[:pixels, :pixels] + 0.5
     turn = random.uniform(0, math.pi)
     right, down = columns - place[0], rows - place[1]

@@ -1,23 +1,21 @@
-"""A user's own images and angles; the contract is framework.data's."""
+"""Reads a user's own images and angles; the contract is framework.data's."""
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets import images
 from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
 from framework.target import Target
-from plugins.data.images_with_angles.table import SPLITS, Row, read_table
+from plugins.data.images_with_angles.table import SPLITS, read_table
 
 
 class ImagesWithAngles(Data):
@@ -72,63 +70,35 @@ class ImagesWithAngles(Data):
         self.input_shape = (self.channels, self.image_size, self.image_size)
         self.groups = (root.resolve().name,)
         self.synthetic = False
-        self._signs = torch.tensor([-1.0 if name in self.mirror else 1.0 for name in table.columns])
+        self._signs = [-1.0 if name in self.mirror else 1.0 for name in table.columns] if self.mirror else []
         self._digest = hashlib.sha256(repr(table).encode()).hexdigest()
-        self._read(root, table.rows)
-
-    def _read(self, root: Path, rows: Sequence[Row]) -> None:
-        in_memory = images.fit_in_memory(len(rows), self.image_size, self.channels)
-        faults: list[DataError] = []
-        self._tables = {}
-        for split in SPLITS:
-            chosen = [row for row in rows if row.split == split]
-            crops = [self._crop(root / row.file) for row in chosen]
-            angles = [[(a + math.pi) % (2 * math.pi) - math.pi for a in row.angles] for row in chosen]
-            fields = {
-                "target": torch.tensor(angles, dtype=torch.float32).reshape(
-                    len(chosen), len(self.target.names)
-                ),
-                "group": torch.zeros(len(chosen), dtype=torch.int64),
-            }
-            self._tables[split], bad = images.load(crops, fields, f"the {split} images", in_memory=in_memory)
-            faults += bad
-        if faults and not self.skip_unreadable:
-            remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
-            raise DataError(images.fault_message(faults, len(rows), remedy))
-        self.skipped = len(faults)
-        for split, table in self._tables.items():
-            if len(table) == 0:
+        chosen = {split: [row for row in table.rows if row.split == split] for split in SPLITS}
+        self._tables, self.skipped = images.load_splits(
+            {split: [self._crop(root / row.file) for row in rows] for split, rows in chosen.items()},
+            {
+                split: images.angle_fields([row.angles for row in rows], table.columns)
+                for split, rows in chosen.items()
+            },
+            skip_unreadable=self.skip_unreadable,
+        )
+        for split, found in self._tables.items():
+            if len(found) == 0:
                 raise DataError(
-                    f"The {split} split is empty ({len(rows)} images in all, {self.skipped} unreadable). Add "
+                    f"The {split} split is empty ({len(table.rows)} images in all, {self.skipped} unreadable). Add "
                     f"images, or say with a column `split` which are for {', '.join(SPLITS)}."
                 )
 
     def _crop(self, file: Path) -> Crop:
         return Crop(file, None, 0.0, self.image_size, self.channels, upright=True)
 
-    def train(self) -> Dataset[Batch]:
-        return self._tables["train"]
-
-    def validation(self) -> Dataset[Batch]:
-        return self._tables["validation"]
-
-    def test(self) -> Dataset[Batch]:
-        return self._tables["test"]
+    def splits(self) -> Splits:
+        return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return images.unlabelled([self._crop(Path(file)) for file in files])
 
     def augment(self, batch: Batch) -> Batch:
-        if not self.mirror and not self.jitter:
-            return batch
-        mirrored = (torch.rand(len(batch["target"])) < 0.5) & bool(self.mirror)
-        target = batch["target"]
-        turned = target * self._signs.to(target)
-        return {
-            **batch,
-            "input": images.augmented(batch["input"], mirrored, self.jitter),
-            "target": torch.where(mirrored.to(target.device)[:, None], turned, target),
-        }
+        return images.varied(batch, self._signs, self.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
         sizes = {split: str(len(table)) for split, table in self._tables.items()}

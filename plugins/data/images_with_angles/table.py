@@ -1,4 +1,4 @@
-"""The table beside the images: one line a file, its angles, and perhaps its split."""
+"""Reads the table beside the images: a line for each file, with its angles and perhaps its split."""
 
 import csv
 import hashlib
@@ -66,7 +66,7 @@ def read_table(
 
 
 def split_of(name: str) -> Split:
-    """70 % train, 15 % validation, 15 % test by a hash of the name: new images never move old ones."""
+    """Choose train (70 %), validation or test (15 % each) by a hash of the name: new images never move old ones."""
     share = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
     for split in SPLITS:
         share -= SHARES[split]
@@ -76,7 +76,7 @@ def split_of(name: str) -> Split:
 
 
 def _read(file: Path) -> tuple[list[str], dict[int, dict[str, str]]]:
-    """The header, and the cells of every line by its number."""
+    """Read the header, and the cells of every line by its number."""
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream, strict=True)

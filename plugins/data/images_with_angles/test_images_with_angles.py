@@ -39,7 +39,7 @@ def prepared(root: Path, **config: Any) -> ImagesWithAngles:
 
 
 def fields(data: ImagesWithAngles, split: str) -> Mapping[str, torch.Tensor]:
-    dataset = getattr(data, split)()
+    dataset = getattr(data.splits(), split)
     assert isinstance(dataset, Fields)
     return dataset.fields
 

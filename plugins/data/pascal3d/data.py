@@ -1,8 +1,9 @@
-"""PASCAL3D+ as labelled crops; the contract is framework.data's."""
+"""Reads PASCAL3D+ as labelled crops; the contract is framework.data's."""
 
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -12,8 +13,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.configuration import schema
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets import images
 from framework.datasets.images import Box, Crop
 from framework.errors import DataError, did_you_mean
@@ -26,6 +26,8 @@ from plugins.data.pascal3d.generator import VERSION, generated
 from plugins.data.pascal3d.layout import CLASSES, Annotation
 
 SPLIT_SEED = 13  # that of the thesis authors' code
+MIRRORED = (-1.0, 1.0, -1.0)
+"""A mirror image of a mirror-symmetric object multiplies azimuth, elevation and tilt by these."""
 
 
 class Sample(NamedTuple):
@@ -33,12 +35,53 @@ class Sample(NamedTuple):
     group: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Which objects are learned from: those of one class or several, and of their images a share for validation."""
+
+    category: str | list[str] = "car"
+    include_occluded: bool = False
+    validation_share: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)] = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Framing:
+    """How an object is cut out: a square of `image_size` pixels with a margin, a share of the box's longer side."""
+
+    image_size: Annotated[int, Field(ge=8, le=1024)] = 48
+    margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1
+
+    def crop(self, annotation: Annotation) -> Crop:
+        return Crop(annotation.image, annotation.box, self.margin, self.image_size)
+
+    def scale(self, box: Box) -> float:
+        """Say how many pixels of the input show one pixel of the picture."""
+        left, top, right, bottom = box
+        return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """How training images vary: half of them mirrored, all shifted, scaled and made brighter by up to `jitter`."""
+
+    mirror: bool = True
+    jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """What is generated where there is no root: how many images a class, from which seed, drawn by what."""
+
+    images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400
+    generator_seed: Annotated[int, Field(ge=0)] = 0
+    renderer: Renderer = "zbuffer"  # pyright: ignore[reportAssignmentType]  # built by the framework
+
+
 class Pascal3D(Data):
     """Rigid objects in photographs and their azimuth, elevation and tilt; generated where no root is given.
 
-    Beside the contract's fields a batch has "symmetry" (int64: 1 none, 2 the same after 180° of azimuth, 4
-    after 90°, 0 after any turn; 1 for real data) and, for generated data, "blur" (float32: standard deviation
-    of the blur, pixels of the input).
+    Beside the contract's fields a batch has "symmetry" (1 for real data) and, for generated data, "blur" (float32:
+    standard deviation of the blur, pixels of the input).
 
     Attributes:
         excluded: how many objects the protocol left out, by reason; set by `prepare`.
@@ -56,43 +99,35 @@ class Pascal3D(Data):
         self,
         *,
         root: str | None = None,
-        category: str | list[str] = "car",
-        image_size: Annotated[int, Field(ge=8, le=1024)] = 48,
-        margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1,
-        include_occluded: bool = False,
+        selection: Selection,
+        framing: Framing,
         skip_unreadable: bool = False,
-        validation_share: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)] = 0.2,
-        mirror: bool = True,
-        jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08,
-        images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400,
-        generator_seed: Annotated[int, Field(ge=0)] = 0,
-        renderer: Renderer | str = "zbuffer",
+        variation: Variation,
+        drawing: Drawing,
     ) -> None:
         self.root = root
-        self.categories = (category,) if isinstance(category, str) else tuple(category)
-        self.image_size = image_size
-        self.margin = margin
-        self.include_occluded = include_occluded
+        category = selection.category
+        self.categories = (category,) if isinstance(category, str) else tuple(dict.fromkeys(category))
+        self.selection = selection
+        self.framing = framing
         self.skip_unreadable = skip_unreadable
-        self.validation_share = validation_share
-        self.mirror = mirror
-        self.jitter = jitter
-        self.images = images
-        self.generator_seed = generator_seed
-        self.renderer = renderer
+        self.variation = variation
+        self.drawing = drawing
+        self.input_shape = (3, framing.image_size, framing.image_size)
 
     def prepare(self) -> None:
         roots = self._roots()
         self.groups = tuple(roots)
-        self.input_shape = (3, self.image_size, self.image_size)
         self.synthetic = any(read_mark(root) is not None for root in roots.values())
         self.excluded: Counter[str] = Counter()
         faults: list[DataError] = []
         samples: dict[str, list[Sample]] = {"train": [], "validation": [], "test": []}
         for group, (category, root) in enumerate(roots.items()):
             lists = layout.split_lists(category)
-            learned = list(self._kept(root, category, lists["train"], self.include_occluded, faults))
-            held_out = validation_files(learned, self.validation_share)
+            learned = list(
+                self._kept(root, category, lists["train"], self.selection.include_occluded, faults)
+            )
+            held_out = validation_files(learned, self.selection.validation_share)
             for annotation in learned:
                 split = "validation" if annotation.file in held_out else "train"
                 samples[split].append(Sample(annotation, group))
@@ -103,28 +138,24 @@ class Pascal3D(Data):
         self._digest = _digest(samples)
 
     def _roots(self) -> dict[str, Path]:
-        """Every class and where its data lie; they are generated here where no root is given."""
-        categories = dict.fromkeys(self.categories)
-        for category in categories:
+        """Find where the data of every class lie, and generate them where no root is given."""
+        for category in self.categories:
             if category not in CLASSES:
                 raise DataError(
                     f"data.category = {category!r} is no class of PASCAL3D+."
                     f"{did_you_mean(category, CLASSES)} Wanted one or more of: {', '.join(CLASSES)}."
                 )
-        if not categories:
+        if not self.categories:
             raise DataError(f"data.category is empty; wanted one or more of: {', '.join(CLASSES)}.")
         if self.root is not None:
             root = Path(self.root).expanduser()
-            for category in categories:
+            for category in self.categories:
                 layout.check_root(root, category)
-            return dict.fromkeys(categories, root)
-        renderer = self.renderer
-        if isinstance(renderer, str):
-            renderer = schema.build("renderer", schema.resolve("renderer", renderer))
-        parent = cache.folder("pascal3d")
+            return dict.fromkeys(self.categories, root)
+        parent, of = cache.folder("pascal3d"), self.drawing
         return {
-            category: generated(parent, category, self.images, self.generator_seed, renderer)
-            for category in categories
+            category: generated(parent, category, of.images, of.generator_seed, of.renderer)
+            for category in self.categories
         }
 
     def _kept(
@@ -135,7 +166,7 @@ class Pascal3D(Data):
         include_occluded: bool,
         faults: list[DataError],
     ) -> Iterator[Annotation]:
-        """The objects of a split that the protocol keeps; what cannot be read is added to `faults`."""
+        """Read the objects of a split that the protocol keeps; what cannot be read is added to `faults`."""
         names = [(source, name) for source, file in lists for name in layout.read_list(root / file)]
         for source, name in dict.fromkeys(names):
             try:
@@ -152,24 +183,13 @@ class Pascal3D(Data):
 
     def _read(self, samples: Mapping[str, Sequence[Sample]], faults: Sequence[DataError]) -> None:
         """Read every split's crops; complain at once of all that could not be read, here or before."""
-        faults = list(faults)
-        total = len(faults) + sum(map(len, samples.values()))
-        in_memory = images.fit_in_memory(total, self.image_size, 3)
-        self._tables = {}
-        for split, chosen in samples.items():
-            crops = [
-                Crop(annotation.image, annotation.box, self.margin, self.image_size)
-                for annotation, _ in chosen
-            ]
-            table, bad = images.load(crops, self._fields(chosen), f"the {split} images", in_memory=in_memory)
-            self._tables[split] = table
-            faults += bad
-        if faults and not self.skip_unreadable:
-            remedy = "Restore them, or set data.skip_unreadable=true to leave them out."
-            if self.root is None:
-                remedy = f"Delete {cache.folder('pascal3d')}: the data are generated anew."
-            raise DataError(images.fault_message(faults, total, remedy))
-        self.skipped = len(faults)
+        self._tables, self.skipped = images.load_splits(
+            {split: [self.framing.crop(one) for one, _ in chosen] for split, chosen in samples.items()},
+            {split: self._fields(chosen) for split, chosen in samples.items()},
+            faults,
+            skip_unreadable=self.skip_unreadable,
+            generated_in=cache.folder("pascal3d") if self.root is None else None,
+        )
         for split, table in self._tables.items():
             if len(table) == 0:
                 reasons = ", ".join(f"{count} {reason}" for reason, count in self.excluded.items()) or "none"
@@ -186,40 +206,22 @@ class Pascal3D(Data):
             "symmetry": torch.tensor([annotation.symmetry for annotation, _ in samples], dtype=torch.int64),
         }
         if self.synthetic:
-            blur = [self._scale(annotation.box) * (annotation.blur or 0.0) for annotation, _ in samples]
+            blur = [self.framing.scale(one.box) * (one.blur or 0.0) for one, _ in samples]
             fields["blur"] = torch.tensor(blur, dtype=torch.float32)
         return fields
 
-    def _scale(self, box: Box) -> float:
-        """Pixels of the input for each pixel of the picture."""
-        left, top, right, bottom = box
-        return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
-
-    def train(self) -> Dataset[Batch]:
-        return self._tables["train"]
-
-    def validation(self) -> Dataset[Batch]:
-        return self._tables["validation"]
-
-    def test(self) -> Dataset[Batch]:
-        return self._tables["test"]
+    def splits(self) -> Splits:
+        return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        crops = [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
-        return images.unlabelled(crops)
+        side = self.framing.image_size
+        return images.unlabelled([Crop(Path(file), None, 0.0, side, upright=True) for file in files])
 
     def augment(self, batch: Batch) -> Batch:
-        if not self.mirror and not self.jitter:
-            return batch
-        mirrored = (torch.rand(len(batch["target"])) < 0.5) & self.mirror
-        # The mirror image of a mirror-symmetric object seen at (a, e, t) is that object seen at (-a, e, -t).
-        sign = torch.ones_like(batch["target"])
-        sign[:, 0] = sign[:, 2] = 1 - 2 * mirrored.to(sign)
-        varied = images.augmented(batch["input"], mirrored, self.jitter)
-        return {**batch, "input": varied, "target": batch["target"] * sign}
+        return images.varied(batch, MIRRORED if self.variation.mirror else (), self.variation.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
-        generated_root = f"synthetic, seed {self.generator_seed}"
+        generated_root = f"synthetic, seed {self.drawing.generator_seed}"
         return {
             "root": generated_root if self.root is None else self.root,
             "version": f"generator {VERSION}" if self.synthetic else "PASCAL3D+ release 1.1",
@@ -232,7 +234,7 @@ class Pascal3D(Data):
 
 
 def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
-    """Why the protocol leaves an object out; None: it does not."""
+    """Say why the protocol leaves an object out; None where it does not."""
     if annotation.angles is None:
         return "without a fine label"
     if annotation.difficult:
@@ -243,7 +245,7 @@ def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | N
 
 
 def validation_files(annotations: Sequence[Annotation], share: float) -> set[Path]:
-    """The files held out of training: whole images, so that no image is in both splits."""
+    """Choose the files held out of training: whole images, so that no image is in both splits."""
     files = sorted({annotation.file for annotation in annotations})
     order = np.random.default_rng(SPLIT_SEED).permutation(len(files))
     return {files[index] for index in order[: round(share * len(files))]}
@@ -264,7 +266,7 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
 
 
 def _digest(samples: Mapping[str, Sequence[Sample]]) -> str:
-    """A hash over the names, boxes and labels of every split."""
+    """Hash the names, boxes and labels of every split."""
     digest = hashlib.sha256()
     for split, chosen in samples.items():
         for annotation, _ in chosen:

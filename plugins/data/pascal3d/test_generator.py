@@ -17,7 +17,6 @@ from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer, Scene
 from framework.storage import generated
 from plugins.data.pascal3d import generator, shapes
-from plugins.data.pascal3d.data import Pascal3D
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import CLASSES
 from plugins.data.pascal3d.scene import View, camera_of, draw, outline, shoot, window
@@ -336,7 +335,7 @@ def test_cache_that_cannot_be_written_is_said(
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "file"))
     with pytest.raises(DataError, match="Set FRAMEWORK_CACHE to another folder"):
-        Pascal3D(renderer=renderer).prepare()
+        schema.build("data", schema.resolve("data", "pascal3d")).prepare()
     with pytest.raises(DataError, match=r"cannot be written to .* set FRAMEWORK_CACHE"):
         generator.generated(tmp_path / "file", "car", 20, 0, renderer)
 

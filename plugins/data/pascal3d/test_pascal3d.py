@@ -42,14 +42,15 @@ def root(drawn: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(drawn, tmp_path / "root"))
 
 
-def prepared(root: Path, **config: Any) -> Pascal3D:
-    data = Pascal3D(root=str(root), **config)
+def prepared(root: Path | None, **config: Any) -> Pascal3D:
+    config = {"name": "pascal3d", "root": root and str(root), **config}
+    data = schema.build("data", schema.resolve("data", config))
     data.prepare()
     return data
 
 
 def table(data: Pascal3D, split: str) -> Mapping[str, torch.Tensor]:
-    dataset = {"train": data.train, "validation": data.validation, "test": data.test}[split]()
+    dataset = getattr(data.splits(), split)
     assert isinstance(dataset, Fields)
     return dataset.fields
 
@@ -291,7 +292,7 @@ def test_generated_root_reads_back_what_was_drawn(drawn: Path, renderer: Rendere
 def test_fields_of_a_batch(drawn: Path) -> None:
     data = prepared(drawn, image_size=32)
     fields = table(data, "train")
-    count = len(data.train())  # type: ignore[arg-type]
+    count = len(data.splits().train)  # type: ignore[arg-type]
     assert data.input_shape == (3, 32, 32)
     assert data.groups == ("car",)
     assert data.target.names == ("azimuth", "elevation", "tilt")
@@ -373,21 +374,16 @@ def test_real_data_have_no_symmetry_and_no_blur(root: Path) -> None:
     assert data.fingerprint()["version"] == "PASCAL3D+ release 1.1"
 
 
-def test_several_classes_are_groups(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renderer: Renderer
-) -> None:
+def test_several_classes_are_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    config = {"category": ["bottle", "diningtable", "bottle"], "images": 40, "image_size": 16}
-    data = schema.build("data", schema.resolve("data", {"name": "pascal3d", **config}))
-    data.prepare()
+    data = prepared(None, category=["bottle", "diningtable", "bottle"], images=40, image_size=16)
     assert data.groups == ("bottle", "diningtable")
     fields = table(data, "train")
     assert {(int(g), int(s)) for g, s in zip(fields["group"], fields["symmetry"], strict=True)} == {
         (0, 0),
         (1, 2),
     }
-    alone = Pascal3D(category="bottle", images=40, image_size=16, renderer=renderer)
-    alone.prepare()
+    alone = prepared(None, category="bottle", images=40, image_size=16)
     bottles = fields["group"] == 0
     assert torch.equal(table(alone, "train")["target"], fields["target"][bottles])
 
@@ -440,7 +436,7 @@ def test_missing_root() -> None:
     with pytest.raises(
         DataError, match=r"data\.root = /nowhere: no such folder; wanted the unpacked PASCAL3D"
     ):
-        Pascal3D(root="/nowhere").prepare()
+        prepared(Path("/nowhere"))
 
 
 def test_wrong_layout_says_what_is_missing_and_where_it_may_be(root: Path, tmp_path: Path) -> None:
@@ -487,11 +483,10 @@ def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
 
 
 def test_generated_data_that_are_damaged_are_to_be_deleted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renderer: Renderer
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    data = Pascal3D(images=20, renderer=renderer)
-    data.prepare()
+    data = prepared(None, images=20)
     next(tmp_path.rglob("car_pascal/*.mat")).write_bytes(b"")
     with pytest.raises(DataError, match=rf"Delete {tmp_path}/pascal3d: the data are generated anew"):
         data.prepare()
@@ -545,7 +540,7 @@ def test_large_data_are_read_when_used(drawn: Path, monkeypatch: pytest.MonkeyPa
     inside = prepared(drawn)
     monkeypatch.setattr(images, "IN_MEMORY", 0)
     outside = prepared(drawn)
-    lazy = outside.train()
+    lazy = outside.splits().train
     assert isinstance(lazy, Crops)
     eager = table(inside, "train")
     assert len(lazy) == len(eager["input"])

@@ -1,4 +1,4 @@
-"""The folder of the CAVIAR crops and its label file, `or_label.mat`: MATLAB 5.
+"""Reads and writes the label file of the CAVIAR crops, `or_label.mat`: MATLAB 5.
 
 Its struct arrays `or_label_train` and `or_label_test` have one element an image, whose fields are by their order gaze
 (degrees), x, y, size and name without suffix; what the fields are called does not matter.
@@ -15,9 +15,9 @@ from scipy.io.matlab import mat_struct
 
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError
+from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label.mat"
-SPLITS = ("train", "test")
 FIELDS = ("gaze", "x", "y", "size", "name")
 HEADER = b"MATLAB 5.0 MAT-file, synthetic labels".ljust(116)  # SciPy's holds the date
 
@@ -29,34 +29,13 @@ class Label(NamedTuple):
     gaze: float
 
 
-def check_root(root: Path) -> None:
-    """Refuse a folder that does not hold the crops.
-
-    Raises:
-        DataError: it is missing, or a part of it is; says which.
-    """
-    if not root.is_dir():
-        raise DataError(
-            f"data.root = {root}: no such folder; wanted the unpacked CAVIARShoppingCenterFullOccl, or null."
-        )
-    missing = [f"{split}/" for split in SPLITS if not (root / split).is_dir()]
-    missing += [LABELS] if not (root / LABELS).is_file() else []
-    if missing:
-        inner = root / "CAVIARShoppingCenterFullOccl"
-        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
-        raise DataError(
-            f"data.root = {root} is not laid out as CAVIARShoppingCenterFullOccl: no {', no '.join(missing)}."
-            f"{hint}"
-        )
-
-
 def read_labels(file: Path) -> dict[str, list[Label]]:
-    """The labels of "train" and "test", in the file's order.
+    """Read the labels of "train" and "test", in the file's order.
 
     Raises:
         DataError: the file cannot be read, lacks a struct array, or one of its elements is no label.
     """
-    names = [f"or_label_{split}" for split in SPLITS]
+    names = [f"or_label_{split}" for split in TRAIN_AND_TEST]
     try:
         content = read_variables(file, names)
     except NotImplementedError:
@@ -75,7 +54,7 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
             _label(file, f"{name}({number})", entry)
             for number, entry in enumerate(np.atleast_1d(content[name]).ravel(), start=1)
         ]
-        for split, name in zip(SPLITS, names, strict=True)
+        for split, name in zip(TRAIN_AND_TEST, names, strict=True)
     }
 
 

@@ -61,7 +61,7 @@ def center_of_skin(who: Person, pose: Pose) -> tuple[float, float]:
         (Pose(30, 0, 70), (0.5, 0, 0.75**0.5)),
     ],
 )
-def test_where_the_nose_points(pose: Pose, nose: tuple[float, float, float]) -> None:
+def test_where_the_nose_points(pose: Pose, nose: tuple[float | int, ...]) -> None:
     turn = rotation(pose)
     np.testing.assert_allclose(turn @ (0, 0, 1), nose, atol=1e-12)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)

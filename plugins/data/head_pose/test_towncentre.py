@@ -1,73 +1,30 @@
 """The folders of TownCentre heads: what is read, how people are split, what is refused, and what is drawn."""
 
-import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sklearn.kernel_ridge import KernelRidge
 
-from framework.configuration import schema
-from framework.datasets.fields import Fields
-from framework.errors import ConfigError, DataError
-from framework.storage import generated
-from plugins.data.head_pose.towncentre import generator
-from plugins.data.head_pose.towncentre.data import TownCentre
-from plugins.data.head_pose.towncentre.labels import Head, by_person, find_heads, read_label
+from framework.data import Splits
+from framework.errors import DataError
+from plugins.data.head_pose import synthetic_heads
+from plugins.data.head_pose.roots import PEOPLE, pixels, prepared, table, write_towncentre
+from plugins.data.head_pose.towncentre import EACH, pose
+from plugins.data.head_pose.towncentre_labels import Head, by_person, find_heads, read_label
 
-SPLITS = ("train", "validation", "test")
-PEOPLE = 40
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-def pixels(number: int) -> np.ndarray:
-    return np.random.default_rng(number).integers(0, 256, (50, 50, 3), dtype=np.uint8)
+SPLITS = Splits._fields
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Forty people with two images each, pan 10° × person and 5° more; the names as published have more numbers."""
-    place = tmp_path / "TownCentreHeadImages"
-    for person in range(PEOPLE):
-        folder = place / f"person{person}"
-        folder.mkdir(parents=True)
-        for second in range(2):
-            stem = f"image_{person}_{second}"
-            Image.fromarray(pixels(2 * person + second)).save(folder / f"{stem}_17_{second}.png")
-            pan = 10 * person + 5 * second - 720
-            (folder / f"{stem}.txt").write_text(f"pan = {pan:+.2f}\nvalid = 1\n", encoding="utf-8")
-    (place / "readme.md").write_text("not a folder", encoding="utf-8")
-    return place
-
-
-def prepared(root: Path | None, **config: Any) -> TownCentre:
-    config = {"name": "towncentre", "root": root and str(root), **config}
-    data = schema.build("data", schema.resolve("data", config))
-    data.prepare()
-    return data
-
-
-def table(data: TownCentre, split: str) -> Mapping[str, torch.Tensor]:
-    dataset = {"train": data.train, "validation": data.validation, "test": data.test}[split]()
-    assert isinstance(dataset, Fields)
-    return dataset.fields
-
-
-# ---- the published layout --------------------------------------------------------------------------------
+    return write_towncentre(tmp_path / "TownCentreHeadImages")
 
 
 def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
-    data = prepared(root)
+    data = prepared("towncentre", root)
     np.random.seed(13)  # noqa: NPY002  (their code seeds the global generator)
     drawn = np.random.rand(PEOPLE)  # noqa: NPY002
     people = {
@@ -93,7 +50,7 @@ def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
     assert not data.synthetic
     assert (data.skipped, data.invalid) == (0, 0)
     assert data.fingerprint()["version"] == "TownCentreHeadImages"
-    assert prepared(root).fingerprint() == data.fingerprint()
+    assert prepared("towncentre", root).fingerprint() == data.fingerprint()
 
 
 def test_split_does_not_depend_on_the_order_of_folders_and_keeps_the_shares() -> None:
@@ -108,7 +65,7 @@ def test_split_does_not_depend_on_the_order_of_folders_and_keeps_the_shares() ->
 
 def test_heads_that_are_not_valid_are_left_out_and_counted(root: Path) -> None:
     (root / "person3" / "image_3_0.txt").write_text("pan = +1.00\nvalid = 0\n", encoding="utf-8")
-    data = prepared(root)
+    data = prepared("towncentre", root)
     assert data.invalid == 1
     assert data.skipped == 0
     assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 1
@@ -151,9 +108,9 @@ def test_label_file_that_is_none_is_named(root: Path, content: bytes) -> None:
     file = root / "person3" / "image_3_0.txt"
     file.write_bytes(content)
     with pytest.raises(DataError) as caught:
-        prepared(root)
+        prepared("towncentre", root)
     assert f"1 of {2 * PEOPLE} samples cannot be read:\n  {file}: " in str(caught.value)
-    assert prepared(root, skip_unreadable=True).skipped == 1
+    assert prepared("towncentre", root, skip_unreadable=True).skipped == 1
 
 
 def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: Path) -> None:
@@ -164,7 +121,7 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
     (root / "person6" / "image_6_0.txt").rename(root / "person6" / "other.txt")
     (root / "person6" / "image_6_0_17_0.png").rename(root / "person6" / "other.png")
     with pytest.raises(DataError) as caught:
-        prepared(root)
+        prepared("towncentre", root)
     message = str(caught.value)
     assert message.startswith(f"4 of {2 * PEOPLE} samples cannot be read")
     for part in (
@@ -175,7 +132,7 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
         "data.skip_unreadable=true",
     ):
         assert part in message
-    data = prepared(root, skip_unreadable=True)
+    data = prepared("towncentre", root, skip_unreadable=True)
     assert data.skipped == 4
     assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 4
 
@@ -185,16 +142,16 @@ def test_pan_that_is_not_finite_is_never_skipped(root: Path) -> None:
     with pytest.raises(
         DataError, match=r"1 images have an angle that is not finite:\n.*image_3_0_17_0\.png: nan"
     ):
-        prepared(root, skip_unreadable=True)
+        prepared("towncentre", root, skip_unreadable=True)
 
 
 def test_wrong_layouts_say_what_is_wanted(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"data\.root = .*nowhere: no such folder; wanted the unpacked Town"):
-        prepared(tmp_path / "nowhere")
+        prepared("towncentre", tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"is not laid out as .* Did you mean .*TownCentreHeadImages\?"):
-        prepared(tmp_path)
+        prepared("towncentre", tmp_path)
     with pytest.raises(DataError, match=r"no folder in it holds a label file .* Unpack the whole archive"):
-        prepared(root / "person3")
+        prepared("towncentre", root / "person3")
 
 
 def test_empty_split(root: Path) -> None:
@@ -204,23 +161,11 @@ def test_empty_split(root: Path) -> None:
     with pytest.raises(
         DataError, match=r"split is empty \(4 images in all, 0 unreadable, 76 marked as not valid"
     ):
-        prepared(root)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("image_size", 4), ("test_blur", -1), ("images", 3), ("jitter", math.nan), ("rot", "x")],
-)
-def test_config_out_of_range(key: str, value: Any) -> None:
-    with pytest.raises(ConfigError, match=rf"data\.{key}"):
-        schema.resolve("data", {"name": "towncentre", key: value})
-
-
-# ---- the rest of the contract ----------------------------------------------------------------------------
+        prepared("towncentre", root)
 
 
 def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
-    data = prepared(root, jitter=0.0)
+    data = prepared("towncentre", root, jitter=0.0)
     batch = dict(table(data, "train"))
     torch.manual_seed(0)
     varied = data.augment(batch)
@@ -228,56 +173,13 @@ def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
     assert 10 < int(flipped.sum()) < len(flipped) - 10
     expected = torch.where(flipped[:, None], -batch["target"], batch["target"])
     assert torch.equal(varied["target"], expected)
-    off = prepared(root, jitter=0.0, mirror=False)
+    off = prepared("towncentre", root, jitter=0.0, mirror=False)
     assert off.augment(batch) is batch
 
 
-def test_test_blur_changes_the_test_split_only(root: Path) -> None:
-    sharp, smooth = prepared(root), prepared(root, test_blur=2.0)
-    for split in ("train", "validation"):
-        assert torch.equal(table(sharp, split)["input"], table(smooth, split)["input"])
-    changes = [table(data, "test")["input"].float().diff(dim=3).abs().mean() for data in (smooth, sharp)]
-    assert changes[0] < 0.2 * changes[1]
-    assert torch.equal(table(sharp, "test")["target"], table(smooth, "test")["target"])
-    assert (sharp.fingerprint()["test_blur"], smooth.fingerprint()["test_blur"]) == ("0.0", "2.0")
-
-
-def test_read_takes_a_users_own_files(root: Path) -> None:
-    data = TownCentre()
-    file = root / "person3" / "image_3_0_17_0.png"
-    samples = data.read([file])
-    assert isinstance(samples, Fields)
-    assert samples.fields.keys() == {"input", "index"}
-    assert np.array_equal(data.picture(samples[0]["input"]), pixels(6))
-
-
-# ---- the synthetic set -----------------------------------------------------------------------------------
-
-
-def files_of(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
-def test_generation_is_the_same_to_the_byte_whatever_the_threads(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    contents = []
-    for painters in (1, 3):
-        monkeypatch.setattr(generated, "PAINTERS", painters)
-        monkeypatch.setenv("FRAMEWORK_CACHE", str(cache / str(painters)))
-        contents.append(files_of(generator.generate(48, 5)))
-    first, second = contents
-    assert len(first) == 2 * 48 + 1
-    assert first == second
-    other = files_of(generator.generate(48, 6))
-    assert first.keys() == other.keys()
-    assert not any(first[name] == other[name] for name in first if name.endswith(".jpg"))
-    mark = json.loads(first["synthetic.json"])
-    assert (mark["seed"], mark["images"]) == (5, 48)
-
-
-def test_generated_set_is_read_as_it_was_drawn() -> None:
-    data = prepared(None, images=600)
+def test_generated_set_is_read_as_it_was_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
+    data = prepared("towncentre", None, images=600)
     assert data.synthetic
     assert data.fingerprint()["root"] == "synthetic, seed 0"
     counts = [len(table(data, split)["input"]) for split in SPLITS]
@@ -286,28 +188,11 @@ def test_generated_set_is_read_as_it_was_drawn() -> None:
     assert counts[0] > 400
     drawn = []
     for number in range(600):
-        heading = np.random.default_rng([0, 1, number // generator.EACH])
-        generator.synthetic_heads.person(heading)
+        heading = np.random.default_rng([0, 1, number // EACH])
+        synthetic_heads.person(heading)
         random = np.random.default_rng([0, 0, number])
-        pan = generator.pose(heading.uniform(0, 360), random).pan
+        pan = pose(heading.uniform(0, 360), random).pan
         if random.random() >= 0.03:
             drawn.append((pan + 180) % 360 - 180)
     read = torch.cat([table(data, split)["target"] for split in SPLITS]).rad2deg().flatten()
     np.testing.assert_allclose(np.sort(read.numpy()), np.sort(drawn), atol=0.006)
-
-
-def test_pictures_agree_with_their_labels() -> None:
-    """A kernel regression of sin(pan) on coarse grey pictures: on mirror images its sign is turned."""
-    data = prepared(None, images=1200, image_size=16)
-
-    def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-        fields = table(data, split)
-        grey = fields["input"].flip(-1) if mirrored else fields["input"]
-        grey = grey.float().mean(1).flatten(1)
-        grey = (grey - grey.mean(1, keepdim=True)) / (grey.std(1, keepdim=True) + 1)
-        return grey.numpy(), fields["target"][:, 0].sin().numpy()
-
-    regression = KernelRidge(kernel="rbf", gamma=2e-3, alpha=0.3).fit(*columns("train", mirrored=False))
-    for mirrored, sign in ((False, 1), (True, -1)):
-        pictures, sine = columns("test", mirrored=mirrored)
-        assert sign * np.corrcoef(regression.predict(pictures), sine)[0, 1] > 0.4

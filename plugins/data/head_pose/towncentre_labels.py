@@ -1,4 +1,4 @@
-"""The folders of the TownCentre heads: one a person, and in it for each image a text file with its label.
+"""Reads the folders of the TownCentre heads: one a person, and in it for each image a text file with its label.
 
 `<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0; the image is the other file whose name
 starts with `<stem>`, and the second of the parts of its name that `_` separates is the person's number.
@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.errors import DataError
+from plugins.data.head_pose.archive import wrong_layout
 from plugins.data.head_pose.labelled_images import SPLIT_SEED, Labelled
 
+FOLDER = "TownCentreHeadImages"
 TRAIN_SHARE, VALIDATION_SHARE = 0.8, 0.1
 
 
@@ -34,15 +36,11 @@ class Found(NamedTuple):
 
 
 def find_heads(root: Path) -> Found:
-    """All heads in a root, in the order of their names.
+    """Find all heads in a root, in the order of their names.
 
     Raises:
-        DataError: the folder is missing, or holds no folder with label files.
+        DataError: it holds no folder with label files.
     """
-    if not root.is_dir():
-        raise DataError(
-            f"data.root = {root}: no such folder; wanted the unpacked TownCentreHeadImages, or null."
-        )
     found = Found([], 0, [])
     invalid, labels = 0, 0
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
@@ -61,17 +59,12 @@ def find_heads(root: Path) -> Found:
             except DataError as error:
                 found.faults.append(error)
     if not labels:
-        inner = root / "TownCentreHeadImages"
-        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
-        raise DataError(
-            f"data.root = {root} is not laid out as TownCentreHeadImages: no folder in it holds a label file "
-            f"`<image>.txt`.{hint}"
-        )
+        raise wrong_layout(root, FOLDER, "folder in it holds a label file `<image>.txt`")
     return found._replace(invalid=invalid)
 
 
 def read_label(file: Path) -> tuple[float, bool]:
-    """Pan in degrees, and whether the image may be used.
+    """Read pan in degrees, and whether the image may be used.
 
     Raises:
         DataError: the file cannot be read, or its lines are others.
@@ -92,7 +85,7 @@ def read_label(file: Path) -> tuple[float, bool]:
 
 
 def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
-    """The image of a label: of those that start with its stem, the one that does not go on with a digit."""
+    """Find the image of a label: of those that start with its stem, the one that does not go on with a digit."""
     stem = text.removesuffix(".txt")
     names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:
@@ -114,7 +107,7 @@ def _person(image: Path) -> int:
 
 
 def by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
-    """The splits by person, 80, 10 and 10 % of them, as the thesis authors' code draws them."""
+    """Split the people, 80, 10 and 10 % of them, as the thesis authors' code does."""
     people = np.unique([head.person for head in heads])
     drawn = np.random.RandomState(SPLIT_SEED).rand(len(people))
     share = dict(zip(people.tolist(), drawn.tolist(), strict=True))
@@ -131,5 +124,5 @@ def _split(share: float) -> str:
 
 
 def label_text(pan: float, valid: bool) -> str:
-    """A label file's content; `pan` in degrees."""
+    """Write the content of a label file; `pan` in degrees."""
     return f"pan = {pan:+.2f}\nvalid = {int(valid)}\n"

@@ -1,4 +1,4 @@
-"""The folder of the IDIAP crops and its label file, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
+"""Reads and writes the label file of the IDIAP crops, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
 
 In it the groups `or_label_train` and `or_label_test` are struct arrays: each of their fields pan, tilt, roll and name
 holds one reference an image, to a number or to UTF-16 text.
@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 
 from framework.errors import DataError
+from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label_full.mat"
-SPLITS = ("train", "test")
 ANGLES = ("pan", "tilt", "roll")
 ENOUGH = 20
 """With more labels than this, none beyond ±2π is taken for radians."""
@@ -29,33 +29,15 @@ class Label(NamedTuple):
     angles: tuple[float, float, float]
 
 
-def check_root(root: Path) -> None:
-    """Refuse a folder that does not hold the crops.
-
-    Raises:
-        DataError: it is missing, or a part of it is; says which.
-    """
-    if not root.is_dir():
-        raise DataError(f"data.root = {root}: no such folder; wanted the unpacked IHDPHeadPose, or null.")
-    missing = [f"{split}/" for split in SPLITS if not (root / split).is_dir()]
-    missing += [LABELS] if not (root / LABELS).is_file() else []
-    if missing:
-        inner = root / "IHDPHeadPose"
-        hint = f" Did you mean {inner}?" if inner.is_dir() else " Unpack the whole archive there."
-        raise DataError(
-            f"data.root = {root} is not laid out as IHDPHeadPose: no {', no '.join(missing)}.{hint}"
-        )
-
-
 def read_labels(file: Path, angles_in: Literal["radians", "degrees"]) -> dict[str, list[Label]]:
-    """The labels of "train" and "test", in the file's order, angles in radians.
+    """Read the labels of "train" and "test", in the file's order, angles in radians.
 
     Raises:
         DataError: it is no such file, a field is missing or of another length, or the angles are not `angles_in`.
     """
     try:
         with h5py.File(file, "r") as content:
-            labels = {split: _read_struct(content, f"or_label_{split}") for split in SPLITS}
+            labels = {split: _read_struct(content, f"or_label_{split}") for split in TRAIN_AND_TEST}
     except Exception as error:  # nearly any, where the file is damaged
         raise DataError(
             f"{file}: cannot be read as the MATLAB 7.3 (HDF5) file of structs or_label_train and or_label_test "
@@ -86,7 +68,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
-    """What a field's references lead to; a struct of one element holds its value itself."""
+    """Read what a field's references lead to; a struct of one element holds its value itself."""
     values = field[()]
     if field.dtype != h5py.ref_dtype:
         return [values]

@@ -13,7 +13,7 @@ from PIL import Image
 from framework.datasets import images
 from framework.datasets.images import Crops, blurred
 from framework.errors import DataError
-from plugins.data.head_pose.labelled_images import SPLITS, Labelled, Splits, halves, own, read_splits, varied
+from plugins.data.head_pose.labelled_images import SPLITS, Labelled, Loaded, Reading, halves, load
 
 
 def samples(place: Path, count: int = 12) -> dict[str, list[Labelled]]:
@@ -27,9 +27,19 @@ def samples(place: Path, count: int = 12) -> dict[str, list[Labelled]]:
     return {"train": made[:6], "validation": made[6:9], "test": made[9:]}
 
 
-def read(chosen: dict[str, list[Labelled]], faults: Sequence[DataError] = (), **more: Any) -> Splits:
-    config = {"side": 8, "test_blur": 0.0, "skip_unreadable": False, "remedy": "Mend it."}
-    return read_splits(chosen, faults, **{**config, **more})
+def read(
+    chosen: dict[str, list[Labelled]],
+    faults: Sequence[DataError] = (),
+    generated_in: Path | None = None,
+    left_out: str = "",
+    **config: Any,
+) -> Loaded:
+    reading = Reading(image_size=8, **config)
+    return load(chosen, ("pan", "roll"), reading, faults, generated_in=generated_in, left_out=left_out)
+
+
+def sizes(loaded: Loaded) -> list[str]:
+    return [loaded.fingerprint[split] for split in SPLITS]
 
 
 def test_published_test_set_is_halved_as_the_authors_code_does() -> None:
@@ -47,7 +57,7 @@ def test_fields(tmp_path: Path) -> None:
     chosen = samples(tmp_path)
     splits = read(chosen)
     assert splits.skipped == 0
-    assert splits.sizes() == {"train": "6", "validation": "3", "test": "3"}
+    assert sizes(splits) == ["6", "3", "3"]
     for split in SPLITS:
         table = splits.tables[split]
         for index, sample in enumerate(chosen[split]):
@@ -59,7 +69,8 @@ def test_fields(tmp_path: Path) -> None:
             torch.testing.assert_close(item["target"], torch.tensor(expected))
             assert (int(item["index"]), int(item["group"])) == (index, 0)
     moved = {**chosen, "test": chosen["test"][::-1]}
-    assert read(chosen).digest == splits.digest != read(moved).digest
+    digest = splits.fingerprint["sha256"]
+    assert read(chosen).fingerprint["sha256"] == digest != read(moved).fingerprint["sha256"]
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
@@ -70,7 +81,7 @@ def test_only_the_test_split_is_blurred(
         monkeypatch.setattr(images, "IN_MEMORY", 0)
     sharp, smooth = read(samples(tmp_path)), read(samples(tmp_path), test_blur=1.2)
     assert isinstance(smooth.tables["test"], Crops) != in_memory
-    assert smooth.digest == sharp.digest
+    assert smooth.fingerprint["sha256"] == sharp.fingerprint["sha256"]
     for split in SPLITS:
         for index in range(len(sharp.tables[split])):
             expected = blurred(sharp.tables[split][index]["input"], 1.2 if split == "test" else 0.0)
@@ -86,12 +97,14 @@ def test_unreadable_images_are_named_or_skipped(tmp_path: Path) -> None:
         read(chosen, [label])
     message = str(caught.value)
     assert message.startswith("3 of 13 samples cannot be read")
-    assert message.endswith("Mend it.")
+    assert message.endswith("data.skip_unreadable=true to leave them out.")
     for part in ("a label that cannot be read", "0.png: cannot be read as an image", "10.png: no such file"):
         assert part in message
+    with pytest.raises(DataError, match=r"\nDelete /the/cache: the data are generated anew\.$"):
+        read(chosen, [label], generated_in=Path("/the/cache"))
     splits = read(chosen, [label], skip_unreadable=True)
     assert splits.skipped == 3
-    assert splits.sizes() == {"train": "5", "validation": "3", "test": "2"}
+    assert sizes(splits) == ["5", "3", "2"]
     assert int(splits.tables["train"][0]["input"][0, 0, 0]) == 10
     torch.testing.assert_close(splits.tables["train"][0]["target"], torch.tensor([1.0, -1.0]))
 
@@ -114,30 +127,12 @@ def test_empty_split(tmp_path: Path, split: str) -> None:
         read(chosen, left_out=", so")
 
 
-def test_augmentation_mirrors_half_of_a_batch_with_the_named_angles() -> None:
-    torch.manual_seed(0)
-    pixels = torch.randint(0, 256, (200, 3, 8, 8), dtype=torch.uint8)
-    batch = {"input": pixels, "target": torch.rand(200, 2) + 0.1, "index": torch.arange(200)}
-    result = varied(batch, ("pan", "tilt"), ("pan",), 0.0)
-    flipped = (255 * result["input"] - pixels.flip(-1)).abs().amax((1, 2, 3)) < 0.01
-    same = (255 * result["input"] - pixels).abs().amax((1, 2, 3)) < 0.01
-    assert torch.all(same ^ flipped)
-    assert 70 < int(flipped.sum()) < 130
-    expected = torch.where(flipped[:, None], batch["target"] * torch.tensor([-1.0, 1.0]), batch["target"])
-    assert torch.equal(result["target"], expected)
-    assert result["index"] is batch["index"]
-    assert varied(batch, ("pan", "tilt"), (), 0.0) is batch
-    shaken = varied(batch, ("pan", "tilt"), (), 0.1)
-    assert torch.equal(shaken["target"], batch["target"])
-    assert not torch.equal(255 * shaken["input"], pixels.float())
-
-
 def test_own_files_are_turned_as_viewers_do(tmp_path: Path) -> None:
     image = Image.new("RGB", (10, 10))
     image.paste((255, 255, 255), (0, 0, 5, 10))
     exif = Image.Exif()
     exif[0x0112] = 6  # to be turned by 90° to be seen upright
     image.save(tmp_path / "one.png", exif=exif)
-    pixels = own(tmp_path / "one.png", 10).read()
+    pixels = Reading(image_size=10).own([tmp_path / "one.png"])[0]["input"]
     assert pixels[0, 0].min() == 255
     assert pixels[0, -1].max() == 0

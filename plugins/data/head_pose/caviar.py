@@ -1,0 +1,109 @@
+"""The CAVIAR crops with partly hidden heads, and drawn ones in their layout: train/ and test/, `or_label.mat`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data, Splits
+from framework.datasets import images
+from framework.storage.generated import read_mark
+from framework.target import Target
+from plugins.data.head_pose import synthetic_heads
+from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
+from plugins.data.head_pose.caviar_labels import LABELS, Label, read_labels, write_labels
+from plugins.data.head_pose.labelled_images import Labelled, Reading, halves, load
+from plugins.data.head_pose.synthetic_heads import Conditions, Pose
+
+SIDE = 50  # pixels, as published
+TRAIN_SHARE = 0.6
+PEOPLE = 200
+CONDITIONS = Conditions(
+    pixels=(12, 26), height=(0.5, 0.66), offset=0.06, blur=0.8, noise=0.05, clutter=6, occluded=0.5
+)
+AS_PUBLISHED = Reading(image_size=SIDE)
+
+
+class Caviar(Data):
+    """Partly hidden heads of people in a shopping centre, and their gaze; generated where no root is given."""
+
+    bibtex = """@misc{fisher2005caviar,
+  author = {Fisher, Robert and Santos-Victor, Jose and Crowley, James},
+  title = {{CAVIAR}: Context Aware Vision using Image-based Active Recognition},
+  year = {2005}
+}
+@article{tosato2013characterizing,
+  author = {Tosato, Diego and Spera, Mauro and Cristani, Marco and Murino, Vittorio},
+  title = {Characterizing Humans on {Riemannian} Manifolds},
+  journal = {IEEE Transactions on Pattern Analysis and Machine Intelligence},
+  volume = {35},
+  number = {8},
+  pages = {1972--1984},
+  year = {2013}
+}"""
+    groups = ("caviar",)
+    target = Target("angle", ("gaze",))
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        reading: Reading = AS_PUBLISHED,
+        images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400,
+        generator_seed: Annotated[int, Field(ge=0)] = 0,
+    ) -> None:
+        self.source = Source(ARCHIVE, root, images, generator_seed)
+        self.reading = reading
+        self.input_shape = (3, reading.image_size, reading.image_size)
+
+    def prepare(self) -> None:
+        root = self.source.folder()
+        self.synthetic = read_mark(root) is not None
+        samples = {
+            split: [
+                Labelled(root / split / f"{label.name}.jpg", (math.radians(label.gaze),)) for label in labels
+            ]
+            for split, labels in read_labels(root / LABELS).items()
+        }
+        samples["validation"], samples["test"] = halves(samples["test"])
+        self.loaded = load(samples, self.target.names, self.reading, generated_in=self.source.generated_in())
+        self.skipped = self.loaded.skipped
+
+    def splits(self) -> Splits:
+        return Splits(**self.loaded.tables)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return self.reading.own(files)
+
+    def augment(self, batch: Batch) -> Batch:
+        # No mirroring: the thesis authors' data hold no mirror images.
+        return images.varied(batch, (), self.reading.jitter)
+
+    def fingerprint(self) -> Mapping[str, str]:
+        return self.source.fingerprint(self.synthetic) | self.loaded.fingerprint
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)
+
+
+def _draw(root: Path, images: int, seed: int) -> None:
+    def draw(number: int) -> tuple[str, np.ndarray, Label]:
+        random = np.random.default_rng([seed, 0, number])
+        who = synthetic_heads.person(np.random.default_rng([seed, 1, int(random.integers(PEOPLE))]))
+        gaze = float(random.uniform(0, 360))
+        looks = Pose(gaze, float(random.normal(0, 6)), float(random.normal(0, 4)))
+        picture = synthetic_heads.photograph(random, who, looks, SIDE, CONDITIONS)
+        name = f"synthetic_{number:06d}"
+        return name, picture, Label(name, gaze)
+
+    write_labels(root / LABELS, draw_train_and_test(root, images, TRAIN_SHARE, "caviar", draw), SIDE)
+
+
+ARCHIVE = Archive(
+    "caviar", "CAVIARShoppingCenterFullOccl", ("train/", "test/", LABELS), version=1, draw=_draw
+)

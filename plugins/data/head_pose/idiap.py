@@ -1,0 +1,126 @@
+"""The IDIAP head-pose crops, and drawn heads in their layout: pictures in train/ and test/, `or_label_full.mat`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data, Splits
+from framework.datasets import images
+from framework.storage.generated import read_mark
+from framework.target import Target
+from plugins.data.head_pose import synthetic_heads
+from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
+from plugins.data.head_pose.idiap_labels import ANGLES, LABELS, Label, read_labels, write_labels
+from plugins.data.head_pose.labelled_images import Labelled, Reading, halves, load
+from plugins.data.head_pose.synthetic_heads import Conditions, Person, Pose
+
+SIDE = 75  # pixels, as published
+TRAIN_SHARE = 0.64  # as published: 42,304 of 66,295
+PEOPLE = 24
+CONDITIONS = Conditions(
+    pixels=(SIDE, SIDE), height=(0.62, 0.78), offset=0.04, blur=0.7, noise=0.03, clutter=5, occluded=0.03
+)
+AS_PUBLISHED = Reading(image_size=SIDE)
+
+
+class Idiap(Data):
+    """Heads of a few people in a meeting room, and their pan, tilt and roll; generated where no root is given."""
+
+    bibtex = """@inproceedings{ba2005evaluation,
+  author = {Ba, Sil{\\`e}ye O. and Odobez, Jean-Marc},
+  title = {Evaluation of Multiple Cue Head Pose Estimation Algorithms in Natural Environments},
+  booktitle = {IEEE International Conference on Multimedia and Expo (ICME)},
+  year = {2005}
+}
+@article{tosato2013characterizing,
+  author = {Tosato, Diego and Spera, Mauro and Cristani, Marco and Murino, Vittorio},
+  title = {Characterizing Humans on {Riemannian} Manifolds},
+  journal = {IEEE Transactions on Pattern Analysis and Machine Intelligence},
+  volume = {35},
+  number = {8},
+  pages = {1972--1984},
+  year = {2013}
+}"""
+    groups = ("idiap",)
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        angles: list[Literal["pan", "tilt", "roll"]] | None = None,
+        angles_in: Literal["radians", "degrees"] = "radians",
+        reading: Reading = AS_PUBLISHED,
+        images: Annotated[int, Field(ge=20, le=1_000_000)] = 2000,
+        generator_seed: Annotated[int, Field(ge=0)] = 0,
+    ) -> None:
+        self.source = Source(ARCHIVE, root, images, generator_seed)
+        # generated labels are in radians whatever a user's own file holds
+        self.angles_in: Literal["radians", "degrees"] = "radians" if root is None else angles_in
+        self.reading = reading
+        self.target = Target("angle", tuple(dict.fromkeys(angles or ANGLES)))
+        self.input_shape = (3, reading.image_size, reading.image_size)
+
+    def prepare(self) -> None:
+        root = self.source.folder()
+        self.synthetic = read_mark(root) is not None
+        columns = [ANGLES.index(name) for name in self.target.names]
+        samples = {
+            split: [
+                Labelled(root / split / label.name, tuple(label.angles[column] for column in columns))
+                for label in labels
+            ]
+            for split, labels in read_labels(root / LABELS, self.angles_in).items()
+        }
+        samples["validation"], samples["test"] = halves(samples["test"])
+        self.loaded = load(samples, self.target.names, self.reading, generated_in=self.source.generated_in())
+        self.skipped = self.loaded.skipped
+
+    def splits(self) -> Splits:
+        return Splits(**self.loaded.tables)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return self.reading.own(files)
+
+    def augment(self, batch: Batch) -> Batch:
+        # No mirroring: the published training images hold their mirror images already.
+        return images.varied(batch, (), self.reading.jitter)
+
+    def fingerprint(self) -> Mapping[str, str]:
+        return self.source.fingerprint(self.synthetic) | self.loaded.fingerprint
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)
+
+
+def pose(random: np.random.Generator) -> Pose:
+    """Draw where a person at a table looks, mostly forwards and down."""
+    pan, tilt, roll = random.normal((0, -8, 0), (35, 14, 10)).clip((-90, -60, -45), (90, 45, 45))
+    return Pose(float(pan), float(tilt), float(roll))
+
+
+def people(seed: int) -> list[Person]:
+    """Draw who sits there; the same people are in both splits, as in frames of the same recordings."""
+    return [synthetic_heads.person(np.random.default_rng([seed, 1, number])) for number in range(PEOPLE)]
+
+
+def _draw(root: Path, images: int, seed: int) -> None:
+    seated = people(seed)
+
+    def draw(number: int) -> tuple[str, np.ndarray, Label]:
+        random = np.random.default_rng([seed, 0, number])
+        who, looks = int(random.integers(PEOPLE)), pose(random)
+        picture = synthetic_heads.photograph(random, seated[who], looks, SIDE, CONDITIONS)
+        name = f"synthetic_{who:02d}_{number:06d}"
+        pan, tilt, roll = map(math.radians, looks)
+        return name, picture, Label(f"{name}.jpg", (pan, tilt, roll))
+
+    write_labels(root / LABELS, draw_train_and_test(root, images, TRAIN_SHARE, "idiap", draw))
+
+
+ARCHIVE = Archive("idiap", "IHDPHeadPose", ("train/", "test/", LABELS), version=1, draw=_draw)

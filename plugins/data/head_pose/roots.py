@@ -1,0 +1,138 @@
+"""Folders as the three data sets are published, written by hand for the tests."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import scipy.io
+from PIL import Image
+from torch import Tensor
+
+from framework.configuration import schema
+from framework.data import Data
+from framework.datasets.fields import Fields
+
+PEOPLE = 40
+"""In the folder of TownCentre heads, each with two images."""
+CAVIAR_FIELDS = ("gaze", "x", "y", "size", "name")
+Row = tuple[str, float, float, float]
+"""Name, pan, tilt and roll of an IDIAP image."""
+
+
+def prepared(name: str, root: Path | None, **config: Any) -> Any:
+    data = schema.build("data", schema.resolve("data", {"name": name, "root": root and str(root), **config}))
+    data.prepare()
+    return data
+
+
+def table(data: Data, split: str) -> Mapping[str, Tensor]:
+    dataset = getattr(data.splits(), split)
+    assert isinstance(dataset, Fields)
+    return dataset.fields
+
+
+# ---- train/ and test/: twenty images and eleven, whose red is their number times eight --------------------------
+
+
+def write_idiap(place: Path) -> Path:
+    _write_images(place, 75, "head_{}.png")
+    publish_idiap(place)
+    return place
+
+
+def publish_idiap(
+    root: Path, train: Iterable[int] = range(20), test: Iterable[int] = range(20, 31), **more: Any
+) -> None:
+    """Write the labels of the images with these numbers."""
+    rows = {"or_label_train": [*map(idiap_row, train)], "or_label_test": [*map(idiap_row, test)], **more}
+    save_idiap(root / "or_label_full.mat", **rows)
+
+
+def idiap_row(number: int) -> Row:
+    return f"head_{number}.png", 0.1 * number - 1.5, 0.02 * number, -0.05 * number
+
+
+def save_idiap(file: Path, *, column: bool = True, **structs: Sequence[Row]) -> None:
+    """A file as MATLAB 7.3 writes struct arrays: cells in #refs#, and fields of references to them.
+
+    Text is UTF-16 code units down a column; a row of structs gives columns of references, a column a row.
+    """
+    with h5py.File(file, "w", userblock_size=512) as content:
+        cells = content.create_group("#refs#")
+        for name, rows in structs.items():
+            struct = content.create_group(name)
+            for index, field in enumerate(("name", "pan", "tilt", "roll")):
+                values = [
+                    np.array([[ord(letter)] for letter in row[0]], dtype=np.uint16)
+                    if field == "name"
+                    else np.array([[row[index]]], dtype=np.float64)
+                    for row in rows
+                ]
+                if len(values) == 1:  # a struct alone holds its values itself
+                    struct.create_dataset(field, data=values[0])
+                    continue
+                references = np.empty((len(values), 1), dtype=h5py.ref_dtype)
+                for place, value in enumerate(values):
+                    references[place, 0] = cells.create_dataset(f"{name}{field}{place}", data=value).ref
+                struct.create_dataset(field, data=references if column else references.T)
+    with file.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def write_caviar(place: Path) -> Path:
+    _write_images(place, 50, "head_{}_x.jpg")
+    publish_caviar(place)
+    return place
+
+
+def publish_caviar(root: Path, train: Iterable[int] = range(20), test: Iterable[int] = range(20, 31)) -> None:
+    """Write the labels of the images with these numbers."""
+    save_caviar(root, struct_array([*map(caviar_row, train)]), struct_array([*map(caviar_row, test)]))
+
+
+def caviar_row(number: int) -> list[Any]:
+    """Gaze of 10° × number - 180°, whole numbers as MATLAB's uint8 would be, and a name with a number in it."""
+    return [10.0 * number - 180, np.uint8(25), 25.5, 50.0, f"head_{number}_x"]
+
+
+def save_caviar(root: Path, train: np.ndarray, test: np.ndarray) -> None:
+    scipy.io.savemat(root / "or_label.mat", {"or_label_train": train, "or_label_test": test, "other": 3})
+
+
+def struct_array(rows: Sequence[Sequence[Any]], names: Sequence[str] = CAVIAR_FIELDS) -> np.ndarray:
+    """A MATLAB struct array, one element a row."""
+    array = np.empty((1, len(rows)), dtype=[(name, object) for name in names])
+    for index, row in enumerate(rows):
+        array[0, index] = tuple(row)
+    return array
+
+
+def _write_images(place: Path, side: int, name: str) -> None:
+    for split, numbers in (("train", range(20)), ("test", range(20, 31))):
+        (place / split).mkdir(parents=True)
+        for number in numbers:
+            color = (8 * number, 100, 200)
+            Image.new("RGB", (side, side), color).save(place / split / name.format(number), quality=100)
+
+
+# ---- a folder a person --------------------------------------------------------------------------------------------
+
+
+def write_towncentre(place: Path) -> Path:
+    """Forty people with two images each, pan 10° × person and 5° more; the names as published have more numbers."""
+    for person in range(PEOPLE):
+        folder = place / f"person{person}"
+        folder.mkdir(parents=True)
+        for second in range(2):
+            stem = f"image_{person}_{second}"
+            Image.fromarray(pixels(2 * person + second)).save(folder / f"{stem}_17_{second}.png")
+            pan = 10 * person + 5 * second - 720
+            (folder / f"{stem}.txt").write_text(f"pan = {pan:+.2f}\nvalid = 1\n", encoding="utf-8")
+    (place / "readme.md").write_text("not a folder", encoding="utf-8")
+    return place
+
+
+def pixels(number: int, side: int = 50) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 256, (side, side, 3), dtype=np.uint8)

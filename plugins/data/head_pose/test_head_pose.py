@@ -1,0 +1,316 @@
+"""What IDIAP, TownCentre and CAVIAR have in common: folders read and refused, augmentation, and heads drawn instead."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from sklearn.kernel_ridge import KernelRidge
+
+from framework.configuration import schema
+from framework.configuration.registry import load
+from framework.data import Splits
+from framework.datasets.fields import Fields
+from framework.errors import ConfigError, DataError
+from framework.storage import generated
+from plugins.data.head_pose.archive import Archive, Source
+from plugins.data.head_pose.caviar import ARCHIVE as CAVIAR
+from plugins.data.head_pose.idiap import ARCHIVE as IDIAP
+from plugins.data.head_pose.roots import (
+    caviar_row,
+    idiap_row,
+    pixels,
+    prepared,
+    publish_caviar,
+    publish_idiap,
+    table,
+    write_caviar,
+    write_idiap,
+    write_towncentre,
+)
+from plugins.data.head_pose.towncentre import ARCHIVE as TOWNCENTRE
+
+SPLITS = Splits._fields
+
+
+class Published(NamedTuple):
+    """A data set as the tests know it: `image` is the name of image number 9, or of an image like it."""
+
+    archive: Archive
+    write: Callable[[Path], Path]
+    publish: Callable[..., None]
+    angles: Callable[[int], tuple[float, ...]]
+    names: tuple[str, ...]
+    side: int
+    labels: str
+    image: str
+
+
+IN_TWO_FOLDERS = (
+    Published(
+        IDIAP,
+        write_idiap,
+        publish_idiap,
+        lambda number: idiap_row(number)[1:],
+        ("pan", "tilt", "roll"),
+        75,
+        "or_label_full.mat",
+        "train/head_9.png",
+    ),
+    Published(
+        CAVIAR,
+        write_caviar,
+        publish_caviar,
+        lambda number: (math.radians(caviar_row(number)[0]),),
+        ("gaze",),
+        50,
+        "or_label.mat",
+        "train/head_9_x.jpg",
+    ),
+)
+BY_PERSON = Published(
+    TOWNCENTRE,
+    write_towncentre,
+    lambda: None,
+    lambda number: (),
+    ("pan",),
+    50,
+    "",
+    "person3/image_3_0_17_0.png",
+)
+
+
+def named(published: Published) -> str:
+    return published.archive.name
+
+
+every = pytest.mark.parametrize("published", [*IN_TWO_FOLDERS, BY_PERSON], ids=named)
+in_two_folders = pytest.mark.parametrize("published", IN_TWO_FOLDERS, ids=named)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def root(published: Published, tmp_path: Path) -> Path:
+    return published.write(tmp_path / published.archive.folder)
+
+
+def numbers_in(fields: Any) -> list[int]:
+    return [round(float(red) / 8) for red in fields["input"][:, 0].float().mean((1, 2))]
+
+
+# ---- the published layout --------------------------------------------------------------------------------
+
+
+@in_two_folders
+def test_images_labels_and_splits(published: Published, root: Path) -> None:
+    name = published.archive.name
+    data = prepared(name, root)
+    assert numbers_in(table(data, "train")) == list(range(20))
+    np.random.seed(13)  # noqa: NPY002  (the thesis authors' code seeds the global generator)
+    order = (20 + np.random.choice(11, 11, replace=False)).tolist()  # noqa: NPY002
+    assert numbers_in(table(data, "validation")) == order[:5]
+    assert numbers_in(table(data, "test")) == order[5:]
+    for split in SPLITS:
+        fields = table(data, split)
+        expected = torch.tensor([published.angles(number) for number in numbers_in(fields)])
+        torch.testing.assert_close(fields["target"], expected)
+        assert torch.all(abs(fields["target"]) < math.pi + 1e-6)
+    assert data.target.names == published.names
+    assert data.input_shape == (3, published.side, published.side)
+    assert data.groups == (name,)
+    assert not data.synthetic
+    assert data.skipped == 0
+    assert data.fingerprint()["version"] == published.archive.folder
+    assert prepared(name, root).fingerprint() == data.fingerprint()
+
+
+@in_two_folders
+def test_wrong_layouts_say_what_is_missing(published: Published, root: Path, tmp_path: Path) -> None:
+    name, folder = published.archive.name, published.archive.folder
+    with pytest.raises(
+        DataError, match=rf"data\.root = .*nowhere: no such folder; wanted the unpacked {folder}, or null"
+    ):
+        prepared(name, tmp_path / "nowhere")
+    labels = published.labels.replace(".", r"\.")
+    with pytest.raises(DataError, match=rf"no train/, no test/, no {labels}\. Did you mean .*{folder}\?"):
+        prepared(name, tmp_path)
+    (root / published.labels).unlink()
+    with pytest.raises(DataError, match=rf"no {labels}\. Unpack the whole archive there"):
+        prepared(name, root)
+
+
+@in_two_folders
+def test_unreadable_images_are_named_or_skipped(published: Published, root: Path) -> None:
+    first = (root / published.image.replace("9", "3")).name
+    other = first.replace("3", "21")
+    (root / "train" / first).unlink()
+    (root / "test" / other).write_bytes(b"\x89PNG" if other.endswith("png") else b"\xff\xd8")
+    with pytest.raises(DataError) as caught:
+        prepared(published.archive.name, root)
+    message = str(caught.value)
+    assert message.startswith("2 of 31 samples cannot be read")
+    for part in (f"{first}: no such file", f"{other}: cannot be read", "data.skip_unreadable=true"):
+        assert part in message
+    data = prepared(published.archive.name, root, skip_unreadable=True)
+    assert data.skipped == 2
+    assert numbers_in(table(data, "train")) == [0, 1, 2, *range(4, 20)]
+
+
+@in_two_folders
+def test_empty_split(published: Published, root: Path) -> None:
+    published.publish(root, train=[0], test=[20])
+    with pytest.raises(DataError, match=r"The validation split is empty \(2 images in all, 0 unreadable\)"):
+        prepared(published.archive.name, root)
+    published.publish(root, train=[])
+    with pytest.raises(DataError, match=r"The train split is empty"):
+        prepared(published.archive.name, root)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value"),
+    [
+        ("idiap", "image_size", 4),
+        ("idiap", "test_blur", math.nan),
+        ("idiap", "images", 3),
+        ("idiap", "mirror", True),
+        ("idiap", "angles_in", "turns"),
+        ("idiap", "angles", ["yaw"]),
+        ("towncentre", "image_size", 4),
+        ("towncentre", "test_blur", -1),
+        ("towncentre", "images", 3),
+        ("towncentre", "jitter", math.nan),
+        ("towncentre", "rot", "x"),
+        ("caviar", "image_size", 4),
+        ("caviar", "test_blur", math.inf),
+        ("caviar", "images", 3),
+        ("caviar", "mirror", True),
+    ],
+)
+def test_config_out_of_range(name: str, key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=rf"data\.{key}"):
+        schema.resolve("data", {"name": name, key: value})
+
+
+# ---- the rest of the contract ----------------------------------------------------------------------------
+
+
+@in_two_folders
+def test_augment_changes_no_label(published: Published, root: Path) -> None:
+    data = prepared(published.archive.name, root)
+    batch = dict(table(data, "train"))
+    torch.manual_seed(0)
+    varied = data.augment(batch)
+    assert torch.equal(varied["target"], batch["target"])
+    assert not torch.equal(255 * varied["input"], batch["input"].float())
+    assert prepared(published.archive.name, root, jitter=0.0).augment(batch) is batch
+
+
+@every
+def test_test_blur_changes_the_test_split_only(published: Published, root: Path) -> None:
+    name = published.archive.name
+    for split in ("train", "test"):
+        for file in root.glob(f"{split}/*"):  # as written they are of one colour
+            Image.fromarray(pixels(0, published.side)).save(file)
+    sharp, smooth = prepared(name, root), prepared(name, root, test_blur=2.0)
+    for split in ("train", "validation"):
+        assert torch.equal(table(sharp, split)["input"], table(smooth, split)["input"])
+    changes = [table(data, "test")["input"].float().diff(dim=3).abs().mean() for data in (smooth, sharp)]
+    assert changes[0] < 0.2 * changes[1]
+    assert torch.equal(table(sharp, "test")["target"], table(smooth, "test")["target"])
+    assert (sharp.fingerprint()["test_blur"], smooth.fingerprint()["test_blur"]) == ("0.0", "2.0")
+
+
+@every
+def test_read_takes_a_users_own_files(published: Published, root: Path) -> None:
+    data = load("data", published.archive.name)()
+    samples = data.read([root / published.image])
+    assert isinstance(samples, Fields)
+    assert samples.fields.keys() == {"input", "index"}
+    picture = data.picture(samples[0]["input"])
+    with Image.open(root / published.image) as image:
+        assert np.array_equal(picture, np.asarray(image))
+    assert picture.shape == (published.side, published.side, 3)
+
+
+# ---- the synthetic sets ----------------------------------------------------------------------------------
+
+
+def files_of(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("archive", "images", "files"),
+    [(IDIAP, 40, 42), (TOWNCENTRE, 48, 97), (CAVIAR, 40, 42)],
+    ids=lambda x: getattr(x, "name", None),
+)
+def test_generation_is_the_same_to_the_byte_whatever_the_threads(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, archive: Archive, images: int, files: int
+) -> None:
+    contents = []
+    for painters in (1, 3):
+        monkeypatch.setattr(generated, "PAINTERS", painters)
+        monkeypatch.setenv("FRAMEWORK_CACHE", str(cache / str(painters)))
+        contents.append(files_of(Source(archive, None, images, 5).folder()))
+    first, second = contents
+    assert len(first) == files
+    assert first == second
+    other = files_of(Source(archive, None, images, 6).folder())
+    assert len(other) == files
+    if archive is not IDIAP:  # whose names tell the person
+        assert first.keys() == other.keys()
+    assert not any(content == other.get(name) for name, content in first.items())
+    mark = json.loads(first["synthetic.json"])
+    assert (mark["seed"], mark["images"]) == (5, images)
+
+
+@pytest.mark.parametrize(
+    ("archive", "sizes"), [(IDIAP, [38, 11, 11]), (CAVIAR, [36, 12, 12])], ids=["idiap", "caviar"]
+)
+def test_generated_set_is_read_by_the_same_loader(archive: Archive, sizes: list[int]) -> None:
+    data = prepared(archive.name, None, images=60)
+    assert data.synthetic
+    assert data.fingerprint()["root"] == "synthetic, seed 0"
+    assert [len(table(data, split)["input"]) for split in SPLITS] == sizes
+    whole = prepared(archive.name, Source(archive, None, 60, 0).folder())
+    assert whole.synthetic
+    assert whole.fingerprint()["sha256"] == data.fingerprint()["sha256"]
+
+
+@pytest.mark.parametrize("name", ["idiap", "caviar"])
+def test_generated_data_that_are_damaged_are_to_be_deleted(cache: Path, name: str) -> None:
+    prepared(name, None, images=20)
+    next(cache.rglob("*.jpg")).write_bytes(b"")
+    with pytest.raises(DataError, match=rf"Delete {cache}/{name}: the data are generated anew"):
+        prepared(name, None, images=20)
+
+
+@pytest.mark.parametrize(
+    ("name", "images", "correlation"),
+    [("idiap", 600, 0.4), ("towncentre", 1200, 0.4), ("caviar", 1200, 0.25)],
+)
+def test_pictures_agree_with_their_labels(name: str, images: int, correlation: float) -> None:
+    """A kernel regression of the first angle's sine on coarse grey pictures: on mirror images its sign is turned."""
+    data = prepared(name, None, images=images, image_size=16)
+
+    def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
+        fields = table(data, split)
+        grey = fields["input"].flip(-1) if mirrored else fields["input"]
+        grey = grey.float().mean(1).flatten(1)
+        grey = (grey - grey.mean(1, keepdim=True)) / (grey.std(1, keepdim=True) + 1)
+        return grey.numpy(), fields["target"][:, 0].sin().numpy()
+
+    regression = KernelRidge(kernel="rbf", gamma=2e-3, alpha=0.3).fit(*columns("train", mirrored=False))
+    for mirrored, sign in ((False, 1), (True, -1)):
+        pictures, sine = columns("test", mirrored=mirrored)
+        assert sign * np.corrcoef(regression.predict(pictures), sine)[0, 1] > correlation

@@ -1,0 +1,126 @@
+"""The IDIAP label file, an HDF5 file: what is read, what is refused, and what is written."""
+
+import math
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from framework.errors import DataError
+from plugins.data.head_pose.idiap import PEOPLE, pose
+from plugins.data.head_pose.idiap_labels import LABELS, Label, read_labels, write_labels
+from plugins.data.head_pose.roots import idiap_row, prepared, publish_idiap, save_idiap, table, write_idiap
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_idiap(tmp_path / "IHDPHeadPose")
+
+
+def test_structs_may_lie_in_a_row(root: Path) -> None:
+    column = table(prepared("idiap", root), "train")
+    publish_idiap(root, column=False)
+    row = table(prepared("idiap", root), "train")
+    assert torch.equal(row["input"], column["input"])
+    assert torch.equal(row["target"], column["target"])
+
+
+def test_angles_are_chosen_and_ordered(root: Path) -> None:
+    data = prepared("idiap", root, angles=["roll", "pan", "roll"])
+    assert data.target.names == ("roll", "pan")
+    expected = torch.tensor([[idiap_row(number)[3], idiap_row(number)[1]] for number in range(20)])
+    torch.testing.assert_close(table(data, "train")["target"], expected)
+
+
+def test_struct_of_one_element(root: Path) -> None:
+    publish_idiap(root, train=[7])
+    (label,) = read_labels(root / LABELS, "radians")["train"]
+    assert label == Label("head_7.png", idiap_row(7)[1:])
+
+
+def test_degrees_and_radians_are_told_apart(root: Path) -> None:
+    turned = {
+        f"or_label_{split}": [
+            (name, *(math.degrees(angle) for angle in angles)) for name, *angles in map(idiap_row, numbers)
+        ]
+        for split, numbers in (("train", range(20)), ("test", range(20, 31)))
+    }
+    radians = table(prepared("idiap", root), "train")["target"]
+    with pytest.raises(DataError, match=r"looks like radians; wanted degrees\. Set data\.angles_in=radians"):
+        prepared("idiap", root, angles_in="degrees")
+    save_idiap(root / LABELS, **turned)
+    with pytest.raises(DataError, match=r"look like degrees; wanted radians\. Set data\.angles_in=degrees"):
+        prepared("idiap", root)
+    torch.testing.assert_close(
+        table(prepared("idiap", root, angles_in="degrees"), "train")["target"], radians
+    )
+
+
+@pytest.mark.parametrize("content", [b"", b"no HDF5 at all" * 99, b"MATLAB 5.0 MAT-file".ljust(600)])
+def test_label_file_that_cannot_be_read(root: Path, content: bytes) -> None:
+    (root / LABELS).write_bytes(content)
+    with pytest.raises(
+        DataError, match=r"or_label_full\.mat: cannot be read as the MATLAB 7\.3 \(HDF5\) file"
+    ):
+        prepared("idiap", root)
+
+
+def test_label_file_that_is_cut_short_or_lacks_something_is_named(root: Path) -> None:
+    whole = (root / LABELS).read_bytes()
+    for length in range(0, len(whole) - 1, 4999):
+        (root / LABELS).write_bytes(whole[:length])
+        with pytest.raises(DataError, match=r"or_label_full\.mat: cannot be read"):
+            prepared("idiap", root)
+    for missing in ("or_label_test", "or_label_train/roll"):
+        (root / LABELS).write_bytes(whole)
+        with h5py.File(root / LABELS, "r+") as content:
+            del content[missing]
+        with pytest.raises(DataError, match=missing.split("/")[-1]):
+            prepared("idiap", root)
+    (root / LABELS).write_bytes(whole)
+    with h5py.File(root / LABELS, "r+") as content:
+        shorter = content["or_label_train/tilt"][:19]
+        del content["or_label_train/tilt"]
+        content["or_label_train/tilt"] = shorter
+    with pytest.raises(DataError, match=r"fields of different lengths: .*'tilt': 19"):
+        prepared("idiap", root)
+
+
+@pytest.mark.parametrize("angle", [math.nan, math.inf])
+def test_angle_that_is_not_finite_is_never_skipped(root: Path, angle: float) -> None:
+    publish_idiap(root, or_label_train=[idiap_row(0), ("head_1.png", 0.5, angle, 0.25)])
+    with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*head_1\.png: 0\.5, {angle}, 0\.25"):
+        prepared("idiap", root, skip_unreadable=True)
+    assert (
+        len(table(prepared("idiap", root, angles=["pan"]), "train")["input"]) == 2
+    )  # nobody asks for that tilt
+
+
+def test_labels_are_written_as_matlab_lays_them_out(tmp_path: Path) -> None:
+    labels = {
+        "train": [Label("a_1.jpg", (1.0, -2.0, 3.0)), Label("b.jpg", (0.5, 0.25, 0.125))],
+        "test": [Label("c.jpg", (0.0, 0.0, 0.0)), Label("d.jpg", (0.0, 0.0, 1.0))],
+    }
+    write_labels(tmp_path / LABELS, labels)
+    assert read_labels(tmp_path / LABELS, "radians") == labels
+    assert (tmp_path / LABELS).read_bytes().startswith(b"MATLAB 7.3 MAT-file")
+    with h5py.File(tmp_path / LABELS) as content:
+        field = content["or_label_train/name"]
+        assert field.shape == (2, 1)
+        cell = content[field[1, 0]]
+        assert (cell.dtype, cell.shape) == (np.uint16, (5, 1))
+
+
+def test_generated_set_is_read_as_it_was_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
+    data = prepared(
+        "idiap", None, images=60, angles_in="degrees"
+    )  # which says how a user's own file is to be read
+    drawn = []
+    for number in range(38):
+        random = np.random.default_rng([0, 0, number])
+        random.integers(PEOPLE)
+        drawn.append(pose(random))
+    np.testing.assert_allclose(table(data, "train")["target"].rad2deg(), drawn, atol=1e-4)

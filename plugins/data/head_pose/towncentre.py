@@ -1,0 +1,127 @@
+"""The TownCentre heads, and drawn ones in their layout: a folder a person, an image and a text file a head."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from PIL import Image
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data, Splits
+from framework.datasets import images
+from framework.storage.generated import draw_all, read_mark
+from framework.target import Target
+from plugins.data.head_pose import synthetic_heads
+from plugins.data.head_pose.archive import Archive, Source
+from plugins.data.head_pose.labelled_images import Reading, load
+from plugins.data.head_pose.synthetic_heads import Conditions, Pose
+from plugins.data.head_pose.towncentre_labels import FOLDER, by_person, find_heads, label_text
+
+SIDE = 50  # pixels
+EACH = 8
+"""So many images show the same person."""
+CONDITIONS = Conditions(
+    pixels=(20, 46), height=(0.5, 0.66), offset=0.05, blur=0.9, noise=0.05, clutter=6, occluded=0.12
+)
+AS_PUBLISHED = Reading(image_size=SIDE)
+
+
+class TownCentre(Data):
+    """Heads of pedestrians seen by a surveillance camera, and their pan; generated where no root is given.
+
+    Attributes:
+        invalid: how many heads their label marks as not valid, which are left out; set by `prepare`.
+    """
+
+    bibtex = """@inproceedings{benfold2009guiding,
+  author = {Benfold, Ben and Reid, Ian},
+  title = {Guiding Visual Surveillance by Tracking Human Attention},
+  booktitle = {British Machine Vision Conference (BMVC)},
+  year = {2009}
+}
+@inproceedings{beyer2015biternion,
+  author = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
+  title = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
+  booktitle = {German Conference on Pattern Recognition},
+  year = {2015}
+}"""
+    groups = ("towncentre",)
+    target = Target("angle", ("pan",))
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        reading: Reading = AS_PUBLISHED,
+        mirror: bool = True,
+        images: Annotated[int, Field(ge=200, le=1_000_000)] = 2400,
+        generator_seed: Annotated[int, Field(ge=0)] = 0,
+    ) -> None:
+        self.source = Source(ARCHIVE, root, images, generator_seed)
+        self.reading = reading
+        self.mirror = mirror
+        self.input_shape = (3, reading.image_size, reading.image_size)
+
+    def prepare(self) -> None:
+        root = self.source.folder()
+        self.synthetic = read_mark(root) is not None
+        heads, self.invalid, faults = find_heads(root)
+        self.loaded = load(
+            by_person(heads),
+            self.target.names,
+            self.reading,
+            faults,
+            generated_in=self.source.generated_in(),
+            left_out=f", {self.invalid} marked as not valid",
+        )
+        self.skipped = self.loaded.skipped
+
+    def splits(self) -> Splits:
+        return Splits(**self.loaded.tables)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return self.reading.own(files)
+
+    def augment(self, batch: Batch) -> Batch:
+        # The mirror image of a head at pan p shows one at -p, 360° - p in the words of Beyer et al.
+        return images.varied(batch, (-1.0,) if self.mirror else (), self.reading.jitter)
+
+    def fingerprint(self) -> Mapping[str, str]:
+        return self.source.fingerprint(self.synthetic) | self.loaded.fingerprint
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)
+
+
+def pose(heading: float, random: np.random.Generator) -> Pose:
+    """Draw where a person looks who walks towards `heading`, degrees."""
+    pan = heading + random.normal(0, 35)
+    return Pose(float(pan), float(random.normal(0, 6)), float(random.normal(0, 4)))
+
+
+def _draw(root: Path, images: int, seed: int) -> None:
+    for person in range(-(-images // EACH)):
+        (root / f"{person:04d}").mkdir()
+
+    def draw(number: int) -> None:
+        person = number // EACH
+        of_person = np.random.default_rng([seed, 1, person])
+        who, heading = synthetic_heads.person(of_person), of_person.uniform(0, 360)
+        random = np.random.default_rng([seed, 0, number])
+        looks, valid = pose(heading, random), random.random() >= 0.03
+        picture = synthetic_heads.photograph(random, who, looks, SIDE, CONDITIONS)
+        if not valid:
+            picture = picture[:5]  # a head that was cut off
+        folder, stem = root / f"{person:04d}", f"synthetic_{person}_{number:06d}"
+        # the official names go on behind the stem as well
+        Image.fromarray(picture).save(folder / f"{stem}_{number % EACH}.jpg", quality=95)
+        text = label_text((looks.pan + 180) % 360 - 180, valid)
+        (folder / f"{stem}.txt").write_text(text, encoding="utf-8")
+
+    draw_all(images, draw, "the synthetic towncentre images")
+
+
+ARCHIVE = Archive("towncentre", FOLDER, (), version=1, draw=_draw)
