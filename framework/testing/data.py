@@ -116,6 +116,8 @@ def _attributes(bench: Workbench, worst: Worst) -> None:
     worst.same("synthetic", type(data.synthetic), bool)
     worst.same("varies", type(data.varies), bool)
     worst.count(not _whole((data.skipped,)), f"skipped {data.skipped!r}; wanted a number from 0")
+    if bench.row.synthetic is not None:  # a row's own files are whole
+        worst.same("skipped", data.skipped, 0)
     worst.same("bibtex", type(data.bibtex), str)
     for name, split in parts(data).items():
         worst.count(not len(split), f"the {name} split is empty")
