@@ -15,7 +15,7 @@ from framework.errors import DataError
 from framework.storage import cache
 from framework.storage.generated import generated, read_mark
 from framework.target import Target
-from framework.testing.contract import contract
+from framework.testing.contract import _shipped, contract
 from framework.testing.data import examine_data
 from framework.testing.data_folders import configured
 from framework.testing.finding import require
@@ -291,8 +291,35 @@ def test_a_users_own_root_is_read_and_never_damaged() -> None:
     assert row.config == {"data_seed": 0, "root": "/own"}
     assert (row.fragile, row.skip, row.changes, row.synthetic) == ({}, {}, {}, None)
     assert row.files is files
+    assert configured(ROW, {}, {"data_seed": 1}).changes == {}  # which would change nothing
     row = configured(DataRow("real", write=written, fragile={"*.txt": DAMAGES}), {}, {"data_seed": 3})
     assert (row.write, row.fragile) == (written, {"*.txt": DAMAGES})
+
+
+def test_rows_stand_beside_the_class_or_in_its_familys_folder(tmp_path, monkeypatch) -> None:
+    row = "from framework.testing.rows import DataRow, MetricRow\nfrom framework.target import Target\n"
+    ofmetric = 'MetricRow("", Target("real", ("x",)))'
+    for place, text in {
+        "kin/data/rows.py": "raise RuntimeError('of the drawer, and nobody's')",
+        "kin/data/family/rows.py": row
+        + 'ROWS = {name: (DataRow(f"{name} of all"),) for name in ("one", "two")}',
+        "kin/data/family/first/rows.py": row
+        + f'ROWS = {{"one": (DataRow("one alone"),), "two": ({ofmetric},)}}',
+        "kin/data/lonely/data.py": "",
+    }.items():
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def shipped(name, module):
+        monkeypatch.setattr("framework.testing.contract.load", lambda group, name: Needles)
+        monkeypatch.setattr(Needles, "__module__", module)
+        return [row.name for row in _shipped("data", name)]
+
+    assert shipped("one", "kin.data.family.first.data") == ["one alone"]
+    assert shipped("two", "kin.data.family.first.data") == ["two of all"]
+    assert shipped("two", "kin.data.family.second") == ["two of all"]
+    assert shipped("one", "kin.data.lonely.data") == []
 
 
 def test_parameters_of_a_shipped_data_set_stand_beside_those_of_its_first_row(tmp_path) -> None:

@@ -12,6 +12,7 @@ from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.finding import Finding
 from framework.testing.rows import (
+    SAID_BY_ROWS,
     DataRow,
     EncoderRow,
     HeadRow,
@@ -115,8 +116,10 @@ def _shipped(group: str, name: str) -> tuple[Row, ...]:
 def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> tuple[Row, ...]:
     """Rows with `config` on every target or shape that the plugin accepts."""
     resolved = resolve(group, {"name": name, **config})
-    if group in ("data", "renderer"):
-        return (ROW_OF[group](label, config=config),)
+    if group == "data":
+        return (DataRow(label, config, leave_out=SAID_BY_ROWS),)
+    if group == "renderer":
+        return (RendererRow(label, config),)
     found: list[Row] = []
     refused: list[str] = []
     for option in SHAPES if group == "encoder" else TARGETS:

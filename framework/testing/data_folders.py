@@ -145,7 +145,8 @@ def first_match(folder: Path, pattern: str) -> Path:
 
 def configured(row: DataRow, usual: Mapping[str, Any], own: Mapping[str, Any]) -> DataRow:
     """The row with a user's own parameters beside its `usual` ones; a user's own data are read, never damaged."""
-    row = replace(row, config={**usual, **own})
+    changes = {key: value for key, value in row.changes.items() if key not in own}
+    row = replace(row, config={**usual, **own}, changes=changes)
     with TemporaryDirectory() as folder:
         says_where = {"root", *(row.write(Path(folder)) if row.write else ())}
     if says_where & set(own):

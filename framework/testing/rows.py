@@ -162,6 +162,19 @@ Damage = Literal["missing", "empty", "cut", "garbage", "folder"]
 DAMAGES: tuple[Damage, ...] = ("missing", "empty", "cut", "garbage", "folder")
 
 
+SAID_BY_ROWS: Mapping[str, str] = dict.fromkeys(
+    (
+        "synthetic is said",
+        "damaged files are named",
+        "files left out are counted",
+        "own files",
+        "damaged own files are named",
+    ),
+    "a rows.py has to say what is wanted",
+)
+"""What of a data set without rows cannot be checked, and why."""
+
+
 @dataclass(frozen=True)
 class DataRow:
     """One parametrisation of a data set, as small as it goes: it is prepared a dozen times.
