@@ -28,7 +28,7 @@ def read_back(bench: Workbench, worst: Worst) -> None:
 
 
 def missing_root(bench: Workbench, worst: Worst) -> None:
-    """A place that is not there is named, and where data are wanted but not named, the parameter is."""
+    """A place that is not there is named; without a place real data are asked for, or others generated and said so."""
     nowhere = bench.folder() / "nowhere"
     for key in bench.says_where:
         refused(
@@ -37,13 +37,16 @@ def missing_root(bench: Workbench, worst: Worst) -> None:
             f"{key} = {nowhere}",
             worst,
         )
-        if not bench.data.synthetic:
-            refused(
-                lambda key=key: bench.prepared(bench.first, **{key: None}),
-                [f"data.{key}"],
-                f"{key} = None",
-                worst,
+        if bench.data.synthetic or bench.default(key) is not None:
+            continue
+        try:
+            found = bench.prepared(bench.first, **{key: None})
+        except DataError as error:
+            worst.count(
+                f"data.{key}" not in str(error), f"{key} = None: {error}, which does not say data.{key}"
             )
+        else:
+            worst.same(f"{key} = None: synthetic", found.synthetic, True)
 
 
 def damaged_files(bench: Workbench, worst: Worst) -> None:

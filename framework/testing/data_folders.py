@@ -95,9 +95,13 @@ class Workbench:
     def says_where(self) -> list[str]:
         """The parameters that say where the data are: those of what was written, else `root` where there is one."""
         if self.row.write is None:
-            return [name for name in inspect.signature(type(self.data).__init__).parameters if name == "root"]
+            return ["root"] if "root" in inspect.signature(type(self.data)).parameters else []
         below = self.first.files
         return [key for key, value in self.first.source.items() if Path(str(value)).is_relative_to(below)]
+
+    def default(self, key: str) -> Any:
+        """What the constructor takes where a parameter is not given."""
+        return inspect.signature(type(self.data)).parameters[key].default
 
     @cached_property
     def generated(self) -> Path | None:
