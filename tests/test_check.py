@@ -1,6 +1,7 @@
 """mode=check: a sound plugin passes by name, an unsound one fails and is told where."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -44,6 +45,32 @@ def test_a_wrapper_that_mixes_densities_passes_and_one_that_averages_parameters_
     done = framework("mode=check", "uncertainty=[averaged_committee]")
     assert done.code == 1, done.out
     assert "averaged_committee: one member is the member" in done.out
+
+
+def test_a_strangers_data_set_passes_without_rows_as_far_as_one_can_say(framework: Framework) -> None:
+    done = framework("mode=check", "data=dial")
+    assert done.code == 0, done.out
+    assert "no sample in two splits" in done.out
+    assert "a rows.py has to say what is wanted" in done.out
+    done = framework("mode=check", "data=dial", "+data.bad_label=3")
+    assert done.code == 1, done.out
+    assert "dial: samples" in done.out
+
+
+def test_a_data_set_passes_by_name_and_with_a_users_own_table(framework: Framework, tmp_path: Path) -> None:
+    done = framework("mode=check", "data=moons", "data.noise=0.2")
+    assert done.code == 0, done.out
+    findings = (done.folder / "check.csv").read_text(encoding="utf-8")
+    assert "as configured" in findings
+    assert "damaged own files are named" in findings
+    table = tmp_path / "own.csv"
+    table.write_text("x,y\n" + "".join(f"{row},{'ab'[row % 3 == 0]}\n" for row in range(40)))
+    done = framework("mode=check", "data=tabular", f"data.path={table}", "data.target=y")
+    assert done.code == 0, done.out
+    table.write_text("x,y\n" + "".join(f"{row % 5},{'ab'[row % 5 == 0]}\n" for row in range(40)))
+    done = framework("mode=check", "data=tabular", f"data.path={table}", "data.target=y")
+    assert done.code == 1, done.out
+    assert "tabular: no sample in two splits" in done.out
 
 
 def test_parameters_from_the_command_line_are_a_row(framework: Framework) -> None:

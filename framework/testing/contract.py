@@ -11,9 +11,18 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.finding import Finding
-from framework.testing.rows import EncoderRow, HeadRow, MetricRow, ObjectiveRow, RendererRow, WrapperRow
+from framework.testing.rows import (
+    SAID_BY_ROWS,
+    DataRow,
+    EncoderRow,
+    HeadRow,
+    MetricRow,
+    ObjectiveRow,
+    RendererRow,
+    WrapperRow,
+)
 
-Row = HeadRow | EncoderRow | MetricRow | ObjectiveRow | RendererRow | WrapperRow
+Row = DataRow | HeadRow | EncoderRow | MetricRow | ObjectiveRow | RendererRow | WrapperRow
 TARGETS = (
     Target("angle", ("azimuth",)),
     Target("angle", ("azimuth", "elevation", "tilt")),
@@ -22,10 +31,13 @@ TARGETS = (
     Target("class", ("first", "second", "third")),
 )
 ROW_OF = {
+    "data": DataRow,
     "density_head": HeadRow,
+    "encoder": EncoderRow,
+    "uncertainty": WrapperRow,
     "metric": MetricRow,
     "objective": ObjectiveRow,
-    "uncertainty": WrapperRow,
+    "renderer": RendererRow,
 }
 SHAPES = ((3, 64, 64), (1, 96, 80), (16,))
 """What a plugin without rows is tried with; it may refuse some, with a ConfigError."""
@@ -72,20 +84,40 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
     further = replace(shipped[0], name="as configured", config=plain)
     if isinstance(further, HeadRow):
         further = replace(further, cases=None)
+    if isinstance(further, DataRow):
+        from framework.testing.data_folders import configured
+
+        usual = resolve(group, {"name": name})
+        further = configured(
+            further, shipped[0].config, {key: plain[key] for key in plain if plain[key] != usual[key]}
+        )
     return Contract(group, name, (further, *shipped))
 
 
 def _shipped(group: str, name: str) -> tuple[Row, ...]:
-    """The rows a plugin gives in the `rows.py` beside its class; none where there is no such file."""
+    """The rows a plugin gives in the `rows.py` beside its class, else those its family gives in a folder above.
+
+    A family's folder stands in the drawer of its registry, `plugins/<group>/<family>`. Where there is no drawer of this
+    name, as in a package of somebody else's, any folder above counts.
+    """
     package = load(group, name).__module__.rpartition(".")[0]
-    if not package or find_spec(f"{package}.rows") is None:
-        return ()
-    return tuple(import_module(f"{package}.rows").ROWS.get(name, ()))
+    while package:
+        if find_spec(f"{package}.rows") is not None:
+            rows = import_module(f"{package}.rows").ROWS.get(name, ())
+            found = tuple(row for row in rows if isinstance(row, ROW_OF[group]))
+            if found:
+                return found
+        package = package.rpartition(".")[0]
+        if package.rpartition(".")[2] == group:
+            break
+    return ()
 
 
 def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> tuple[Row, ...]:
     """Rows with `config` on every target or shape that the plugin accepts."""
     resolved = resolve(group, {"name": name, **config})
+    if group == "data":
+        return (DataRow(label, config, leave_out=SAID_BY_ROWS),)
     if group == "renderer":
         return (RendererRow(label, config),)
     found: list[Row] = []
@@ -125,6 +157,12 @@ def _examiner(group: str) -> Callable[[str, Any], Iterator[Finding]]:
     if group not in CONTRACTS:
         raise ConfigError(f"No contract is written for the group {group}, only for {', '.join(CONTRACTS)}.")
     return CONTRACTS[group]
+
+
+def _examine_data(name: str, row: DataRow) -> Iterator[Finding]:
+    from framework.testing.data import examine_data
+
+    yield from examine_data(row, lambda config: build("data", resolve("data", {"name": name, **config})))
 
 
 def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
@@ -185,6 +223,7 @@ def _examine_renderer(name: str, row: RendererRow) -> Iterator[Finding]:
 
 
 CONTRACTS: dict[str, Callable[[str, Any], Iterator[Finding]]] = {
+    "data": _examine_data,
     "density_head": _examine_head,
     "encoder": _examine_encoder,
     "uncertainty": _examine_wrapper,

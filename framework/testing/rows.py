@@ -1,13 +1,14 @@
 """Rows of the contract: a plugin states parameters and references in its `rows.py`, and every check runs on them.
 
-`rows.py` stands beside the module that holds the plugin's class; its `ROWS` is a dictionary from the plugin's name to
-its rows, of `HeadRow` for a density head, and so on. A plugin without rows is checked with its default parameters and
-no reference.
+`rows.py` stands beside the module that holds the plugin's class, or for a family in a folder above it; its `ROWS` is a
+dictionary from the plugin's name to its rows, of `HeadRow` for a density head, and so on. A plugin without rows is
+checked with its default parameters and no reference.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -152,5 +153,52 @@ class RendererRow:
 
     name: str
     config: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    leave_out: Mapping[str, str] = field(default_factory=dict)
+
+
+Damage = Literal["missing", "empty", "cut", "garbage", "folder"]
+"""What can happen to a file: it is gone, has no bytes, half of them, others, or a folder stands in its place."""
+DAMAGES: tuple[Damage, ...] = ("missing", "empty", "cut", "garbage", "folder")
+
+
+SAID_BY_ROWS: Mapping[str, str] = dict.fromkeys(
+    (
+        "synthetic is said",
+        "damaged files are named",
+        "files left out are counted",
+        "own files",
+        "damaged own files are named",
+    ),
+    "a rows.py has to say what is wanted",
+)
+"""What of a data set without rows cannot be checked, and why."""
+
+
+@dataclass(frozen=True)
+class DataRow:
+    """One parametrisation of a data set, as small as it goes: it is prepared a dozen times.
+
+    Attributes:
+        name: what distinguishes it from the plugin's other rows.
+        config, limits, leave_out: as in HeadRow.
+        write: fills an empty folder with what the data set reads, the official layout where there is one, and returns
+            the parameters that say where it is ({"root": ...}). None where data are generated.
+        synthetic: what `Data.synthetic` has to say; None: anything.
+        files: fills an empty folder with two or more files of a user's own, no two alike, for `Data.read`.
+        fragile: pattern of files below what was written or generated → the damage to the first of them that `prepare`
+            has to name. Half a list of names is a list of names: such damage nobody can see.
+        skip: parameters that have files of the first of these patterns left out and counted where they cannot be read.
+        changes: parameters each of which changes the samples, and with them the fingerprint.
+    """
+
+    name: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+    write: Callable[[Path], Mapping[str, Any]] | None = None
+    synthetic: bool | None = None
+    files: Callable[[Path], Sequence[Path]] | None = None
+    fragile: Mapping[str, Collection[Damage]] = field(default_factory=dict)
+    skip: Mapping[str, Any] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
     leave_out: Mapping[str, str] = field(default_factory=dict)

@@ -1,6 +1,5 @@
 """The two moons with overlapping noise; the contract is framework.data's."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -11,15 +10,10 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
-from framework.target import Target
 from plugins.data.moons.generator import draw, posterior
-from plugins.data.moons.points import LABELS, picture, read_points, shown
-
-Size = Annotated[int, Field(ge=1, le=10_000_000)]
-Noise = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
-DataSeed = Annotated[int, Field(ge=0, lt=2**31)]
+from plugins.data.moons.points import TARGET, DataSeed, Size, fingerprint, picture, read_points, split_of
 
 
 class Moons(Data):
@@ -42,6 +36,12 @@ class Moons(Data):
   pages = {2825--2830},
   year = {2011}
 }"""
+    target = TARGET
+    input_shape = (2,)
+    groups = ("moons",)
+    synthetic = True
+    skipped = 0
+    varies = False
 
     def __init__(
         self,
@@ -49,41 +49,24 @@ class Moons(Data):
         train: Size = 500,
         validation: Size = 500,
         test: Size = 5000,
-        noise: Noise = 0.37,
+        noise: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] = 0.37,
         data_seed: DataSeed = 0,
     ) -> None:
-        self.sizes = {"train": train, "validation": validation, "test": test}
+        self.sizes = (train, validation, test)
         self.noise = noise
         self.data_seed = data_seed
 
     def prepare(self) -> None:
-        self.target = Target("class", LABELS)
-        self.input_shape = (2,)
-        self.groups = ("moons",)
-        self.synthetic = True
-        self.skipped = 0
-        self._tables = {name: self._table(name) for name in self.sizes}
+        self._splits = [self._drawn(size, number) for number, size in enumerate(self.sizes)]
 
-    def _table(self, split: str) -> Fields:
-        size = self.sizes[split]
-        points, label = draw(size, self.noise, self.data_seed, list(self.sizes).index(split))
+    def _drawn(self, size: int, split: int) -> Fields:
+        points, label = draw(size, self.noise, self.data_seed, split)
         inputs = torch.from_numpy(points).float()
-        return Fields(
-            input=inputs,
-            target=torch.from_numpy(label),
-            posterior=torch.from_numpy(posterior(inputs.double().numpy(), self.noise)).float(),
-            group=torch.zeros(size, dtype=torch.int64),
-            index=torch.arange(size),
-        )
+        exact = posterior(inputs.double().numpy(), self.noise)
+        return split_of(inputs, label, posterior=torch.from_numpy(exact).float())
 
-    def train(self) -> Dataset[Batch]:
-        return self._tables["train"]
-
-    def validation(self) -> Dataset[Batch]:
-        return self._tables["validation"]
-
-    def test(self) -> Dataset[Batch]:
-        return self._tables["test"]
+    def splits(self) -> Splits:
+        return Splits(*self._splits)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return read_points(files)
@@ -92,18 +75,7 @@ class Moons(Data):
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:
-        digest = hashlib.sha256()
-        for table in self._tables.values():
-            digest.update(table.fields["input"].numpy().tobytes())
-        return {
-            "root": "generated",
-            "version": "moons 1",
-            "noise": str(self.noise),
-            "data_seed": str(self.data_seed),
-            **{name: str(size) for name, size in self.sizes.items()},
-            "sha256": digest.hexdigest(),
-        }
+        return fingerprint("moons 1", self._splits, noise=self.noise, data_seed=self.data_seed)
 
     def picture(self, inputs: Tensor) -> np.ndarray:
-        fields = self._tables["train"].fields
-        return picture(shown(inputs), fields["input"].double().numpy(), fields["target"].numpy())
+        return picture(inputs, self._splits[0])

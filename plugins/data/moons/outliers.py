@@ -1,6 +1,5 @@
 """Points where no moon is; the contract is framework.data's."""
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,11 +11,9 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
-from framework.target import Target
-from plugins.data.moons.data import DataSeed, Size
-from plugins.data.moons.points import LABELS, picture, read_points, shown
+from plugins.data.moons.points import TARGET, DataSeed, Size, fingerprint, picture, read_points, split_of
 
 
 class MoonsOutliers(Data):
@@ -41,6 +38,12 @@ class MoonsOutliers(Data):
   school = {Universit{\\"a}t T{\\"u}bingen},
   year = {2020}
 }"""
+    target = TARGET
+    input_shape = (2,)
+    groups = ("outliers",)
+    synthetic = True
+    skipped = 0
+    varies = False
 
     def __init__(
         self,
@@ -52,45 +55,26 @@ class MoonsOutliers(Data):
         radius: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.6,
         data_seed: DataSeed = 0,
     ) -> None:
-        self.sizes = {"train": train, "validation": validation, "test": test}
+        self.sizes = (train, validation, test)
         self.corner = corner
         self.radius = radius
         self.data_seed = data_seed
 
     def prepare(self) -> None:
-        self.target = Target("class", LABELS)
-        self.input_shape = (2,)
-        self.groups = ("outliers",)
-        self.synthetic = True
-        self.skipped = 0
-        self._tables = {name: self._table(name) for name in self.sizes}
+        self._splits = [self._drawn(size, number) for number, size in enumerate(self.sizes)]
 
-    def _table(self, split: str) -> Fields:
-        size = self.sizes[split]
+    def _drawn(self, size: int, split: int) -> Fields:
         # 1: a stream of its own beside those of moons with the same seed
-        random = np.random.default_rng([self.data_seed, list(self.sizes).index(split), 1, 1]).random(
-            (size, 2)
-        )
+        random = np.random.default_rng([self.data_seed, split, 1, 1]).random((size, 2))
         label = np.arange(size) % 2
         centre = np.where(label == 0, 1.0, -1.0)[:, None] * [-self.corner, self.corner]
         # the square root of a uniform number is the radius of a uniform point of a disc
         distance, angle = self.radius * np.sqrt(random[:, 0]), 2 * math.pi * random[:, 1]
         points = centre + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-        return Fields(
-            input=torch.from_numpy(points).float(),
-            target=torch.from_numpy(label),
-            group=torch.zeros(size, dtype=torch.int64),
-            index=torch.arange(size),
-        )
+        return split_of(torch.from_numpy(points).float(), label)
 
-    def train(self) -> Dataset[Batch]:
-        return self._tables["train"]
-
-    def validation(self) -> Dataset[Batch]:
-        return self._tables["validation"]
-
-    def test(self) -> Dataset[Batch]:
-        return self._tables["test"]
+    def splits(self) -> Splits:
+        return Splits(*self._splits)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return read_points(files)
@@ -99,19 +83,13 @@ class MoonsOutliers(Data):
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:
-        digest = hashlib.sha256()
-        for table in self._tables.values():
-            digest.update(table.fields["input"].numpy().tobytes())
-        return {
-            "root": "generated",
-            "version": "moons_outliers 1",
-            "corner": str(self.corner),
-            "radius": str(self.radius),
-            "data_seed": str(self.data_seed),
-            **{name: str(size) for name, size in self.sizes.items()},
-            "sha256": digest.hexdigest(),
-        }
+        return fingerprint(
+            "moons_outliers 1",
+            self._splits,
+            corner=self.corner,
+            radius=self.radius,
+            data_seed=self.data_seed,
+        )
 
     def picture(self, inputs: Tensor) -> np.ndarray:
-        fields = self._tables["train"].fields
-        return picture(shown(inputs), fields["input"].double().numpy(), fields["target"].numpy())
+        return picture(inputs, self._splits[0])

@@ -1,23 +1,55 @@
-"""Points of the plane from a user's files, and as a person would see them."""
+"""Labelled points of the plane: as a split holds them, from a user's files, and as a person would see them."""
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
+from pydantic import Field
 from torch import Tensor
 
+from framework.data import Splits
 from framework.datasets.csv_columns import numbers, read_columns, require
 from framework.datasets.fields import Fields
 from framework.errors import DataError
+from framework.target import Target
 
-LABELS = ("upper", "lower")
+Size = Annotated[int, Field(ge=1, le=10_000_000)]
+DataSeed = Annotated[int, Field(ge=0, lt=2**31)]
+TARGET = Target("class", ("upper", "lower"))
 SIDE = 96
 """Pixels of a picture."""
 REACH = 4.0
 """A picture shows [-4, 4]², the square in which thesis §2.3.5 draws outliers."""
 COLOURS = np.array([[31, 119, 180], [255, 127, 14]], np.uint8)
+
+
+def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
+    """Points with their labels, in one group."""
+    return Fields(
+        input=inputs,
+        target=torch.from_numpy(label),
+        **more,
+        group=torch.zeros(len(inputs), dtype=torch.int64),
+        index=torch.arange(len(inputs)),
+    )
+
+
+def fingerprint(version: str, splits: Sequence[Fields], **parameters: object) -> dict[str, str]:
+    """What identifies draws: their parameters and sizes, and a hash over their points."""
+    digest = hashlib.sha256()
+    for split in splits:
+        digest.update(split.fields["input"].numpy().tobytes())
+    return {
+        "root": "generated",
+        "version": version,
+        **{name: str(value) for name, value in parameters.items()},
+        **{name: str(len(split)) for name, split in zip(Splits._fields, splits, strict=True)},
+        "sha256": digest.hexdigest(),
+    }
 
 
 def read_points(files: Sequence[Path]) -> Fields:
@@ -43,10 +75,10 @@ def read_points(files: Sequence[Path]) -> Fields:
     return Fields(input=torch.from_numpy(points).float(), index=torch.arange(len(points)))
 
 
-def picture(
-    point: Float[np.ndarray, "2"], cloud: Float[np.ndarray, "size 2"], label: Int[np.ndarray, "size"]
-) -> UInt8[np.ndarray, "side side 3"]:
-    """The cloud in two colours on white, and a black cross at the point, at the border where it lies outside."""
+def picture(inputs: Float[Tensor, "2"], among: Fields) -> UInt8[np.ndarray, "side side 3"]:
+    """All points of a split in two colours on white, and a black cross at one, at the border where it lies outside."""
+    point = inputs.detach().cpu().double().numpy()
+    cloud, label = among.fields["input"].double().numpy(), among.fields["target"].numpy()
     canvas = np.full((SIDE, SIDE, 3), 255, np.uint8)
     row, column = _pixel(cloud)
     canvas[row, column] = COLOURS[label]
@@ -56,11 +88,6 @@ def picture(
         inside = (rows >= 0) & (rows < SIDE) & (columns >= 0) & (columns < SIDE)
         canvas[rows[inside], columns[inside]] = 0
     return canvas
-
-
-def shown(inputs: Tensor) -> Float[np.ndarray, "2"]:
-    """One input as NumPy has it."""
-    return inputs.detach().cpu().double().numpy()
 
 
 def _pixel(points: Float[np.ndarray, "*batch 2"]) -> tuple[np.ndarray, np.ndarray]:

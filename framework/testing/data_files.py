@@ -1,0 +1,161 @@
+"""What the contract asks of a data set's files: roots that are missing, files that are damaged, a user's own files."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from framework.data import Data
+from framework.errors import DataError
+from framework.storage.generated import MARK
+from framework.testing.data_folders import Workbench, cache_in, damage, first_match
+from framework.testing.data_samples import equal_splits, parts, samples, total, trimmed
+from framework.testing.finding import TooSlow, Worst
+from framework.testing.rows import DAMAGES, Damage
+
+
+def read_back(bench: Workbench, worst: Worst) -> None:
+    """What was generated gives the same samples through `root`; it is synthetic as long as its mark says so."""
+    for what, synthetic in {"as it is": True, "without its mark": False}.items():
+        place, source = bench.spoilt(lambda root, keep=synthetic: None if keep else (root / MARK).unlink())
+        found = bench.prepared(place, **source)
+        worst.same(f"{what}: synthetic", found.synthetic, synthetic)
+        worst.same(f"{what}: target", found.target, bench.data.target)
+        worst.same(f"{what}: input_shape", found.input_shape, bench.data.input_shape)
+        equal_splits(found, bench.data, what, worst, only=("input", "target", "index", "group"))
+
+
+def missing_root(bench: Workbench, worst: Worst) -> None:
+    """A place that is not there is named; without a place real data are asked for, or others generated and said so."""
+    nowhere = bench.folder() / "nowhere"
+    for key in bench.says_where:
+        refused(
+            lambda key=key: bench.prepared(bench.first, **{key: str(nowhere)}),
+            [nowhere.name],
+            f"{key} = {nowhere}",
+            worst,
+        )
+        if bench.data.synthetic or bench.default(key) is not None:
+            continue
+        try:
+            found = bench.prepared(bench.first, **{key: None})
+        except DataError as error:
+            worst.count(
+                f"data.{key}" not in str(error), f"{key} = None: {error}, which does not say data.{key}"
+            )
+        else:
+            worst.same(f"{key} = None: synthetic", found.synthetic, True)
+
+
+def damaged_files(bench: Workbench, worst: Worst) -> None:
+    for pattern, kinds in bench.row.fragile.items():
+        for kind in kinds:
+            names: list[str] = []
+
+            def spoil(
+                root: Path, pattern: str = pattern, kind: Damage = kind, names: list[str] = names
+            ) -> None:
+                file = first_match(root, pattern)
+                damage(file, kind)
+                names.append(file.name)
+
+            place, source = bench.spoilt(spoil)
+            refused(
+                lambda place=place, source=source: bench.prepared(place, **source),
+                names,
+                f"{names[0]}: {kind}",
+                worst,
+            )
+
+
+def left_out(bench: Workbench, worst: Worst) -> None:
+    """A file that cannot be read costs its samples, and `skipped` says how many."""
+    pattern = next(iter(bench.row.fragile))
+    place, source = bench.spoilt(lambda root: damage(first_match(root, pattern), "garbage"))
+    found = bench.prepared(place, **source, **bench.row.skip)
+    left = total(bench.data) - total(found)
+    worst.count(found.skipped < 1, f"skipped {found.skipped} after damage to {pattern}")
+    worst.same("samples fewer", left, found.skipped - bench.data.skipped)
+
+
+def own_files(bench: Workbench, worst: Worst) -> None:
+    """Files are read without preparing anything, in their order, as the samples of the splits are."""
+    files, data = _own(bench)
+    together = _read(data, files, bench, worst)
+    apart = [sample for file in files for sample in _read(data, [file], bench, worst)]
+    backwards = _read(data, files[::-1], bench, worst)
+    count = len(_read(data, files[-1:], bench, worst))
+    for what, found, wanted in (
+        ("one file at a time", apart, together),
+        ("files backwards", backwards[:count], together[-count:]),
+        ("without prepare", _read(bench.data, files, bench, worst), together),
+    ):
+        worst.same(f"{what}: samples", len(found), len(wanted))
+        for number, (one, other) in enumerate(zip(found, wanted, strict=False)):
+            worst.same_bits(f"{what}: sample {number}", one, other)
+
+
+def damaged_own_files(bench: Workbench, worst: Worst) -> None:
+    for kind in DAMAGES:
+        files, data = _own(bench)
+        damage(files[0], kind)
+        # looking at a sample counts too: large collections are read when they are used
+        refused(
+            lambda files=files, data=data: data.read(files[::-1])[len(files) - 1],
+            [files[0].name],
+            kind,
+            worst,
+        )
+
+
+def refused(act: Callable[[], object], wanted: Sequence[str], what: str, worst: Worst) -> None:
+    """A DataError that says these words and what to do."""
+    try:
+        act()
+    except DataError as error:
+        told = " ".join(str(error).split())
+        missing = [word for word in wanted if word not in told]
+        short = len(told) < sum(map(len, wanted)) + 20
+        lacks = ", ".join(missing) or "what to do" * short
+        worst.count(
+            bool(lacks), f"{what}: {f'an error that does not say {lacks}: ' * bool(lacks)}{told[:300]}"
+        )
+    except TooSlow:
+        raise
+    except Exception as error:
+        worst.see(math.inf, f"{what}: {type(error).__name__} ({error}), wanted a DataError")
+    else:
+        worst.count(True, f"{what}: taken without a word, where the error should say {', '.join(wanted)}")
+
+
+def _own(bench: Workbench) -> tuple[list[Path], Data]:
+    """A user's own files, and a data set that is not prepared."""
+    assert bench.row.files is not None
+    return list(bench.row.files(bench.folder())), bench.built(bench.first)
+
+
+def _read(data: Data, files: Sequence[Path], bench: Workbench, worst: Worst) -> list[Tensor]:
+    """Every input without padding."""
+    with cache_in(bench.first.cache):
+        found = data.read(files)
+    sample_of_split = parts(bench.data)["train"][0]
+    like, wanted = sample_of_split["input"], bench.data.input_shape
+    inputs = []
+    for number, sample in samples(found):
+        where = f"sample {number} of {len(files)} files"
+        further = set(sample) - (set(sample_of_split) - {"target", "group"})
+        lacking = {"input", "index"} - set(sample)
+        worst.same(f"{where}: fields too many or missing", sorted(further | lacking), [])
+        if lacking:
+            continue
+        shape = tuple(sample["input"].shape)
+        # of a user's own clouds any may be the largest
+        known = (len(shape) == len(wanted) == 2 and shape[1:] == wanted[1:]) or shape == wanted
+        worst.count(not known, f"{where}: input of {shape}, wanted {wanted}")
+        worst.same(f"{where}: input", sample["input"].dtype, like.dtype)
+        worst.same(f"{where}: index", (sample["index"].dtype, int(sample["index"])), (torch.int64, number))
+        inputs.append(trimmed(sample["input"]))
+    worst.count(not inputs, f"{len(files)} files without a sample")
+    return inputs

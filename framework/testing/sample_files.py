@@ -1,0 +1,66 @@
+"""Small files as a user may have them, for rows of data sets: images, and meshes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from framework.testing.finding import SEED
+
+
+def noise_image(file: Path, number: int, size: tuple[int, int] = (20, 20)) -> Path:
+    """An image of (height, width) in colour, no two numbers alike; in the format that the name's end says."""
+    pixels = np.random.default_rng([SEED, number]).integers(0, 256, (*size, 3), np.uint8)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(file)
+    return file
+
+
+def images(folder: Path) -> Sequence[Path]:
+    """A wide one and a tall one, of two formats."""
+    wide, tall = folder / "wide.png", folder / "tall.jpg"
+    return noise_image(wide, 0, (30, 40)), noise_image(tall, 1, (50, 20))
+
+
+def surface(number: int, side: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (side², 3) and triangles of a rough piece of land off the origin, no two numbers alike."""
+    random = np.random.default_rng([SEED, number])
+    row, column = np.divmod(np.arange(side**2), side)
+    vertices = np.stack([row, column, random.normal(size=side**2)], -1) + random.normal(3, 1, 3)
+    corner = np.flatnonzero((row < side - 1) & (column < side - 1))
+    halves = [(0, side, 1), (side, side + 1, 1)]
+    return vertices.round(4), np.concatenate([corner[:, None] + half for half in halves])
+
+
+def write_off(file: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    """A mesh as the Object File Format has it."""
+    return _write(file, ["OFF", f"{len(vertices)} {len(faces)} 0"], vertices, faces)
+
+
+def write_ply(file: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
+    """A mesh as ASCII PLY."""
+    head = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return _write(file, head, vertices, faces)
+
+
+def _write(file: Path, head: Sequence[str], vertices: np.ndarray, faces: np.ndarray) -> Path:
+    rows = [" ".join(map(str, row)) for row in vertices.tolist()]
+    rows += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text("\n".join([*head, *rows, ""]), encoding="ascii")
+    return file
+
+
+def meshes(folder: Path) -> Sequence[Path]:
+    """Two pieces of land, in two formats."""
+    first, second = surface(0), surface(1, side=7)
+    return write_ply(folder / "first.ply", *first), write_off(folder / "second.off", *second)

@@ -1,0 +1,47 @@
+"""Rows of the contract: a turntable that one blob goes round, as the distributed MATLAB file."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.io import savemat
+
+from framework.testing.rows import DAMAGES, DataRow
+from framework.testing.sample_files import images
+
+
+def turntable(symmetric: bool = False) -> np.ndarray:
+    """20 objects × 72 views (20, 72, 32, 32): a blob going round, twice a turn where it is symmetric."""
+    angle = np.radians(5) * np.arange(72) * (2 if symmetric else 1)
+    row, column = np.mgrid[:32, :32]
+    views = []
+    for number in range(20):
+        place = 16 + 8 * np.stack([np.cos(angle + number), np.sin(angle + number)], -1)
+        gap = (row - place[:, :1, None]) ** 2 + (column - place[:, 1:, None]) ** 2
+        views.append(255 * np.exp(-gap / 40))
+    return np.stack(views).round().astype(np.uint8)
+
+
+def as_matlab(folder: Path, views: np.ndarray, **more: object) -> Path:
+    pixels = views.swapaxes(-1, -2).reshape(1440, 1024)
+    savemat(folder / "COIL20.mat", {"X": pixels, "Y": np.repeat(np.arange(1, 21), 72)[:, None], **more})
+    return folder
+
+
+def write(folder: Path) -> Mapping[str, str]:
+    return {"root": str(as_matlab(folder, turntable()))}
+
+
+ROWS = {
+    "coil20": (
+        DataRow(
+            "a blob",
+            {"image_size": 16},
+            write=write,
+            synthetic=False,
+            files=images,
+            fragile={"COIL20.mat": DAMAGES},
+            changes={"every": 30, "image_size": 17},
+        ),
+    )
+}

@@ -1,0 +1,54 @@
+"""Rows of the contract: a few generated heads of each set, in its official layout."""
+
+from framework.testing.rows import DAMAGES, DataRow
+from framework.testing.sample_files import images
+
+SIZES = {"images": 30, "image_size": 12}
+SKIP = {"skip_unreadable": True}
+CHANGES = {"generator_seed": 1, "images": 31}
+ROWS = {
+    "idiap": (
+        DataRow(
+            "three angles",
+            SIZES,
+            synthetic=True,
+            files=images,
+            fragile={"train/*.jpg": DAMAGES, "or_label_full.mat": DAMAGES},
+            skip=SKIP,
+            changes={**CHANGES, "angles": ["roll", "pan"]},
+        ),
+        DataRow(
+            "tilt, blurred, not varied",
+            {**SIZES, "angles": ["tilt"], "test_blur": 1.0, "jitter": 0.0},
+            synthetic=True,
+            files=images,
+            changes={"test_blur": 2.0},
+        ),
+    ),
+    "towncentre": (
+        DataRow(
+            "mirrored",
+            {"images": 200, "image_size": 12},
+            synthetic=True,
+            files=images,
+            # an image and its label tell of each other: one alone is named by the label, or not missed
+            fragile={
+                "0001/*.jpg": ("empty", "cut", "garbage", "folder"),
+                "0001/*.txt": ("empty", "cut", "garbage", "folder"),
+            },
+            skip=SKIP,
+            changes={"generator_seed": 1, "images": 201},
+        ),
+    ),
+    "caviar": (
+        DataRow(
+            "gaze",
+            SIZES,
+            synthetic=True,
+            files=images,
+            fragile={"train/*.jpg": DAMAGES, "or_label.mat": DAMAGES},
+            skip=SKIP,
+            changes=CHANGES,
+        ),
+    ),
+}

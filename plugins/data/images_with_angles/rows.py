@@ -1,0 +1,38 @@
+"""Rows of the contract: a folder of noise, as one has it, and grey and divided by the table."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from framework.testing.rows import DAMAGES, DataRow
+from framework.testing.sample_files import images, noise_image
+
+
+def write(folder: Path, split: bool = False) -> Mapping[str, str]:
+    """Forty images and a table of their angles, degrees."""
+    lines = ["file,pan,tilt" + ",split" * split]
+    for number in range(40):
+        file = noise_image(folder / f"{number:03d}.png", number)
+        part = ("train", "validation", "test")[number % 3]
+        lines.append(f"{file.name},{10 * number},{-number}" + f",{part}" * split)
+    (folder / "angles.csv").write_text("\n".join(lines), encoding="utf-8")
+    return {"root": str(folder)}
+
+
+MIRRORED = DataRow(
+    "mirrored",
+    {"image_size": 8, "mirror": ["pan"]},
+    write=write,
+    synthetic=False,
+    files=images,
+    fragile={"*.png": DAMAGES, "angles.csv": DAMAGES},
+    skip={"skip_unreadable": True},
+    changes={"angle_columns": ["pan"], "angles_in": "radians"},
+)
+GREY = replace(
+    MIRRORED,
+    name="grey, not varied",
+    config={"image_size": 9, "grayscale": True, "jitter": 0.0},
+    write=lambda folder: write(folder, split=True),
+)
+ROWS = {"images_with_angles": (MIRRORED, GREY)}

@@ -1,0 +1,95 @@
+"""Rows of the contract: generated CAD models, a folder of pieces of land, and an archive of small objects."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from framework.testing.rows import DAMAGES, DataRow
+from framework.testing.sample_files import meshes, surface, write_off
+
+UNMISSED = ("empty", "cut", "garbage", "folder")
+"""Which files there are is for the folder to say: one fewer is a smaller set."""
+MODELS = {"train_models": 3, "test_models": 1, "points": 20, "classes": ["bolt", "bowl", "stool"]}
+MADE = {"data_seed": 1, "generator_seed": 1}
+
+
+def folder_of_classes(folder: Path) -> Mapping[str, str]:
+    """Meshes and clouds, of many sizes, of two classes."""
+    for number in range(16):
+        vertices, faces = surface(number, side=3 + number % 3)
+        place = folder / ("hills" if number % 2 else "plains")
+        if number % 4 < 2:
+            write_off(place / f"{number:02d}.off", vertices, faces)
+        else:
+            np.savetxt(place / f"{number:02d}.xyz", vertices, header="x y z", comments="")
+    return {"root": str(folder)}
+
+
+def archive(folder: Path) -> Mapping[str, str]:
+    """33 objects of 2 to 20 points and three classes."""
+    random = np.random.default_rng(0)
+    label = random.permutation(np.repeat(np.arange(3), (11, 10, 12)))
+    sizes = random.integers(2, 21, len(label))
+    np.savez(
+        folder / "objects.npz",
+        points=random.normal(size=(sizes.sum(), 3)).astype(np.float32),
+        offset=np.concatenate([[0], np.cumsum(sizes)]),
+        label=label,
+        object_id=np.arange(len(label)) + 100,
+        classes=np.array(["building", "car", "tree"]),
+    )
+    return {"root": str(folder / "objects.npz")}
+
+
+ROWS = {
+    "modelnet40": (
+        DataRow(
+            "three classes",
+            MODELS,
+            synthetic=True,
+            files=meshes,
+            fragile={"bolt/train/*.off": UNMISSED, "bowl/test/*.off": UNMISSED},
+            skip={"unreadable": "skip"},
+            changes={**MADE, "points": 30},
+        ),
+        DataRow(
+            "normals, turned",
+            {**MODELS, "normals": True, "rotations": 3},
+            synthetic=True,
+            files=meshes,
+            changes={"rotations": 4},
+        ),
+    ),
+    "point_cloud_folder": (
+        DataRow(
+            "pieces of land",
+            write=folder_of_classes,
+            synthetic=False,
+            files=meshes,
+            fragile={"hills/*.off": UNMISSED, "plains/*.xyz": UNMISSED},
+            skip={"unreadable": "skip"},
+            changes={"data_seed": 1, "points": 8},
+        ),
+        DataRow(
+            "ten points, centred",
+            {"points": 10, "centred": True},
+            write=folder_of_classes,
+            synthetic=False,
+            files=meshes,
+        ),
+    ),
+    "dales": (
+        DataRow(
+            "33 objects",
+            write=archive,
+            synthetic=False,
+            files=meshes,
+            fragile={"objects.npz": DAMAGES},
+            changes={"data_seed": 1, "fold": 1, "points": 5},
+        ),
+        DataRow(
+            "at most ten points", {"points": 10, "fold": 4}, write=archive, synthetic=False, files=meshes
+        ),
+    ),
+}

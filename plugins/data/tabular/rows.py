@@ -1,0 +1,46 @@
+"""Rows of the contract: one table, of which a label, numbers or an angle are predicted."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from framework.testing.rows import DAMAGES, DataRow
+
+LABELS = ("cat", "dog", "emu")
+
+
+def write(folder: Path, rows: int = 40) -> Mapping[str, str]:
+    """Rows with a number, its square, a group, and three columns worth predicting."""
+    lines = ["number,square,group,class,real,angle"]
+    for row in range(rows):
+        lines.append(f"{row},{row * row},{'ab'[row % 2]},{LABELS[row % 3]},{row / 2 - 3},{20 * row - 360}")
+    (folder / "mine.csv").write_text("\n".join(lines), encoding="utf-8")
+    return {"path": str(folder / "mine.csv")}
+
+
+def files(folder: Path) -> Sequence[Path]:
+    """Two rows in one file, one in another, with the columns that are read in any order."""
+    first, second = folder / "first.csv", folder / "second.csv"
+    first.write_text("square,number\n9,3\n1000000,1000\n", encoding="utf-8")
+    second.write_text("number,note,square\n5,hello,25\n", encoding="utf-8")
+    return first, second
+
+
+def row(name: str, target: object, kind: str) -> DataRow:
+    return DataRow(
+        name,
+        {"target": target, "kind": kind, "columns": ["number", "square"]},
+        write=write,
+        synthetic=False,
+        files=files,
+        fragile={"mine.csv": DAMAGES},
+        changes={"data_seed": 1, "test": 0.3, "columns": ["square", "number"]},
+    )
+
+
+ROWS = {
+    "tabular": (
+        row("a label", "class", "class"),
+        row("two numbers", ["real", "angle"], "real"),
+        row("an angle", "angle", "degrees"),
+    )
+}
