@@ -9,20 +9,10 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 
+NAME = "dales"
 CLASSES = ("building", "car", "tree")
-
-
-def data(root, **config):
-    return build("data", resolve("data", {"name": "dales", "root": str(root), **config}))
-
-
-def prepared(root, **config):
-    found = data(root, **config)
-    found.prepare()
-    return found
 
 
 def arrays(counts=(11, 10, 12), seed=0):
@@ -50,14 +40,14 @@ def root(tmp_path):
     return tmp_path / "objects.npz"
 
 
-def test_objects_are_cut_out_and_padded(root):
+def test_objects_are_cut_out_and_padded(prepared, root):
     held = arrays()
-    found = prepared(root)
+    found = prepared(root=root)
     assert found.target.names == CLASSES
     assert found.input_shape == (int(np.diff(held["offset"]).max()), 3)
     assert (found.columns, found.synthetic, found.skipped, found.varies) == (("x", "y", "z"), False, 0, False)
     seen = []
-    for split in (found.train(), found.validation(), found.test()):
+    for split in found.splits():
         batch = split.__getitems__(range(len(split)))
         for cloud, label, number in zip(batch["input"], batch["target"], batch["object"] - 100, strict=True):
             wanted = held["points"][held["offset"][number] : held["offset"][number + 1]]
@@ -67,33 +57,36 @@ def test_objects_are_cut_out_and_padded(root):
         assert batch["index"].tolist() == list(range(len(split)))
         seen += batch["object"].tolist()
     assert sorted(seen) == list(range(100, 133))  # each once
-    assert found.picture(found.test()[0]["input"]).shape == (160, 160, 3)
+    assert found.picture(found.splits().test[0]["input"]).shape == (160, 160, 3)
 
 
-def test_every_object_is_tested_once_over_the_folds(root):
+def test_every_object_is_tested_once_over_the_folds(prepared, root):
     tested = []
     for fold in range(5):
-        found = prepared(root, fold=fold, validation_share=0.2)
-        batch = found.test().__getitems__(range(len(found.test())))
+        found = prepared(root=root, fold=fold, validation_share=0.2)
+        batch = found.splits().test.__getitems__(range(len(found.splits().test)))
         tested += batch["object"].tolist()
         counts = torch.bincount(batch["target"], minlength=3)
         assert set(counts.tolist()) <= {2, 3}
-        assert torch.bincount(found.validation().fields.fields["target"]).tolist() in (
+        assert torch.bincount(found.splits().validation.fields.fields["target"]).tolist() in (
             [2, 2, 2],
             [2, 1, 2],
             [1, 2, 2],
         )
     assert sorted(tested) == list(range(100, 133))
-    assert prepared(root).fingerprint() == prepared(root).fingerprint()
-    assert prepared(root).fingerprint()["sha256"] != prepared(root, data_seed=1).fingerprint()["sha256"]
+    assert prepared(root=root).fingerprint() == prepared(root=root).fingerprint()
+    assert (
+        prepared(root=root).fingerprint()["sha256"]
+        != prepared(root=root, data_seed=1).fingerprint()["sha256"]
+    )
 
 
-def test_larger_objects_are_subsampled_whatever_the_fold(root):
+def test_larger_objects_are_subsampled_whatever_the_fold(prepared, root):
     clouds, whole = {}, np.diff(arrays()["offset"])
     for fold in (0, 1):
-        found = prepared(root, points=10, fold=fold)
+        found = prepared(root=root, points=10, fold=fold)
         assert found.input_shape == (10, 3)
-        for split in (found.train(), found.validation(), found.test()):
+        for split in found.splits():
             for number in range(len(split)):
                 sample = split[number]
                 cloud = clouds.setdefault(int(sample["object"]), sample["input"])
@@ -101,9 +94,9 @@ def test_larger_objects_are_subsampled_whatever_the_fold(root):
                 assert len(cloud) == min(10, whole[int(sample["object"]) - 100])
 
 
-def test_own_files_need_no_archive(tmp_path):
+def test_own_files_need_no_archive(data, tmp_path):
     np.save(tmp_path / "tree.npy", np.random.default_rng(0).normal(size=(50, 3)))
-    found = build("data", resolve("data", {"name": "dales", "points": 20})).read([tmp_path / "tree.npy"])
+    found = data(points=20).read([tmp_path / "tree.npy"])
     assert found[0]["input"].shape == (20, 3)
 
 
@@ -138,43 +131,37 @@ def changed(name, change):
         (lambda held: {**held, "label": held["label"][:-1]}, "32 labels, 33 identities and 34 offsets"),
     ],
 )
-def test_another_archive_is_refused(tmp_path, change, message):
+def test_another_archive_is_refused(prepared, tmp_path, change, message):
     held = arrays()
     first = held["offset"][1]
     assert first > 7  # so that point 7 is the first object's
     np.savez(tmp_path / "objects.npz", **change(held))
     with pytest.raises(DataError, match=message):
-        prepared(tmp_path / "objects.npz")
+        prepared(root=tmp_path / "objects.npz")
 
 
-def test_missing_and_damaged_archives_are_refused(tmp_path):
+def test_missing_and_damaged_archives_are_refused(data, prepared, tmp_path):
     with pytest.raises(DataError, match=r"data\.root is not set: .* github\.com/ATRM-Raphael/geo5017_A2"):
-        build("data", resolve("data", {"name": "dales"})).prepare()
+        data().prepare()
     with pytest.raises(DataError, match="no such file"):
-        prepared(tmp_path / "objects.npz")
+        prepared(root=tmp_path / "objects.npz")
     np.save(tmp_path / "one.npy", np.zeros(3))
     with pytest.raises(DataError, match="holds nothing, but no points"):
-        prepared(tmp_path / "one.npy")
+        prepared(root=tmp_path / "one.npy")
     np.savez(tmp_path / "objects.npz", **arrays())
     (tmp_path / "objects.npz").write_bytes((tmp_path / "objects.npz").read_bytes()[:2000])
     with pytest.raises(DataError, match="cannot be read as a NumPy archive"):
-        prepared(tmp_path / "objects.npz")
+        prepared(root=tmp_path / "objects.npz")
 
 
-@pytest.mark.parametrize("config", [{"fold": 5}, {"fold": -1}, {"points": 0}, {"validation_share": 0.0}])
-def test_a_config_out_of_range_is_refused(config):
-    with pytest.raises(ConfigError, match=r"data\."):
-        resolve("data", {"name": "dales", **config})
-
-
-def test_a_class_of_few_objects_keeps_its_training_samples(tmp_path):
+def test_a_class_of_few_objects_keeps_its_training_samples(prepared, tmp_path):
     np.savez(tmp_path / "objects.npz", **arrays((30, 5)))
-    found = prepared(tmp_path / "objects.npz", fold=2)
-    assert torch.bincount(found.train().fields.fields["target"], minlength=2).min() >= 1
+    found = prepared(root=tmp_path / "objects.npz", fold=2)
+    assert torch.bincount(found.splits().train.fields.fields["target"], minlength=2).min() >= 1
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
-def test_the_real_objects_can_be_told_apart_by_distances_to_fixed_points():
+def test_the_real_objects_can_be_told_apart_by_distances_to_fixed_points(prepared):
     random = np.random.default_rng(0)
     basis = random.normal(size=(128, 3))
     basis *= random.random((128, 1)) ** (1 / 3) / np.linalg.norm(basis, axis=1, keepdims=True)
@@ -188,8 +175,10 @@ def test_the_real_objects_can_be_told_apart_by_distances_to_fixed_points():
             rows.append(cKDTree(points).query(basis)[0])
         return np.array(rows), split.fields.fields["target"].numpy()
 
-    found = prepared(Path(os.environ["REAL_DATA_ROOT"]) / "clouds" / "dales500.npz", points=2000)
+    found = prepared(root=Path(os.environ["REAL_DATA_ROOT"]) / "clouds" / "dales500.npz", points=2000)
     assert found.target.names == ("building", "car", "fence", "pole", "tree")
-    assert [len(split) for split in (found.train(), found.validation(), found.test())] == [339, 60, 100]
-    model = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000)).fit(*encoded(found.train()))
-    assert model.score(*encoded(found.test())) > 0.9
+    assert [len(split) for split in found.splits()] == [339, 60, 100]
+    model = make_pipeline(StandardScaler(), LogisticRegression(max_iter=2000)).fit(
+        *encoded(found.splits().train)
+    )
+    assert model.score(*encoded(found.splits().test)) > 0.9

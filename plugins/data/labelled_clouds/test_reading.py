@@ -1,4 +1,4 @@
-"""Clouds from files with labels: sampling, the cache, padding, splits, pictures."""
+"""Clouds from files: sampling, the cache, padding; shares of classes; configs."""
 
 import math
 
@@ -8,21 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.datasets import cloud_picture
-from framework.errors import DataError
+from framework.configuration.schema import resolve
+from framework.errors import ConfigError, DataError
 from framework.geometry import meshes
-from framework.geometry.mesh_files import COLOURS, NORMALS
-from plugins.data.labelled_clouds import labelled_clouds
-from plugins.data.labelled_clouds.labelled_clouds import (
-    Clouds,
-    Packed,
-    Reading,
-    cloud,
-    folds,
-    load,
-    spared,
-    unlabelled,
-)
+from framework.geometry.mesh_files import NORMALS
+from plugins.data.labelled_clouds import reading
+from plugins.data.labelled_clouds.labelled_clouds import require_samples
+from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, cloud, load, unlabelled
+from plugins.data.labelled_clouds.shares import folds, spared
 
 SQUARE = b"OFF\n4 1 0\n0 0 2\n1 0 2\n1 1 2\n0 1 2\n4 0 1 2 3\n"
 
@@ -89,8 +82,8 @@ def test_clouds_are_read_once_and_anew_when_something_changes(here, monkeypatch)
     assert first.packed.offset.tolist() == [0, 10, 20]
 
     calls = []
-    real = labelled_clouds.cloud
-    monkeypatch.setattr(labelled_clouds, "cloud", lambda *given: calls.append(given) or real(*given))
+    real = reading.cloud
+    monkeypatch.setattr(reading, "cloud", lambda *given: calls.append(given) or real(*given))
     again = load(files, here, Reading(10), "place")
     assert not calls
     assert torch.equal(again.packed.points, first.packed.points)
@@ -178,52 +171,7 @@ def test_folds_have_every_class_alike(counts, count, seed):
 
 def test_an_empty_split_is_refused():
     with pytest.raises(DataError, match=r"there: the validation split is empty \(train 3, validation 0\)"):
-        labelled_clouds.require_samples({"train": 3, "validation": 0}, "there")
-
-
-# ---- pictures --------------------------------------------------------------------------------------------
-
-
-def test_the_picture_shows_the_nearer_of_two_points_and_its_colour():
-    # one behind the other on the line of sight, towards the viewer: red in front of blue
-    a, e = cloud_picture.AZIMUTH, cloud_picture.ELEVATION
-    towards = torch.tensor([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
-    aside = torch.tensor([-math.sin(a), math.cos(a), 0.0])
-    places = torch.stack([towards, -towards, 3 * aside, -3 * aside])
-    colours = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 0]])
-    for order in ([0, 1, 2, 3], [1, 0, 3, 2]):
-        cloud = torch.cat([places, colours], 1)[order]
-        image = cloud_picture.picture(cloud, ("x", "y", "z", *COLOURS), side=101)
-        assert image.shape == (101, 101, 3)
-        red, blue = ((image == colour).all(-1) for colour in ([255, 0, 0], [0, 0, 153]))
-        assert red[47:54, 47:54].sum() == red.sum() == 21  # the whole disc
-        assert blue.sum() <= 7  # of another pixel's width at the rim, by rounding
-        assert (image == [255, 255, 255]).all(-1).mean() > 0.8
-
-
-def test_up_is_up_and_the_padding_is_not_seen():
-    stick = torch.stack([torch.zeros(200), torch.zeros(200), torch.linspace(0, 1, 200)], 1)
-    cap = torch.tensor([[0.2, 0, 1.0], [-0.2, 0, 1.0]]).repeat(20, 1)
-    cloud = torch.cat([stick, cap])
-    image = cloud_picture.picture(cloud)
-    dark = (image < 255).any(-1)
-    assert dark[:40].sum() > dark[-40:].sum()
-    padded = torch.cat([cloud, torch.full((500, 3), math.nan)])
-    np.testing.assert_array_equal(cloud_picture.picture(padded), image)
-
-
-@pytest.mark.parametrize(
-    "cloud",
-    [
-        torch.zeros(0, 3),
-        torch.ones(1, 3),
-        torch.full((4, 3), math.nan),
-        torch.ones(3, 3) * 1e30,
-        torch.eye(3) * 1e-30,
-    ],
-)
-def test_any_cloud_has_a_picture(cloud):
-    assert cloud_picture.picture(cloud).dtype == np.uint8
+        require_samples({"train": 3, "validation": 0}, "there")
 
 
 def test_what_is_kept_of_a_file_is_what_the_reader_and_sampler_say(here):
@@ -231,3 +179,27 @@ def test_what_is_kept_of_a_file_is_what_the_reader_and_sampler_say(here):
     mesh = meshes.read(here / "square.off")
     wanted = meshes.sample(mesh, 7, meshes.stream(3, "square.off")).points.astype(np.float32)
     np.testing.assert_array_equal(cloud(here / "square.off", Reading(7, seed=3)), wanted)
+
+
+@pytest.mark.parametrize(
+    "name, key, value",
+    [
+        *[
+            ("modelnet40", "points", 0),
+            ("modelnet40", "rotations", 0),
+            ("modelnet40", "validation_share", 1.0),
+        ],
+        *[
+            ("modelnet40", "unreadable", "no"),
+            ("dales", "fold", 5),
+            ("dales", "fold", -1),
+            ("dales", "points", 0),
+        ],
+        *[("dales", "validation_share", 0.0), ("point_cloud_folder", "points", 0)],
+        *[("point_cloud_folder", "validation", 1.0), ("point_cloud_folder", "test", 0.0)],
+        ("point_cloud_folder", "data_seed", -1),
+    ],
+)
+def test_a_config_out_of_range_is_refused(name, key, value):
+    with pytest.raises(ConfigError, match=r"data\."):
+        resolve("data", {"name": name, key: value})

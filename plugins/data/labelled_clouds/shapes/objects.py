@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from plugins.data.labelled_clouds.modelnet40.solids import (
+from plugins.data.labelled_clouds.shapes.solids import (
     Number,
     Point,
     Solid,

@@ -6,14 +6,15 @@ of more objects are those of fewer. It is written beside its place and renamed w
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from framework.storage import cache
 from framework.storage.generated import draw_all
 from framework.storage.generated import generated as whole
-from plugins.data.labelled_clouds.modelnet40 import furniture, objects
-from plugins.data.labelled_clouds.modelnet40.solids import Solid
+from plugins.data.labelled_clouds.shapes import furniture, objects
+from plugins.data.labelled_clouds.shapes.solids import Solid
 
 VERSION = 1
 """Of the generator; a change in what it makes takes a new number, and with it a new folder."""
@@ -50,21 +51,24 @@ STRETCH = 0.15
 """Standard deviation of the logarithm of each axis's own stretch."""
 
 
-def generated(train: int, test: int, seed: int) -> Path:
-    """The root of a generated set of so many models a class; made now unless it is there.
+class Models(NamedTuple):
+    """How many models of each class are generated for each split, and from which seed."""
+
+    train: int
+    test: int
+    seed: int
+
+
+def generated(models: Models) -> Path:
+    """The root of a generated set; made now unless it is there.
 
     Raises:
         DataError: the cache cannot be written, or holds something else in its place.
     """
-    mark = {
-        "generator_version": VERSION,
-        "seed": seed,
-        "train": train,
-        "test": test,
-        "classes": list(CLASSES),
-    }
-    root = cache.folder("modelnet40") / f"v{VERSION}-seed{seed}-train{train}-test{test}"
-    return whole(root, mark, lambda part: _write(part, train, test, seed))
+    mark = {"generator_version": VERSION, "seed": models.seed, "train": models.train, "test": models.test}
+    mark |= {"classes": list(CLASSES)}
+    root = cache.folder("modelnet40") / f"v{VERSION}-seed{models.seed}-train{models.train}-test{models.test}"
+    return whole(root, mark, lambda part: _write(part, models))
 
 
 def model(category: str, split: str, number: int, seed: int) -> Solid:
@@ -87,8 +91,8 @@ def as_off(solid: Solid) -> str:
     return "\n".join(["OFF", f"{len(vertices)} {len(faces)} 0", *vertices, *faces, ""])
 
 
-def _write(part: Path, train: int, test: int, seed: int) -> None:
-    sizes = dict(zip(SPLITS, (train, test), strict=True))
+def _write(part: Path, models: Models) -> None:
+    sizes = {"train": models.train, "test": models.test}
     jobs = [(name, split, number) for name in CLASSES for split in SPLITS for number in range(sizes[split])]
     for name in CLASSES:
         for split in SPLITS:
@@ -97,8 +101,8 @@ def _write(part: Path, train: int, test: int, seed: int) -> None:
     def write(job: int) -> None:
         name, split, number = jobs[job]
         # numbered through, as the official files are
-        place = number + 1 + (train if split == "test" else 0)
-        text = as_off(model(name, split, number, seed))
+        place = number + 1 + (models.train if split == "test" else 0)
+        text = as_off(model(name, split, number, models.seed))
         (part / name / split / f"{name}_{place:04d}.off").write_text(text, encoding="ascii", newline="\n")
 
     draw_all(len(jobs), write, "the synthetic CAD models")

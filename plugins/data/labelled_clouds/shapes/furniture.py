@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from plugins.data.labelled_clouds.modelnet40.solids import (
+from plugins.data.labelled_clouds.shapes.solids import (
     Solid,
     box,
     cylinder,

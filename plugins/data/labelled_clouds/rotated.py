@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from plugins.data.labelled_clouds.labelled_clouds import Clouds
+from plugins.data.labelled_clouds.reading import Clouds
 
 
 class Rotated(Dataset[dict[str, Tensor]]):
