@@ -1,18 +1,11 @@
 import json
-import math
 
 import numpy as np
 import pytest
 import torch
-from torch.distributions import MultivariateNormal
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
-from framework.prediction import Prediction
-from framework.target import Target
-from plugins.data.bodies.faust.correspondence import correspondence
-from plugins.data.bodies.faust.metric import CorrespondenceError
-from plugins.data.bodies.faust.rows import FIELDS, NAMES
 
 
 def write_ply(file, vertices, faces=()):
@@ -67,7 +60,7 @@ def test_people_are_split_and_meshes_come_back_in_metres(root):
     assert not faust.synthetic
     assert faust.faces.tolist() == [[0, 1, 2], [2, 1, 3]]
     for name, wanted in numbers.items():
-        split = getattr(faust, name)()
+        split = getattr(faust.splits(), name)
         batch = split.__getitems__(range(len(split)))
         assert batch["subject"].tolist() == [number // 10 for number in wanted]
         for row, number in enumerate(wanted):
@@ -87,13 +80,13 @@ def test_points_depend_on_the_seed_and_small_scans_are_padded(root, tmp_path):
     one, same, other = data(root, points=150), data(root, points=150), data(root, points=150, data_seed=1)
     for each in (one, same, other):
         each.prepare()
-    first = [each.train().fields["input"] for each in (one, same, other)]
+    first = [each.splits().train.fields["input"] for each in (one, same, other)]
     assert torch.equal(first[0], first[1])
     assert not torch.equal(first[0], first[2])
     assert one.fingerprint() == same.fingerprint()
     whole = data(root, points=500)
     whole.prepare()
-    assert whole.train().fields["input"].shape == (2, 300, 3)
+    assert whole.splits().train.fields["input"].shape == (2, 300, 3)
 
 
 def test_a_generated_layout_says_so(root, tmp_path):
@@ -141,77 +134,3 @@ def test_what_is_not_there_is_said(root, tmp_path):
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"data\."):
         resolve("data", {"name": "faust", **config})
-
-
-def by_loop(truth, registered, subject):
-    """One pair, one point at a time."""
-    errors = {True: [], False: []}
-    for one in range(len(truth)):
-        for other in range(len(truth)):
-            if one == other:
-                continue
-            gaps = []
-            for point, there in zip(truth[one], truth[other], strict=True):
-                vertex = min(range(len(registered[one])), key=lambda v: math.dist(registered[one][v], point))
-                gaps.append(100 * math.dist(registered[other][vertex], there))
-            errors[bool(subject[one] == subject[other])].append(np.mean(gaps))
-    return np.mean(errors[True]), np.mean(errors[False])
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_errors_are_those_of_a_loop_whatever_the_template(dtype):
-    random = np.random.default_rng(3)
-    truth = random.normal(size=(6, 20, 3)).astype(np.float32)
-    registered = random.normal(size=(6, 33, 3)).astype(np.float32)  # another mesh than the true one
-    subject = np.array([0, 1, 0, 2, 1, 0])
-    found = correspondence(
-        torch.tensor(truth, dtype=dtype), torch.tensor(registered, dtype=dtype), torch.tensor(subject)
-    )
-    wanted = by_loop(truth.tolist(), registered.tolist(), subject)
-    assert found.intra_cm.item() == pytest.approx(wanted[0], rel=1e-6)
-    assert found.inter_cm.item() == pytest.approx(wanted[1], rel=1e-6)
-
-
-def test_perfect_registrations_have_no_error_and_a_shift_of_one_scan_has_its_length():
-    meshes = torch.stack([torch.from_numpy(body(number)[0]) for number in (0, 1, 10)])
-    subject = torch.tensor([0, 0, 1])
-    assert correspondence(meshes, meshes, subject) == (0, 0)
-    # the third template is registered 1 mm too high: its own points still find their vertices
-    shifted = meshes.clone()
-    shifted[2, :, 1] += 0.001
-    found = correspondence(meshes, shifted, subject)
-    assert found.intra_cm.item() == 0
-    assert found.inter_cm.item() == pytest.approx(
-        0.1 / 2, rel=1e-9
-    )  # where the third is the other of the pair
-
-
-def test_one_person_alone_has_no_inter_error():
-    meshes = torch.randn(3, 8, 3)
-    found = correspondence(meshes, meshes, torch.zeros(3, dtype=torch.int64))
-    assert (found.intra_cm.item(), found.inter_cm.isnan().item()) == (0, True)
-
-
-def test_the_metric_reads_metres_from_normalised_meshes():
-    target = Target("real", NAMES)
-    metric = build("metric", resolve("metric", "correspondence"), target=target)
-    generator = torch.Generator().manual_seed(0)
-    point, truth = (torch.randn(7, 15, generator=generator) for _ in range(2))
-    fields = {name: make(7) for name, make in FIELDS.items()}
-    for rows in (slice(0, 3), slice(3, 7)):
-        density = MultivariateNormal(point[rows], scale_tril=torch.eye(15))
-        metric.update(Prediction(density, {"target": truth[rows], **{k: v[rows] for k, v in fields.items()}}))
-    back = fields["scale"].double()[:, None, None], fields["centre"].double()[:, None]
-    metres = [mesh.double().reshape(7, 5, 3) * back[0] + back[1] for mesh in (truth, point)]
-    wanted = by_loop(*(mesh.tolist() for mesh in metres), fields["subject"])
-    found = metric.compute()
-    assert found["intra_cm"].item() == pytest.approx(wanted[0], rel=1e-5)
-    assert found["inter_cm"].item() == pytest.approx(wanted[1], rel=1e-5)
-
-
-def test_data_and_targets_without_meshes_are_refused():
-    with pytest.raises(ConfigError, match="metric correspondence describes targets of kind 'real'"):
-        CorrespondenceError(Target("angle", ("azimuth",)))
-    density = MultivariateNormal(torch.zeros(2, 15), scale_tril=torch.eye(15))
-    with pytest.raises(DataError, match="reads 'centre'"):
-        CorrespondenceError(Target("real", NAMES)).update(Prediction(density, {"target": torch.zeros(2, 15)}))

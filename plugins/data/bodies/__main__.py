@@ -1,5 +1,4 @@
-"""`python -m plugins.data.bodies.registration <checkpoint> <scan> ...`: meshes registered "
-"to scans, as PLY files and pictures."""
+"""`python -m plugins.data.bodies <checkpoint> <scan> ...` registers meshes to scans: PLY files and pictures."""
 
 import argparse
 import sys
@@ -13,8 +12,9 @@ from framework.distributions.density import median
 from framework.errors import ConfigError, UserError
 from framework.geometry.clouds import denormalised, sizes
 from framework.runs.loading import load_with_description
-from plugins.data.bodies.registration.data import Registration, chosen_body
-from plugins.data.bodies.registration.result import picture, write_ply
+from plugins.data.bodies.data import Registration
+from plugins.data.bodies.people import chosen_body
+from plugins.data.bodies.result import picture, write_ply
 
 
 def main(arguments: list[str]) -> None:
@@ -23,7 +23,7 @@ def main(arguments: list[str]) -> None:
     Raises:
         UserError: a checkpoint of another data set, or a file that cannot be read.
     """
-    parser = argparse.ArgumentParser(prog="python -m plugins.data.bodies.registration", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m plugins.data.bodies", description=__doc__)
     parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
     parser.add_argument("scans", nargs="+", type=Path, help="meshes or clouds, metres, y up, facing z")
     parser.add_argument(

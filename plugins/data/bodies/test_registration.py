@@ -15,11 +15,10 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.clouds import denormalised, sizes
 from framework.geometry.meshes import Mesh, read
-from plugins.data.bodies import body_files
+from plugins.data.bodies import body_files, poses
 from plugins.data.bodies.body import Body, BodyModel
-from plugins.data.bodies.registration import poses
-from plugins.data.bodies.registration.result import SCAN, SKIN, picture, write_ply
-from plugins.data.bodies.registration.scanner import KINDS, Scanner, scan, strangers
+from plugins.data.bodies.result import SCAN, SKIN, picture, write_ply
+from plugins.data.bodies.scanner import KINDS, Scanner, scan, strangers
 
 # the SMPL family's first 22 joints: pelvis, hips, spine, knees, spine, ankles, spine, toes, neck, collars, head,
 # shoulders, elbows, wrists; a T-pose of a person of 1.7 m
@@ -354,7 +353,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     points = prepared(file).splits().test.__getitems__([0])
     cloud = denormalised(points["input"], points["centre"], points["scale"])[0, :400].numpy()
     np.save(tmp_path / "me.npy", cloud)
-    code, told = command(tmp_path, "plugins.data.bodies.registration", "run", "me.npy", "--folder", "meshes")
+    code, told = command(tmp_path, "plugins.data.bodies", "run", "me.npy", "--folder", "meshes")
     assert code == 0, told
     assert told.split() == ["meshes/me_registered.ply", "meshes/me_registered.png"]
     mesh = read(tmp_path / "meshes" / "me_registered.ply")
@@ -364,7 +363,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     assert np.linalg.norm(body.mean(0) - cloud.mean(0)) < 1
     with Image.open(tmp_path / "meshes" / "me_registered.png") as image:
         assert image.size[1] > 100
-    code, told = command(tmp_path, "plugins.data.bodies.registration", "run", "nobody.ply")
+    code, told = command(tmp_path, "plugins.data.bodies", "run", "nobody.ply")
     assert code == 1
     assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told
 

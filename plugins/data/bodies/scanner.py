@@ -30,6 +30,12 @@ class Scanner:
     strangers: float
 
 
+def shares(partial: float, outliers: float) -> Float[np.ndarray, "kind"]:
+    """Of each kind of scan, of sum 1; what is neither partial nor has outliers is whole."""
+    found = (1 - min(1, partial + outliers), partial, outliers)
+    return np.array(found) / sum(found)
+
+
 def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:
     """Points of one body, metres, uniform over what is seen of its surface.
 

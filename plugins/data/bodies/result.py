@@ -1,9 +1,9 @@
-"""A registered mesh and the scan it was registered to: as one PLY file, and as a picture."""
+"""Shows a registered mesh with the scan it was registered to: as one PLY file, and as a picture."""
 
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
+import trimesh
 from jaxtyping import Float, Int, UInt8
 
 SKIN, SCAN = (0.86, 0.68, 0.58), (0.16, 0.36, 0.75)
@@ -19,31 +19,9 @@ def write_ply(
     cloud: Float[np.ndarray, "points 3"],
 ) -> None:
     """The mesh, skin-coloured, and the cloud's points, blue, as vertices that no face uses; binary, metres."""
-    corners = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    points = np.empty(len(vertices) + len(cloud), corners)
-    points["xyz"] = np.concatenate([vertices, cloud])
-    points["rgb"][: len(vertices)] = _bytes(SKIN)
-    points["rgb"][len(vertices) :] = _bytes(SCAN)
-    triangles = np.empty(len(faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
-    triangles["count"], triangles["corners"] = 3, faces
-    with file.open("wb") as stream:
-        _header(stream, len(points), len(faces))
-        stream.write(points.tobytes())
-        stream.write(triangles.tobytes())
-
-
-def _header(stream: BinaryIO, points: int, faces: int) -> None:
-    lines = (
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {points}",
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {name}" for name in ("red", "green", "blue")),
-        f"element face {faces}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    )
-    stream.write(("\n".join(lines) + "\n").encode("ascii"))
+    colours = np.repeat([_bytes(SKIN), _bytes(SCAN)], (len(vertices), len(cloud)), 0)
+    points = np.concatenate([vertices, cloud])
+    trimesh.Trimesh(points, faces, vertex_colors=colours, process=False).export(file, "ply")
 
 
 def picture(

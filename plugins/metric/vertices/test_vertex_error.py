@@ -12,8 +12,8 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.prediction import Prediction
 from framework.target import Target
-from plugins.metric.vertex_error.metric import VertexError
-from plugins.metric.vertex_error.rows import names
+from plugins.metric.vertices.metric import VertexError
+from plugins.metric.vertices.rows import mesh
 
 
 def predicted(point, target, scale):
@@ -23,7 +23,7 @@ def predicted(point, target, scale):
 
 
 def measured(*batches, vertices):
-    metric = build("metric", resolve("metric", "vertex_error"), target=Target("real", names(vertices)))
+    metric = build("metric", resolve("metric", "vertex_error"), target=mesh(vertices))
     for batch in batches:
         metric.update(predicted(*batch))
     return {name: value.item() for name, value in metric.compute().items()}
@@ -94,5 +94,5 @@ def test_targets_and_data_that_are_no_meshes_are_refused():
         VertexError(Target("real", ("a", "b", "c", "d")))
     prediction = predicted(torch.zeros(2, 3), torch.zeros(2, 3), torch.ones(2))
     del prediction.batch["scale"]
-    with pytest.raises(DataError, match='reads "scale"'):
-        VertexError(Target("real", names(1))).update(prediction)
+    with pytest.raises(DataError, match="reads 'scale'"):
+        VertexError(mesh(1)).update(prediction)

@@ -1,9 +1,12 @@
-"""Where FAUST's files are."""
+"""Finds FAUST's training scans and reads their registrations."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from framework.errors import DataError
+from framework.geometry.meshes import read
 
 SUBJECTS, POSES = 10, 10
 WANTED = (
@@ -53,3 +56,18 @@ def scans(root: str | None) -> tuple[Path, list[Scan]]:
     if not found:
         raise DataError(f"data.root = {folder}: FAUST is not available there. {WANTED}")
     return folder, found
+
+
+def registered(scan: Scan, vertices: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices, metres, and faces of a scan's registration.
+
+    Raises:
+        DataError: it cannot be read, or has another number of vertices than wanted.
+    """
+    mesh = read(scan.registration)
+    if vertices not in (None, len(mesh.vertices)):
+        raise DataError(
+            f"{scan.registration}: {len(mesh.vertices)} vertices, the first registration has {vertices}; wanted one "
+            "mesh throughout. Restore it from its source."
+        )
+    return mesh.vertices, mesh.faces
