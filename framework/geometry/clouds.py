@@ -1,4 +1,4 @@
-"""Batches of point clouds: how many points each has, padding, normalisation and the way back (thesis eq. 6.1-6.2).
+"""Pads batches of point clouds, counts their points, normalises them and leads back (thesis eq. 6.1-6.2).
 
 A batch is a float tensor (batch, points, columns): x, y, z, then attributes of each point (colours, normals, anything).
 Clouds of fewer points are padded at their end with rows that are NaN in every column. Messages count clouds and points

@@ -1,4 +1,4 @@
-"""Mesh and cloud files as arrays, one parser a format; what a file does not hold is never made up.
+"""Parses mesh and cloud files into arrays, one function a format; what a file does not hold is never made up.
 
 Every parser takes the bytes of a file and raises a ValueError that says what came and what was wanted; the caller,
 `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, line ends may be those of any
