@@ -108,6 +108,15 @@ def without_bad_points(
     return pad([cloud[kept] for cloud, kept in zip(clouds, good, strict=True)]), dropped
 
 
+def filled(
+    clouds: Float[Tensor, "batch points columns"], sizes: Int[Tensor, "batch"] | None
+) -> Bool[Tensor, "batch points"]:
+    """Which rows hold points, of clouds of so many points; all, where None."""
+    if sizes is None:
+        return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
+    return torch.arange(clouds.shape[1], device=clouds.device) < sizes.to(clouds.device)[:, None]
+
+
 def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
     """Clouds (points, columns) of different sizes as one batch: rows of NaN at the end of those that are not largest.
 
@@ -180,7 +189,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
     _, points, columns = clouds.shape
     real = None  # a mask of the points, where there is padding
     if not bool((counts == points).all()):
-        real = (torch.arange(points, device=clouds.device) < counts[:, None])[..., None]
+        real = filled(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()
     first = coordinates[:, :1]
     # about the first point: what is far from the origin keeps its digits, equal points are exactly equal
@@ -241,7 +250,7 @@ def require_normalised(
         DataError: half of a cloud's points are further than 2 reaches from the origin (fewer may be outliers that a
             robust normalisation left there), or all are within 0.01 (but not all on it).
     """
-    real = torch.arange(coordinates.shape[1], device=coordinates.device) < counts[:, None]
+    real = filled(coordinates, counts)
     norm = torch.linalg.vector_norm(coordinates.detach().double(), dim=-1)
     largest = norm.where(real, 0).amax(1) if norm.shape[1] else norm.sum(1)
     far = largest > LOOSE * reach

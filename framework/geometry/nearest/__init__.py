@@ -10,10 +10,11 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.errors import DataError
+from framework.geometry.clouds import filled
 
 OFTEN = 2**16
 """Queries up to which packing them well takes less than a second."""
@@ -156,13 +157,6 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
             f"{name}: point {point} of number {cloud} of the batch is {points[cloud, point].tolist()}; wanted finite "
             "coordinates. Mend the file, drop such points, or give `sizes` so that padding is not read."
         )
-
-
-def filled(points: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
-    """Which rows hold points, of sets of so many; all, where None."""
-    if sizes is None:
-        return points.new_ones(points.shape[:2], dtype=torch.bool)
-    return torch.arange(points.shape[1], device=points.device) < sizes.to(points.device)[:, None]
 
 
 def on_processor(

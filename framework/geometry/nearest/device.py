@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from framework.geometry.nearest import MOST, filled
+from framework.geometry.clouds import filled
+from framework.geometry.nearest import MOST
 
 PAIRS = 2**24
 """Squared distances held at a time: three arrays of this size, 192 MiB in float32."""

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 
 
 def write_ply(file, vertices, faces=()):
@@ -128,9 +128,3 @@ def test_what_is_not_there_is_said(root, tmp_path):
         data(tmp_path).prepare()
     with pytest.raises(DataError, match=r"both name the people \[8\]"):
         data(root, validation=[7, 8]).prepare()
-
-
-@pytest.mark.parametrize("config", [{"points": 5}, {"test": []}, {"test": [10]}, {"data_seed": -1}])
-def test_a_config_out_of_range_is_refused(config):
-    with pytest.raises(ConfigError, match=r"data\."):
-        resolve("data", {"name": "faust", **config})

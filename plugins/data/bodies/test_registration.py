@@ -285,11 +285,16 @@ def written(folder):
 
 
 @pytest.mark.parametrize(
-    "config", [{"train": 0}, {"noise": -1.0}, {"partial": 1.5}, {"strangers": 0.4}, {"cut": math.nan}]
+    "name, key, value",
+    [
+        *[("registration", "train", 0), ("registration", "noise", -1.0), ("registration", "partial", 1.5)],
+        *[("registration", "strangers", 0.4), ("registration", "cut", math.nan), ("faust", "points", 5)],
+        *[("faust", "test", []), ("faust", "test", [10]), ("faust", "data_seed", -1)],
+    ],
 )
-def test_a_config_out_of_range_is_refused(config):
+def test_a_config_out_of_range_is_refused(name, key, value):
     with pytest.raises(ConfigError, match=r"data\."):
-        resolve("data", {"name": "registration", **config})
+        resolve("data", {"name": name, key: value})
 
 
 def test_a_result_is_one_coloured_ply(tmp_path):
