@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
-OTHER_NAMES = {
-    "r": "red",
-    "g": "green",
-    "b": "blue",
-    "nx": "normal_x",
-    "ny": "normal_y",
-    "nz": "normal_z",
-}
+OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
 """What files call the columns that have a name of their own here."""
 MOST = 2**31
 """Vertices or faces that a header may announce; more is damage."""

@@ -219,10 +219,7 @@ def rotations(
         thigh = _unit(joints[where.knee[side]] - joints[where.hip[side]])
         apart = np.arctan2(sign * thigh[0], -thigh[1])
         turn(
-            [where.hip[side]],
-            (x, -of["hip"]),
-            (z, sign * (of["spread"] - apart)),
-            (y, sign * of["hip_turn"]),
+            [where.hip[side]], (x, -of["hip"]), (z, sign * (of["spread"] - apart)), (y, sign * of["hip_turn"])
         )
         turn([where.knee[side]], (x, of["knee"]))
         turn([where.ankle[side]], (x, of["ankle"]))

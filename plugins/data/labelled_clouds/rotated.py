@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.geometry.rotation import about_z
 from plugins.data.labelled_clouds.reading import Clouds
 
 
@@ -20,10 +21,7 @@ class Rotated(Dataset[dict[str, Tensor]]):
     def __init__(self, clouds: Clouds, rotations: int) -> None:
         self.clouds = clouds
         angle = torch.arange(rotations, dtype=torch.float64) * (2 * math.pi / rotations)
-        cos, sin, one = angle.cos(), angle.sin(), torch.ones_like(angle)
-        zero = torch.zeros_like(angle)
-        rows = [torch.stack(row, -1) for row in ((cos, -sin, zero), (sin, cos, zero), (zero, zero, one))]
-        self.matrices = torch.stack(rows, -2).float()
+        self.matrices = about_z(angle).float()
 
     def __len__(self) -> int:
         return len(self.matrices) * len(self.clouds)

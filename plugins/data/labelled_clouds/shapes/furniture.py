@@ -34,10 +34,7 @@ def rails(random: Random, width: float, depth: float, height: float, thick: floa
         return []
     z, half = height * random.uniform(0.2, 0.45), thick * 0.35
     x, y = width / 2 - thick, depth / 2 - thick
-    return [
-        rod((-x, 0, z), (x, 0, z), half),
-        mirrored(rod((x, -y, z), (x, y, z), half), 0),
-    ]
+    return [rod((-x, 0, z), (x, 0, z), half), mirrored(rod((x, -y, z), (x, y, z), half), 0)]
 
 
 def top(random: Random, width: float, depth: float, height: float, thick: float, bar: float) -> list[Solid]:
@@ -76,10 +73,7 @@ def desk(random: Random) -> Solid:
     side = random.choice([-1, 1])
     x = side * (width - chest) / 2 * 0.96
     low = random.choice([0.0, 0.0, 0.35]) * height
-    parts = [
-        box(width, depth, thick, (0, 0, height)),
-        box(chest, depth * 0.9, height - low, (x, 0, low)),
-    ]
+    parts = [box(width, depth, thick, (0, 0, height)), box(chest, depth * 0.9, height - low, (x, 0, low))]
     for number in range(int(random.integers(0, 4))):
         z = low + (number + 0.5) / 4 * (height - low)
         parts.append(box(chest * 0.85, 0.02, (height - low) * 0.18, (x, -depth * 0.46, z)))
