@@ -82,30 +82,9 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
         raise DataError(
             f"Cloud {cloud} of the batch holds {clouds[cloud, point, column].item()} in column {column} of its point "
             f"{point}; wanted finite numbers, and rows of NaN as padding at the end alone. Mend the file, or drop such "
-            "points (framework.geometry.clouds.without_bad_points)."
+            "points."
         )
     return counts
-
-
-def without_bad_points(
-    clouds: Float[Tensor, "batch points columns"],
-) -> tuple[Float[Tensor, "batch fewer columns"], Int[Tensor, "batch"]]:
-    """The clouds without points that hold a NaN or infinite number, and how many each has lost; padding is no loss.
-
-    Raises:
-        DataError: nothing is left of a cloud; names it.
-    """
-    padding = clouds.isnan().all(-1).flip(1).cumprod(1).flip(1).bool()  # NaN from here to the end
-    good = clouds.isfinite().all(-1)
-    dropped = (~good & ~padding).sum(1)
-    empty = (~good.any(1)).nonzero()
-    if len(empty):
-        cloud = int(empty[0])
-        raise DataError(
-            f"Cloud {cloud} of the batch has no finite point, {int(dropped[cloud])} that are not; wanted one at least. "
-            "Leave this cloud out."
-        )
-    return pad([cloud[kept] for cloud, kept in zip(clouds, good, strict=True)]), dropped
 
 
 def filled(
