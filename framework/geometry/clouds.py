@@ -87,9 +87,7 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
     return counts
 
 
-def filled(
-    clouds: Float[Tensor, "batch points columns"], sizes: Int[Tensor, "batch"] | None
-) -> Bool[Tensor, "batch points"]:
+def filled(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
     """Which rows hold points, of clouds of so many points; all, where None."""
     if sizes is None:
         return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
