@@ -153,7 +153,7 @@ def trained(run: Path, split) -> list[str]:
 
 
 def picture(run: str, scan: Path) -> None:
-    from plugins.data.bodies.registration.__main__ import register
+    from plugins.data.bodies.__main__ import register
 
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         written = register(run, [scan], Path(folder))

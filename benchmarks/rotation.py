@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.geometry.meshes import Mesh, sample
 from framework.reports.table import markdown
-from plugins.data.labelled_clouds.modelnet40.generator import CLASSES, model
+from plugins.data.labelled_clouds.shapes.generator import CLASSES, model
 from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import channels, encode, prepared
 

@@ -20,9 +20,9 @@ from framework.figures.style import titled_figure
 from framework.geometry.clouds import sizes
 from framework.geometry.nearest import nearest
 from framework.reports.table import markdown
+from plugins.data.bodies import poses
 from plugins.data.bodies.body import Body
-from plugins.data.bodies.registration import poses
-from plugins.data.bodies.registration.data import chosen_body
+from plugins.data.bodies.people import chosen_body
 from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import Basis, encode, per_point, prepared
 

@@ -19,7 +19,6 @@ from framework.geometry.clouds import (
     pad,
     require_normalised,
     sizes,
-    without_bad_points,
 )
 
 DTYPES = [torch.float32, torch.float64]
@@ -83,19 +82,6 @@ def test_a_bad_number_is_named_wherever_it_stands(lengths, columns, data):
         DataError, match=f"Cloud {which} .* holds {number} in column {column} of its point {point};"
     ):
         sizes(batch)
-    kept, dropped = without_bad_points(batch) if lengths[which] > 1 else (None, None)
-    if kept is not None:
-        assert dropped.tolist() == [int(other == which) for other in range(len(lengths))]
-        wanted = [
-            np.delete(one, point, 0) if n == which else one for n, one in enumerate(unpadded(batch, lengths))
-        ]
-        assert sizes(kept).tolist() == [len(one) for one in wanted]
-        for found, one in zip(unpadded(kept, sizes(kept)), wanted, strict=True):
-            np.testing.assert_array_equal(found, one)
-
-
-def unpadded(batch, lengths):
-    return [one[: int(length)].numpy() for one, length in zip(batch, lengths, strict=True)]
 
 
 def test_rows_of_nan_within_a_cloud_are_bad_points_and_at_its_end_padding():
@@ -103,19 +89,12 @@ def test_rows_of_nan_within_a_cloud_are_bad_points_and_at_its_end_padding():
     batch[0, 2] = NAN
     with pytest.raises(DataError, match=r"Cloud 0 .* of its point 2;"):
         sizes(batch)
-    kept, dropped = without_bad_points(batch)
-    assert (sizes(kept).tolist(), dropped.tolist()) == ([4, 3], [1, 0])
 
 
 @pytest.mark.parametrize("batch", [torch.zeros(2, 0, 3), pad([cloud(2), cloud(2) * NAN])], ids=["0", "NaN"])
 def test_an_empty_cloud_is_refused(batch):
     with pytest.raises(DataError, match=r"Cloud \d of the batch has no point"):
         sizes(batch)
-
-
-def test_a_cloud_of_bad_points_alone_cannot_be_mended():
-    with pytest.raises(DataError, match="Cloud 1 of the batch has no finite point, 2 that are not"):
-        without_bad_points(torch.stack([torch.zeros(2, 3), torch.tensor([[INF, 0, 0], [0, NAN, 0]])]))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Batches of point clouds: how many points each has, padding, normalisation and the way back (thesis eq. 6.1-6.2).
+"""Pads batches of point clouds, counts their points, normalises them and leads back (thesis eq. 6.1-6.2).
 
 A batch is a float tensor (batch, points, columns): x, y, z, then attributes of each point (colours, normals, anything).
 Clouds of fewer points are padded at their end with rows that are NaN in every column. Messages count clouds and points
@@ -82,30 +82,16 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
         raise DataError(
             f"Cloud {cloud} of the batch holds {clouds[cloud, point, column].item()} in column {column} of its point "
             f"{point}; wanted finite numbers, and rows of NaN as padding at the end alone. Mend the file, or drop such "
-            "points (framework.geometry.clouds.without_bad_points)."
+            "points."
         )
     return counts
 
 
-def without_bad_points(
-    clouds: Float[Tensor, "batch points columns"],
-) -> tuple[Float[Tensor, "batch fewer columns"], Int[Tensor, "batch"]]:
-    """The clouds without points that hold a NaN or infinite number, and how many each has lost; padding is no loss.
-
-    Raises:
-        DataError: nothing is left of a cloud; names it.
-    """
-    padding = clouds.isnan().all(-1).flip(1).cumprod(1).flip(1).bool()  # NaN from here to the end
-    good = clouds.isfinite().all(-1)
-    dropped = (~good & ~padding).sum(1)
-    empty = (~good.any(1)).nonzero()
-    if len(empty):
-        cloud = int(empty[0])
-        raise DataError(
-            f"Cloud {cloud} of the batch has no finite point, {int(dropped[cloud])} that are not; wanted one at least. "
-            "Leave this cloud out."
-        )
-    return pad([cloud[kept] for cloud, kept in zip(clouds, good, strict=True)]), dropped
+def filled(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
+    """Which rows hold points, of clouds of so many points; all, where None."""
+    if sizes is None:
+        return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
+    return torch.arange(clouds.shape[1], device=clouds.device) < sizes.to(clouds.device)[:, None]
 
 
 def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
@@ -180,7 +166,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
     _, points, columns = clouds.shape
     real = None  # a mask of the points, where there is padding
     if not bool((counts == points).all()):
-        real = (torch.arange(points, device=clouds.device) < counts[:, None])[..., None]
+        real = filled(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()
     first = coordinates[:, :1]
     # about the first point: what is far from the origin keeps its digits, equal points are exactly equal
@@ -241,7 +227,7 @@ def require_normalised(
         DataError: half of a cloud's points are further than 2 reaches from the origin (fewer may be outliers that a
             robust normalisation left there), or all are within 0.01 (but not all on it).
     """
-    real = torch.arange(coordinates.shape[1], device=coordinates.device) < counts[:, None]
+    real = filled(coordinates, counts)
     norm = torch.linalg.vector_norm(coordinates.detach().double(), dim=-1)
     largest = norm.where(real, 0).amax(1) if norm.shape[1] else norm.sum(1)
     far = largest > LOOSE * reach

@@ -1,4 +1,4 @@
-"""The usual normalisation of clouds in one pass of compiled code, for small batches on the processor."""
+"""Normalises clouds in the usual way in one pass of compiled code, for small batches on the processor."""
 
 from typing import no_type_check
 

@@ -1,4 +1,4 @@
-"""Mesh and cloud files as arrays, one parser a format; what a file does not hold is never made up.
+"""Parses mesh and cloud files into arrays, one function a format; what a file does not hold is never made up.
 
 Every parser takes the bytes of a file and raises a ValueError that says what came and what was wanted; the caller,
 `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, line ends may be those of any
@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
-OTHER_NAMES = {
-    "r": "red",
-    "g": "green",
-    "b": "blue",
-    "nx": "normal_x",
-    "ny": "normal_y",
-    "nz": "normal_z",
-}
+OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
 """What files call the columns that have a name of their own here."""
 MOST = 2**31
 """Vertices or faces that a header may announce; more is damage."""

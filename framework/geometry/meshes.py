@@ -1,4 +1,4 @@
-"""Meshes and point clouds: reading their files, and points drawn from a surface, uniformly by area."""
+"""Reads meshes and point clouds from files, and draws points from a surface, uniformly by area."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -151,10 +151,8 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
     Raises:
         DataError: the mesh has no faces, or none with an area.
     """
-    cross = _cross(mesh)
-    areas = np.sqrt((cross * cross).sum(0))  # twice the area, in units² of the longest side
-    total = areas.sum()
-    if not total > 0:
+    _, areas = _cross(mesh)  # twice the area, in units² of the longest side
+    if not areas.sum() > 0:
         raise DataError(
             f"{mesh.source}: its {len(areas)} faces have no area; wanted a surface to draw points from. Leave it out, "
             "or give points instead of a mesh."
@@ -172,13 +170,13 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
 
 def normals(mesh: Mesh) -> Float[np.ndarray, "faces 3"]:
     """Unit normals of the faces, outwards; 0 where a face has no area."""
-    cross = _cross(mesh)
-    length = np.sqrt((cross * cross).sum(0))
+    cross, length = _cross(mesh)
     return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0).T
 
 
-def _cross(mesh: Mesh) -> Float[np.ndarray, "3 faces"]:
-    """Cross products of two sides of every face, in units² of the longest side: none over- or underflows."""
+def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, "faces"]]:
+    """Cross products of two sides of every face and their lengths, in units² of the longest side: none over- or
+    underflows."""
     if not len(mesh.faces):
         raise DataError(
             f"{mesh.source}: it has no faces; wanted a surface to draw points from. Use it as the point cloud it is, "
@@ -195,7 +193,8 @@ def _cross(mesh: Mesh) -> Float[np.ndarray, "3 faces"]:
     if unit > 0:
         first, second = first / unit, second / unit
     (x, y, z), (u, v, w) = first, second
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    cross = np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    return cross, np.sqrt((cross * cross).sum(0))
 
 
 def stream(seed: int, name: str) -> np.random.Generator:

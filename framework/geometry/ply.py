@@ -1,4 +1,4 @@
-"""PLY files, text or binary, as arrays: vertices with all their properties, and faces."""
+"""Parses PLY files, text or binary, into arrays: vertices with all their properties, and faces."""
 
 import re
 from dataclasses import dataclass

@@ -12,7 +12,7 @@ def viewpoint_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*bat
     Tulsiani & Malik (CVPR 2015). The camera frame has x right, y up, z towards the viewer.
     """
     azimuth, elevation, tilt = angles.unbind(-1)
-    return _about_z(tilt) @ _about_x_elevation(elevation) @ _about_z(-azimuth)
+    return about_z(tilt) @ _about_x_elevation(elevation) @ about_z(-azimuth)
 
 
 def geodesic_distance(
@@ -20,8 +20,7 @@ def geodesic_distance(
 ) -> Float[Tensor, "*batch"]:
     """Angle of the rotation between two rotations, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
 
-    Computed as 2 asin(||R₁ - R₂||_F / (2√2)), which is exact near 0, where the arc cosine of the trace loses half
-    the digits; past 90° from the trace side: 2 acos(√(1 + tr(R₁ᵀR₂)) / 2), exact near π.
+    Exact near 0, where the arc cosine of the trace loses half the digits, and near π.
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5  # sin(angle / 2)
     trace = (first * second).sum((-2, -1))
@@ -29,7 +28,8 @@ def geodesic_distance(
     return 2 * torch.atan2(chord, cosine)
 
 
-def _about_z(angle: Tensor) -> Tensor:
+def about_z(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation about the third axis, radians, counter-clockwise seen from its positive end."""
     cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
     rows = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1)
     return rows.unflatten(-1, (3, 3))

@@ -1,6 +1,7 @@
-"""Exact nearest neighbours of query points in point clouds, and the Chamfer distance (thesis eq. 6.4-6.6).
+"""Finds the point of a cloud that is nearest to each query, exactly; and the Chamfer distance (thesis eq. 6.4-6.6).
 
-On the processor by compiled kernels (`nearest_numba`, imported when first needed), elsewhere in torch.
+On the processor by compiled kernels (`processor`, imported when first needed), elsewhere in torch (`device`). For
+clouds in pieces see `streamed`; the modules beside it are for this package alone.
 """
 
 import math
@@ -13,9 +14,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.errors import DataError
+from framework.geometry.clouds import filled
 
 OFTEN = 2**16
 """Queries up to which packing them well takes less than a second."""
+MOST = {torch.float32: 126, torch.float64: 1000}
+"""Exponents of two up to which a power is finite, and its inverse too."""
 
 
 class Nearest(NamedTuple):
@@ -146,7 +150,7 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
     """Raises DataError that names the first number that is not finite, where there is one."""
     bad = ~points.isfinite().all(-1)
     if sizes is not None:
-        bad &= torch.arange(points.shape[1], device=bad.device) < sizes.to(bad.device)[:, None]
+        bad &= filled(points, sizes)
     if bad.any():
         cloud, point = bad.nonzero()[0].tolist()
         raise DataError(
@@ -158,12 +162,12 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
 def on_processor(
     clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None, query_sizes: Tensor | None
 ) -> Nearest:
-    from framework.geometry.nearest import processor as nearest_numba
+    from framework.geometry.nearest import processor
 
     shared = isinstance(queries, Queries)
     points = queries.points if isinstance(queries, Queries) else queries.detach().contiguous()
     clouds = clouds.contiguous()
-    answered = nearest_numba.answers(
+    answered = processor.answers(
         clouds.numpy(),
         None if sizes is None else sizes.numpy(),
         queries.packed if isinstance(queries, Queries) else points.numpy(),
@@ -172,11 +176,11 @@ def on_processor(
     )
     distance, index = torch.from_numpy(answered.distance), torch.from_numpy(answered.index)
     for i, outcome in enumerate(answered.outcome.tolist() if answered.outcome.any() else ()):
-        if outcome == nearest_numba.BAD_CLOUD:
+        if outcome == processor.BAD_CLOUD:
             refuse_bad(clouds, sizes, "clouds")
-        elif outcome == nearest_numba.BAD_QUERIES:
+        elif outcome == processor.BAD_QUERIES:
             refuse_bad(points, query_sizes, "queries")
-        elif outcome == nearest_numba.IMMODERATE:
+        elif outcome == processor.IMMODERATE:
             some = points if shared else points[i]
             some = some if query_sizes is None else some[: int(query_sizes[i])]
             cloud = clouds[i] if sizes is None else clouds[i, : int(sizes[i])]
@@ -205,8 +209,7 @@ def scaling(cloud: Tensor, queries: Tensor) -> float:
     """A power of two, by which multiplying is exact, that takes the largest coordinate to 1, or nearer where the dtype
     cannot hold such a power: `nearest` then scales once more."""
     largest = max(float(cloud.abs().max()), float(queries.abs().max()))
-    most = 126 if cloud.dtype == torch.float32 else 1000
-    return 2.0 ** max(-most, min(most, -math.frexp(largest)[1]))
+    return 2.0 ** max(-MOST[cloud.dtype], min(MOST[cloud.dtype], -math.frexp(largest)[1]))
 
 
 def unscaled(distance: Tensor, scale: float, cloud: int) -> Tensor:
@@ -236,10 +239,9 @@ def chamfer(
 def one_way(queries: Tensor, clouds: Tensor, query_sizes: Tensor | None, sizes: Tensor | None) -> Tensor:
     index = nearest(clouds, queries, sizes, query_sizes).index
     if query_sizes is not None:
-        query_sizes = query_sizes.to(queries.device)
-        real = torch.arange(queries.shape[1], device=queries.device) < query_sizes[:, None]
+        real = filled(queries, query_sizes)
         queries = queries.where(real[..., None], 0)  # before anything is multiplied: NaN × 0 is no gradient
     square = (queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))).square().sum(-1)
     if query_sizes is None:
         return square.mean(1)
-    return square.where(real, 0).sum(1) / query_sizes
+    return square.where(real, 0).sum(1) / query_sizes.to(square.device)

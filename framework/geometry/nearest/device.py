@@ -1,8 +1,11 @@
-"""Nearest neighbours in torch, for devices other than the processor: all pairs, in pieces of bounded memory."""
+"""Finds nearest neighbours in torch, on devices other than the processor: all pairs, in pieces of bounded memory."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from framework.geometry.clouds import filled
+from framework.geometry.nearest import MOST
 
 PAIRS = 2**24
 """Squared distances held at a time: three arrays of this size, 192 MiB in float32."""
@@ -24,12 +27,10 @@ def nearest_of(
     if queries.dim() == 2:
         queries = queries.expand(batch, -1, -1)
     # divided by a power of two, which is exact, so that no square overflows or vanishes
-    real = torch.arange(points, device=clouds.device) < limits(sizes, batch, points, clouds.device)
-    asking = torch.arange(asked, device=clouds.device) < limits(query_sizes, batch, asked, clouds.device)
+    real, asking = filled(clouds, sizes), filled(queries, query_sizes)
     clouds, queries = clouds.where(real[..., None], 0), queries.where(asking[..., None], 0)
     largest = torch.maximum(clouds.abs().amax((1, 2)), queries.abs().amax((1, 2)))
-    most = 126 if clouds.dtype == torch.float32 else 1000  # further powers of two are infinite
-    exponent = torch.frexp(largest).exponent.clamp(-most, most)
+    exponent = torch.frexp(largest).exponent.clamp(-MOST[clouds.dtype], MOST[clouds.dtype])
     clouds = torch.ldexp(clouds, -exponent[:, None, None])
     queries = torch.ldexp(queries, -exponent[:, None, None])
 
@@ -58,9 +59,3 @@ def nearest_of(
             index[b : b + cut_batch, q : q + cut_queries] = which
     distance = torch.ldexp(distance, exponent[:, None])
     return distance.where(asking, torch.nan), index.where(asking, 0)
-
-
-def limits(sizes: Tensor | None, batch: int, most: int, device: torch.device) -> Int[Tensor, "batch 1"]:
-    if sizes is None:
-        return torch.full((batch, 1), most, device=device)
-    return sizes.to(device)[:, None]

@@ -1,4 +1,4 @@
-"""Sixteen numbers that move together: short vectors for functions compiled by numba.
+"""Gives functions compiled by numba short vectors: sixteen numbers that move together.
 
 A value of type `Lanes` holds 16 numbers (4 where a name ends in 4) of an array's dtype, or as many truth values. `-`,
 `+`, `*`, `&`, `|` and the comparisons work lane by lane on two of the same type. Vectors are LLVM's own, so the

@@ -1,4 +1,4 @@
-"""Nearest neighbours on the processor: which kernel for which cloud, and in how many threads."""
+"""Finds nearest neighbours on the processor: chooses the kernel for each cloud, and the number of threads."""
 
 import os
 from collections.abc import Callable
@@ -206,7 +206,7 @@ UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.
 
 
 class Desks(local):
-    """Memory of each thread; that of small clouds is kept for the next call, since finding it takes as long as they."""
+    """Memory of each thread; a small cloud's is kept for the next call: asking for it takes as long as answering."""
 
     def __init__(self) -> None:
         self.kept: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}

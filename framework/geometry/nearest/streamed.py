@@ -1,4 +1,4 @@
-"""Nearest neighbours in clouds that do not fit into memory: points come in chunks of any size, one after the other.
+"""Finds nearest neighbours in clouds larger than memory: points come in chunks of any size, one after the other.
 
     middle = Middle()                       # first reading
     for chunk in chunks(): middle.add(chunk)

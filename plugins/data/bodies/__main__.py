@@ -1,0 +1,68 @@
+"""`python -m plugins.data.bodies <checkpoint> <scan> ...` registers meshes to scans: PLY files and pictures."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.protocol import median
+from framework.errors import ConfigError, UserError
+from framework.geometry.clouds import denormalised, sizes
+from framework.runs.loading import load_with_description
+from plugins.data.bodies.data import Registration
+from plugins.data.bodies.people import chosen_body
+from plugins.data.bodies.result import picture, write_ply
+
+
+def main(arguments: list[str]) -> None:
+    """Write `<folder>/<scan>_registered.ply` and `.png` for each scan: metres, as the scan lies.
+
+    Raises:
+        UserError: a checkpoint of another data set, or a file that cannot be read.
+    """
+    parser = argparse.ArgumentParser(prog="python -m plugins.data.bodies", description=__doc__)
+    parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
+    parser.add_argument("scans", nargs="+", type=Path, help="meshes or clouds, metres, y up, facing z")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("outputs"), help="where to write; default: outputs"
+    )
+    given = parser.parse_args(arguments)
+    given.folder.mkdir(parents=True, exist_ok=True)
+    for file in register(given.checkpoint, given.scans, given.folder):
+        sys.stdout.write(f"{file}\n")
+
+
+@torch.no_grad()
+def register(checkpoint: str, scans: list[Path], folder: Path) -> list[Path]:
+    """The files written, two a scan."""
+    predictor, described = load_with_description(checkpoint)
+    part = described["config"]["data"]
+    if part["name"] != "registration":
+        raise ConfigError(
+            f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration`, which says "
+            "what body its vertices are of."
+        )
+    data: Registration = build("data", resolve("data", part))
+    faces = chosen_body(data.body)[0].faces
+    written = []
+    for scan in scans:
+        batch = data.read([scan]).__getitems__([0])  # pyright: ignore[reportAttributeAccessIssue]
+        local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
+        place = batch["centre"], batch["scale"]
+        vertices = denormalised(local, *place)[0].numpy()
+        cloud = denormalised(batch["input"], *place)[0, : int(sizes(batch["input"]))].numpy()
+        stem = folder / f"{scan.stem}_registered"
+        write_ply(stem.with_suffix(".ply"), vertices, faces, cloud)
+        Image.fromarray(picture(vertices, faces, cloud)).save(stem.with_suffix(".png"))
+        written += [stem.with_suffix(".ply"), stem.with_suffix(".png")]
+    return written
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UserError as error:
+        sys.exit(f"error: {error}")

@@ -1,1 +1,0 @@
-"""FAUST: real scans of ten people with registered meshes."""

@@ -1,1 +1,0 @@
-"""Registering a body's mesh to a scan: synthetic bodies, scanned."""

@@ -1,0 +1,98 @@
+"""Shows a registered mesh with the scan it was registered to: as one PLY file, and as a picture."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int, UInt8
+
+SKIN, SCAN = (0.86, 0.68, 0.58), (0.16, 0.36, 0.75)
+"""Colours of the mesh and of the scan's points (thesis Figure 6.6)."""
+AMBIENT = 0.3
+"""Share of the light that comes from everywhere; the rest comes from the viewer."""
+
+
+def write_ply(
+    file: Path,
+    vertices: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    cloud: Float[np.ndarray, "points 3"],
+) -> None:
+    """The mesh, skin-coloured, and the cloud's points, blue, as vertices that no face uses; binary, metres."""
+    colours = np.repeat([_bytes(SKIN), _bytes(SCAN)], (len(vertices), len(cloud)), 0)
+    points = np.concatenate([vertices, cloud])
+    trimesh.Trimesh(points, faces, vertex_colors=colours, process=False).export(file, "ply")
+
+
+def picture(
+    vertices: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    cloud: Float[np.ndarray, "points 3"],
+    height: int = 480,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """From the front and from the left, orthographic on white, y up: the cloud alone, the mesh, and both."""
+    everything = np.concatenate([vertices, cloud])
+    low, high = everything.min(0), everything.max(0)
+    middle, reach = (low + high) / 2, 1.06 * max((high - low).max(), 1e-9)
+    views = []
+    for right, towards in ((0, 2), (2, 0)):
+        flip = 1 if right == 0 else -1  # from the left, the front is to the viewer's left
+        frame = np.zeros((3, 3))
+        frame[0, right], frame[1, 1], frame[2, towards] = flip, 1, 1
+        seen = (vertices - middle) @ frame.T / reach
+        points = (cloud - middle) @ frame.T / reach
+        for parts in ((None, points), (seen, None), (seen, points)):
+            views.append(_drawn(*parts, faces, height))
+    return np.concatenate(views, 1)
+
+
+def _drawn(
+    vertices: np.ndarray | None, points: np.ndarray | None, faces: np.ndarray, side: int
+) -> UInt8[np.ndarray, "side side 3"]:
+    """x right, y up, z to the viewer, all within ±0.5; nearer surfaces hide others, points sit on what they touch."""
+    image = np.ones((side, side, 3))
+    depth = np.full((side, side), -np.inf)
+    if vertices is not None:
+        _draw_mesh(vertices, faces, image, depth)
+    if points is not None:
+        place = _pixels(points[:, :2], side)
+        order = np.argsort(points[:, 2], kind="stable")  # the nearest last
+        row, column, near = *place[order].T, points[order, 2]
+        seen = near >= depth[row, column] - 0.01  # noise of a scan may lie a little under the surface
+        image[row[seen], column[seen]] = SCAN
+    return _bytes(image)
+
+
+def _draw_mesh(vertices: np.ndarray, faces: np.ndarray, image: np.ndarray, depth: np.ndarray) -> None:
+    """Points densely over every face that looks at the viewer, each as near as it is; brighter the more it does."""
+    side = len(image)
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    kept = (length > 0) & (normal[:, 2] > 0)
+    corners, facing = corners[kept], normal[kept, 2] / length[kept]
+    size = np.abs(corners - np.roll(corners, 1, 1))[..., :2].max((1, 2)) * side
+    for steps in np.unique(np.ceil(size).astype(int) + 1):
+        some = np.ceil(size).astype(int) + 1 == steps
+        i, j = (index.ravel() for index in np.meshgrid(*[np.arange(steps + 1)] * 2))
+        weights = np.stack([i, j, steps - i - j], 1)[i + j <= steps] / steps
+        dots = np.einsum("wc,fcx->fwx", weights, corners[some])
+        shade = AMBIENT + (1 - AMBIENT) * np.repeat(facing[some], len(weights))
+        dots = dots.reshape(-1, 3)
+        order = np.argsort(dots[:, 2], kind="stable")
+        row, column = _pixels(dots[order, :2], side).T
+        near = dots[order, 2] > depth[row, column]
+        row, column, order = row[near], column[near], order[near]
+        depth[row, column] = dots[order, 2]
+        image[row, column] = shade[order, None] * np.array(SKIN)
+
+
+def _pixels(points: np.ndarray, side: int) -> Int[np.ndarray, "points 2"]:
+    """Row and column of points within ±0.5."""
+    column = np.floor((points[:, 0] + 0.5) * side)
+    row = np.floor((0.5 - points[:, 1]) * side)
+    return np.stack([row, column], 1).clip(0, side - 1).astype(np.int64)
+
+
+def _bytes(color: object) -> UInt8[np.ndarray, "*shape"]:
+    return (255 * np.asarray(color)).round().astype(np.uint8)

@@ -1,0 +1,97 @@
+"""What a scanner makes of a body: points of its surface with noise, parts missing, and points of something else."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.random import Generator
+
+from framework.geometry.meshes import Mesh, normals, sample
+
+Kind = Literal["whole", "partial", "outliers"]
+KINDS: tuple[Kind, ...] = ("whole", "partial", "outliers")
+
+
+@dataclass(frozen=True)
+class Scanner:
+    """How a body is scanned.
+
+    Attributes:
+        points: of the surface and beside it, all in all; fewer where parts are missing.
+        noise: largest standard deviation of every coordinate, metres.
+        cut: largest share of the points that is missing behind a plane or within a ball.
+        strangers: largest share of the points that are not the body's.
+    """
+
+    points: int
+    noise: float
+    cut: float
+    strangers: float
+
+
+def shares(partial: float, outliers: float) -> Float[np.ndarray, "kind"]:
+    """Of each kind of scan, of sum 1; what is neither partial nor has outliers is whole."""
+    found = (1 - min(1, partial + outliers), partial, outliers)
+    return np.array(found) / sum(found)
+
+
+def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:
+    """Points of one body, metres, uniform over what is seen of its surface.
+
+    "partial": without what lies behind a plane or within a ball, or as one camera at its height sees it (surfaces that
+    face away are missing; what an arm hides is not). "outliers": with a patch of floor and points anywhere around.
+    """
+    stranger = int(scanner.strangers * scanner.points * random.random()) if kind == "outliers" else 0
+    drawn = sample(mesh, scanner.points - stranger, random)
+    points = drawn.points
+    if kind == "partial":
+        hidden = (_behind_plane, _within_ball, _facing_away)[random.integers(3)]
+        points = points[~hidden(mesh, drawn.points, drawn.face, scanner.cut, random)]
+    points = points + random.normal(0, scanner.noise * random.random(), points.shape)
+    if stranger:
+        points = np.concatenate([points, strangers(mesh.vertices, stranger, random)])
+    return points
+
+
+def strangers(
+    vertices: Float[np.ndarray, "vertex 3"], count: int, random: Generator
+) -> Float[np.ndarray, "points 3"]:
+    """A patch of the floor under the feet, and at most one in fifty of them anywhere in a box around the body."""
+    low, high = vertices.min(0), vertices.max(0)
+    anywhere = random.integers(count // 50 + 1)
+    middle, reach = (low + high) / 2, 0.65 * (high - low).max()
+    around = middle + random.uniform(-reach, reach, (anywhere, 3))
+    side = random.uniform(0.3, 0.8, 2)
+    centre = middle[[0, 2]] + random.normal(0, 0.15, 2)
+    floor = np.empty((count - anywhere, 3))
+    floor[:, [0, 2]] = centre + random.uniform(-side, side, (count - anywhere, 2))
+    floor[:, 1] = low[1] + random.normal(0, 0.004, count - anywhere)
+    return np.concatenate([floor, around])
+
+
+def _behind_plane(
+    mesh: Mesh, points: np.ndarray, face: np.ndarray, most: float, random: Generator
+) -> Bool[np.ndarray, "points"]:
+    along = points @ _direction(random)
+    return along > np.quantile(along, 1 - most * random.random())
+
+
+def _within_ball(
+    mesh: Mesh, points: np.ndarray, face: np.ndarray, most: float, random: Generator
+) -> Bool[np.ndarray, "points"]:
+    distance = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
+    return distance < np.quantile(distance, most * random.random())
+
+
+def _facing_away(
+    mesh: Mesh, points: np.ndarray, face: np.ndarray, most: float, random: Generator
+) -> Bool[np.ndarray, "points"]:
+    azimuth = random.normal(0, 0.7) + (np.pi if random.random() < 0.3 else 0)  # mostly from the front
+    towards = np.array([np.sin(azimuth), random.normal(0, 0.15), np.cos(azimuth)])
+    return normals(mesh)[face] @ towards < 0
+
+
+def _direction(random: Generator) -> Float[np.ndarray, "3"]:
+    vector = random.normal(size=3)
+    return vector / np.linalg.norm(vector)

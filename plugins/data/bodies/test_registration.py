@@ -1,0 +1,392 @@
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError
+from framework.geometry.clouds import denormalised, sizes
+from framework.geometry.meshes import Mesh, read
+from plugins.data.bodies import body_files, poses
+from plugins.data.bodies.body import Body, BodyModel
+from plugins.data.bodies.result import SCAN, SKIN, picture, write_ply
+from plugins.data.bodies.scanner import KINDS, Scanner, scan, strangers
+
+# the SMPL family's first 22 joints: pelvis, hips, spine, knees, spine, ankles, spine, toes, neck, collars, head,
+# shoulders, elbows, wrists; a T-pose of a person of 1.7 m
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+JOINTS = np.array(
+    [
+        *[(0, 0.95, 0), (0.1, 0.9, 0), (-0.1, 0.9, 0), (0, 1.05, 0), (0.1, 0.5, 0), (-0.1, 0.5, 0)],
+        *[
+            (0, 1.18, 0),
+            (0.1, 0.1, -0.02),
+            (-0.1, 0.1, -0.02),
+            (0, 1.25, 0),
+            (0.1, 0.02, 0.1),
+            (-0.1, 0.02, 0.1),
+        ],
+        *[(0, 1.45, 0), (0.08, 1.38, 0), (-0.08, 1.38, 0), (0, 1.55, 0.02), (0.2, 1.4, 0), (-0.2, 1.4, 0)],
+        *[(0.45, 1.4, 0), (-0.45, 1.4, 0), (0.7, 1.4, 0), (-0.7, 1.4, 0)],
+    ]
+)
+
+
+def doll():
+    """A small octahedron around the middle of every bone, which follows it alone."""
+    around = 0.04 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+    faces = np.array([(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)])
+    template = np.concatenate([joint + around for joint in JOINTS])
+    vertices = len(template)
+    random = np.random.default_rng(0)
+    return {
+        "v_template": template,
+        "shapedirs": np.concatenate(
+            [0.05 * template[..., None], random.normal(0, 1e-3, (vertices, 3, 3))], 2
+        ),
+        "J_regressor": np.kron(np.eye(22), np.full((1, 6), 1 / 6)),
+        "weights": np.kron(np.eye(22), np.ones((6, 1))),
+        "kintree_table": np.array([PARENTS, range(22)]),
+        "f": np.concatenate([faces + 6 * joint for joint in range(22)]),
+    }
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("body") / "doll.npz"
+    np.savez(path, **doll())
+    return path
+
+
+def data(file, **config):
+    sizes = {"train": 12, "validation": 3, "test": 30, "points": 500}
+    return build("data", resolve("data", {"name": "registration", "body": str(file), **sizes, **config}))
+
+
+def prepared(file, **config):
+    made = data(file, **config)
+    made.prepare()
+    return made
+
+
+def angles(**movements):
+    named = {
+        name.replace("_", " ", 1) if name.split("_")[0] in ("left", "right") else name: value
+        for name, value in movements.items()
+    }
+    return np.array([[named.get(name, rest(name)) for name in poses.MOVEMENTS]], float)
+
+
+def rest(name):
+    """The movement that leaves a T-pose as it is."""
+    return 90.0 if name.endswith("raise") else 0.0
+
+
+def placed(file, **movements):
+    body = body_files.read(file)
+    pose = poses.rotations(body, poses.skeleton(body), angles(**movements))
+    model = BodyModel(body)
+    return model.posed_joints(torch.zeros(1, 0, dtype=torch.float64), torch.from_numpy(pose))[0].numpy()
+
+
+def test_movements_take_joints_where_their_names_say(file):
+    shoulder, elbow, wrist = 16, 18, 20
+    np.testing.assert_allclose(placed(file), JOINTS, atol=1e-12)
+    down = placed(file, left_raise=0)
+    np.testing.assert_allclose(down[wrist], JOINTS[shoulder] + [0, -0.5, 0], atol=1e-12)
+    np.testing.assert_allclose(down[21], JOINTS[21], atol=1e-12)  # the other arm stays
+    up = placed(file, right_raise=160)
+    wanted = [-math.sin(math.radians(160)), -math.cos(math.radians(160)), 0]
+    np.testing.assert_allclose((up[21] - up[17]) / 0.5, wanted, atol=1e-12)
+    for side, elbow, wrist in (("left", 18, 20), ("right", 19, 21)):
+        bent = placed(file, **{f"{side}_elbow": 90})
+        np.testing.assert_allclose(
+            bent[wrist] - bent[elbow], [0, 0, 0.25], atol=1e-12
+        )  # forearm to the front
+        ahead = placed(file, **{f"{side}_forward": 90})
+        np.testing.assert_allclose(ahead[wrist] - ahead[elbow], [0, 0, 0.25], atol=1e-12)
+    hanging = placed(file, left_raise=0, left_swing=-90)
+    np.testing.assert_allclose(hanging[20] - hanging[18], [0, 0, 0.25], atol=1e-12)
+    sitting = placed(file, right_hip=90, right_knee=90)
+    np.testing.assert_allclose(sitting[5] - sitting[2], [0, 0, 0.4], atol=1e-12)  # thigh to the front
+    np.testing.assert_allclose(sitting[8] - sitting[5], [0, -0.4, -0.02], atol=1e-12)  # shin down again
+    wide = placed(file, left_spread=30, right_spread=30)
+    assert wide[7][0] == pytest.approx(-wide[8][0], abs=1e-12)
+    assert wide[7][0] > JOINTS[7][0] + 0.3
+    leaning = placed(file, lean=60)
+    assert leaning[15][2] > 0.2
+    assert placed(file, nod=30)[15][1] == pytest.approx(JOINTS[15][1], abs=0.05)
+    turned = placed(file, yaw=90)
+    np.testing.assert_allclose(
+        turned[20] - JOINTS[0],
+        Rotation.from_euler("y", 90, degrees=True).apply(JOINTS[20] - JOINTS[0]),
+        atol=1e-12,
+    )
+
+
+def test_both_sides_mirror_each_other(file):
+    moves = {
+        "raise": 50,
+        "forward": 20,
+        "swing": -15,
+        "twist": 25,
+        "elbow": 70,
+        "pronate": 30,
+        "wrist": 20,
+        "shrug": 9,
+    }
+    moves |= {"hip": 40, "spread": 15, "hip_turn": 20, "knee": 50, "ankle": 10}
+    left = placed(file, **{f"left_{name}": value for name, value in moves.items()})
+    right = placed(file, **{f"right_{name}": value for name, value in moves.items()})
+    for one, other in ((16, 17), (18, 19), (20, 21), (1, 2), (4, 5), (7, 8), (10, 11)):
+        np.testing.assert_allclose(left[one] * [-1, 1, 1], right[other], atol=1e-12)
+
+
+def test_poses_stay_within_their_limits_and_vary_as_stated():
+    drawn = poses.draw(20_000, np.random.default_rng(0))
+    limits = [*poses.CENTRAL.values(), *poses.SIDED.values(), *poses.SIDED.values()]
+    for values, (_, _, least, most) in zip(drawn.T, limits, strict=True):
+        assert least <= values.min() < values.max() <= most
+    places = {name: place for place, name in enumerate(poses.MOVEMENTS)}
+    yaw = drawn[:, places["yaw"]]
+    wide = 1 - poses.TAIL + poses.TAIL * poses.WIDER**2
+    assert yaw.std() == pytest.approx(12 * wide**0.5, rel=0.05)
+    level = (drawn[:, places["left raise"]] > 80) & (drawn[:, places["left raise"]] < 100)
+    assert level.mean() > 0.15  # arms of a T-pose are common
+
+
+def test_people_are_split_and_drawn_by_the_data_seed(file):
+    one, same, other = prepared(file), prepared(file), prepared(file, data_seed=1)
+    batch = one.splits().test.__getitems__([3, 0, 29])
+    again = same.splits().test.__getitems__([29, 3])
+    assert torch.equal(
+        batch["input"][2].nan_to_num(), again["input"][0].nan_to_num()[: batch["input"].shape[1]]
+    )
+    assert torch.equal(batch["target"][[2, 0]], again["target"])
+    assert one.fingerprint() == same.fingerprint()
+    assert one.fingerprint()["sha256"] != other.fingerprint()["sha256"]
+    assert one.target.names[:4] == ("x0", "y0", "z0", "x1")
+    assert len(one.target.names) == 3 * 132
+    assert one.input_shape == (500, 3)
+    assert one.synthetic
+    assert (one.groups, one.varies, one.columns) == (("whole", "partial", "outliers"), False, ("x", "y", "z"))
+    assert one.augment(batch) is batch
+    assert {name: (value.dtype, value.shape[0]) for name, value in batch.items() if name != "input"} == {
+        "target": (torch.float32, 3),
+        "centre": (torch.float32, 3),
+        "scale": (torch.float32, 3),
+        "group": (torch.int64, 3),
+        "index": (torch.int64, 3),
+    }
+    assert one.splits().train.__getitems__([0])["target"].dtype == torch.float16
+    single = one.splits().test[7]
+    assert single["target"].shape == (396,)
+    assert one.picture(single["input"]).shape == (160, 160, 3)
+
+
+def test_points_lie_on_the_body_and_both_in_one_frame(file):
+    made = prepared(file, noise=0, partial=0, outliers=0)
+    scans = made.splits().test
+    batch = scans.__getitems__(range(5))
+    place = batch["centre"].double(), batch["scale"].double()
+    vertices = denormalised(batch["target"].double().unflatten(1, (-1, 3)), *place)
+    np.testing.assert_allclose(vertices, scans.model(scans.shape[:5], scans.pose[:5]), atol=1e-6)
+    points = denormalised(batch["input"].double(), *place)
+    normal, corners = planes(vertices, made.model.faces)
+    for cloud, n, c in zip(points, normal, corners, strict=True):
+        apart = torch.einsum("fk,pfk->pf", n, cloud[:, None] - c[None, :, 0]).abs()  # from every face's plane
+        assert apart.amin(1).max() < 1e-6
+
+
+def planes(vertices, faces):
+    corners = vertices[:, faces]
+    normal = torch.linalg.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    return torch.nn.functional.normalize(normal, dim=-1), corners
+
+
+def test_scans_lack_parts_and_hold_strangers_as_asked(file):
+    whole, partial, outliers = (
+        prepared(file, noise=0, partial=float(kind == "partial"), outliers=float(kind == "outliers"))
+        .splits()
+        .test.__getitems__(range(30))
+        for kind in KINDS
+    )
+    assert set(whole["group"].tolist()) == {0}
+    assert (sizes(whole["input"]) == 500).all()
+    counts = sizes(partial["input"])
+    assert set(partial["group"].tolist()) == {1}
+    assert 150 < counts.min() < counts.float().mean() < 480
+    assert set(outliers["group"].tolist()) == {2}
+    assert (sizes(outliers["input"]) == 500).all()
+
+
+def test_a_scanner_sees_one_side_and_cuts_no_more_than_asked():
+    content = doll()
+    mesh = Mesh("a doll", content["v_template"], content["f"])
+    for seed in range(40):
+        found = scan(mesh, "partial", Scanner(2_000, 0.0, 0.1, 0.0), np.random.default_rng(seed))
+        # a tenth at most behind a plane or in a ball; or half, which faces away
+        assert len(found) >= 1_800 or 800 < len(found) < 1_200
+    noisy = scan(mesh, "whole", Scanner(20_000, 0.01, 0.0, 0.0), np.random.default_rng(3))
+    assert len(noisy) == 20_000
+    outside = np.linalg.norm(noisy[:, None] - JOINTS, axis=-1).min(1) > 0.0401
+    assert 0.05 < outside.mean() < 0.6
+
+
+def test_strangers_are_a_patch_of_floor_and_a_few_others():
+    vertices = doll()["v_template"]
+    found = strangers(vertices, 1_000, np.random.default_rng(0))
+    floor = np.abs(found[:, 1] - vertices[:, 1].min()) < 0.02
+    assert floor.mean() >= 0.98
+    assert np.ptp(found[floor][:, 0]) < 1.7
+
+
+def test_a_users_scan_is_read_in_metres_without_preparing(file, tmp_path):
+    points = np.random.default_rng(0).normal(size=(300, 3)) + np.array([5, 1, -3])
+    np.save(tmp_path / "a.npy", points)
+    np.save(tmp_path / "b.npy", points[:40])
+    batch = data(file).read([tmp_path / "a.npy", tmp_path / "b.npy"]).__getitems__([0, 1])
+    assert sizes(batch["input"]).tolist() == [300, 40]
+    back = denormalised(batch["input"].double(), batch["centre"].double(), batch["scale"].double())
+    np.testing.assert_allclose(back[1, :40], points[:40], atol=1e-6)
+    with pytest.raises(DataError, match=r"c\.npy: no such file"):
+        data(file).read([tmp_path / "c.npy"])
+
+
+def test_bodies_that_poses_cannot_move_are_refused(tmp_path):
+    content = doll()
+    few = {
+        **content,
+        "weights": np.ones((132, 3)) / 3,
+        "J_regressor": content["J_regressor"][:3],
+        "kintree_table": np.array([[-1, 0, 1], [0, 1, 2]]),
+    }
+    np.savez(tmp_path / "few.npz", **few)
+    with pytest.raises(DataError, match="has 3 joints; wanted 22 at least"):
+        prepared(tmp_path / "few.npz")
+    named = Body(**{**body_files.read(written(tmp_path)).__dict__, "names": tuple(map(str, range(22)))})
+    with pytest.raises(DataError, match="has no joint 'root'"):
+        poses.skeleton(named)
+    with pytest.raises(DataError, match="no such file"):
+        prepared(tmp_path / "none.npz")
+
+
+def written(folder):
+    np.savez(folder / "doll.npz", **doll())
+    return folder / "doll.npz"
+
+
+@pytest.mark.parametrize(
+    "name, key, value",
+    [
+        *[("registration", "train", 0), ("registration", "noise", -1.0), ("registration", "partial", 1.5)],
+        *[("registration", "strangers", 0.4), ("registration", "cut", math.nan), ("faust", "points", 5)],
+        *[("faust", "test", []), ("faust", "test", [10]), ("faust", "data_seed", -1)],
+    ],
+)
+def test_a_config_out_of_range_is_refused(name, key, value):
+    with pytest.raises(ConfigError, match=r"data\."):
+        resolve("data", {"name": name, key: value})
+
+
+def test_a_result_is_one_coloured_ply(tmp_path):
+    content = doll()
+    cloud = np.random.default_rng(0).normal(size=(50, 3))
+    write_ply(tmp_path / "a.ply", content["v_template"], content["f"], cloud)
+    found = read(tmp_path / "a.ply")
+    np.testing.assert_allclose(found.vertices, np.concatenate([content["v_template"], cloud]), atol=1e-6)
+    assert np.array_equal(found.faces, content["f"])
+    colours = found.attribute(("red", "green", "blue"))
+    np.testing.assert_allclose(colours[0], SKIN, atol=1 / 255)
+    np.testing.assert_allclose(colours[-1], SCAN, atol=1 / 255)
+
+
+def test_a_picture_shows_the_front_and_the_left_side(tmp_path):
+    # a square that looks to the front, to its left a bar that looks to the left; a point before and one behind the
+    # square
+    vertices = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (1, -1, -0.3), (1, 1, -0.3)], float)
+    faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
+    cloud = np.array([(0.5, 0.5, 1.0), (-0.5, -0.5, -1.0)])
+    image = picture(vertices, faces, cloud, height=100)
+    assert image.shape == (100, 600, 3)
+    Image.fromarray(image).save(tmp_path / "a.png")
+    skin, blue = ((255 * np.array(color)).round() for color in (SKIN, SCAN))
+    front, left = image[:, 200:300].astype(float), image[:, 500:600].astype(float)
+    assert (front == blue).all(-1).sum() == 1  # the point behind the square is hidden
+    row, column = np.argwhere((front == blue).all(-1))[0]
+    assert row < 50 < column  # up, and to the body's left, which is the viewer's right
+    assert np.abs(front[30, 30] - skin).max() <= 1  # a square that faces the viewer is fully lit
+    row, column = np.argwhere((left == blue).all(-1))[0]
+    assert column < 50  # the front is to the left when a body is seen from its left
+    share = (np.abs(left - skin).max(-1) <= 1).mean()
+    assert 0.05 < share < 0.15  # the bar alone, 0.3 by 2 of 2.12 by 2.12
+    assert (image[:, :100] != 255).any(-1).sum() == 2  # the cloud alone
+
+
+def write(path, vertices, faces=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh = trimesh.PointCloud(vertices) if faces is None else trimesh.Trimesh(vertices, faces, process=False)
+    mesh.export(path)
+
+
+def command(folder, *arguments):
+    """`python -m ...` as a user calls it: exit code, output."""
+    call = [sys.executable, "-m", *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_a_trained_run_registers_a_users_scan(file, tmp_path):
+    small = ["data.train=64", "data.validation=16", "data.test=16", "data.points=200", "trainer.max_epochs=2"]
+    code, told = command(
+        tmp_path, "framework", "experiment=registration/quick", f"data.body={file}", *small, "batch_size=16",
+        "encoder.bps.points=64", "encoder.dense_blocks.width=32", "workers=0", "logger=none", "hydra.run.dir=run",
+    )  # fmt: skip
+    assert code == 0, told
+    found = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
+    assert found["synthetic"]
+    assert 0 < found["vertex_error_median_cm"] < 100
+    points = prepared(file).splits().test.__getitems__([0])
+    cloud = denormalised(points["input"], points["centre"], points["scale"])[0, :400].numpy()
+    np.save(tmp_path / "me.npy", cloud)
+    code, told = command(tmp_path, "plugins.data.bodies", "run", "me.npy", "--folder", "meshes")
+    assert code == 0, told
+    assert told.split() == ["meshes/me_registered.ply", "meshes/me_registered.png"]
+    mesh = read(tmp_path / "meshes" / "me_registered.ply")
+    assert np.array_equal(mesh.faces, doll()["f"])
+    np.testing.assert_allclose(mesh.vertices[6 * 22 :], cloud, atol=1e-5)
+    body = mesh.vertices[: 6 * 22]
+    assert np.linalg.norm(body.mean(0) - cloud.mean(0)) < 1
+    with Image.open(tmp_path / "meshes" / "me_registered.png") as image:
+        assert image.size[1] > 100
+    code, told = command(tmp_path, "plugins.data.bodies", "run", "nobody.ply")
+    assert code == 1
+    assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told
+
+    # thesis Table 6.4: a model of the body that FAUST's registrations have, on FAUST's scans
+    batch = prepared(file, points=200).splits().test.__getitems__(range(6))
+    place = batch["centre"], batch["scale"]
+    meshes = denormalised(batch["target"].unflatten(1, (-1, 3)), *place).numpy()
+    scans = denormalised(batch["input"], *place).numpy()
+    for row, number in enumerate((0, 70, 80, 81, 90, 91)):
+        training = tmp_path / "faust" / "training"
+        write(training / "scans" / f"tr_scan_{number:03}.ply", scans[row][np.isfinite(scans[row]).all(1)])
+        write(training / "registrations" / f"tr_reg_{number:03}.ply", meshes[row], doll()["f"])
+    code, told = command(
+        tmp_path, "framework", "mode=test", "checkpoint=run", "data=faust", "data.root=faust", "data.points=200",
+        "metric=[vertex_error,correspondence]", "logger=none", "hydra.run.dir=faust_run",
+    )  # fmt: skip
+    assert code == 0, told
+    found = json.loads((tmp_path / "faust_run" / "results.json").read_text(encoding="utf-8"))
+    assert not found["synthetic"]
+    for key in ("vertex_error_cm", "intra_cm", "inter_cm"):
+        assert 0 < found[key] < 200

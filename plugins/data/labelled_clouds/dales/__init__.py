@@ -1,1 +1,0 @@
-"""Objects from airborne laser scans (DALES) as point clouds."""

@@ -1,1 +1,0 @@
-"""A user's own meshes and point clouds in folders named by class."""

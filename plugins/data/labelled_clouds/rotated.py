@@ -1,0 +1,46 @@
+"""Clouds again and again, turned about the up axis."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.geometry.rotation import about_z
+from plugins.data.labelled_clouds.reading import Clouds
+
+
+class Rotated(Dataset[dict[str, Tensor]]):
+    """The same clouds `rotations` times: first all as they are, then all turned by a step of 2π / rotations, and so on.
+
+    Normals, the fourth to sixth columns where there are so many, turn with their points.
+    """
+
+    def __init__(self, clouds: Clouds, rotations: int) -> None:
+        self.clouds = clouds
+        angle = torch.arange(rotations, dtype=torch.float64) * (2 * math.pi / rotations)
+        self.matrices = about_z(angle).float()
+
+    def __len__(self) -> int:
+        return len(self.matrices) * len(self.clouds)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        return {name: values[0] for name, values in self.__getitems__([index]).items()}
+
+    def __getitems__(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        index = torch.as_tensor(indices)
+        if ((index < 0) | (index >= len(self))).any():
+            raise IndexError(f"wanted 0 to {len(self) - 1}")
+        batch = self.clouds.__getitems__((index % len(self.clouds)).tolist())
+        matrix = self.matrices[index // len(self.clouds)]
+        return {**batch, "input": _turned(batch["input"], matrix), "index": index}
+
+
+def _turned(
+    clouds: Float[Tensor, "batch points columns"], matrix: Float[Tensor, "batch 3 3"]
+) -> Float[Tensor, "batch points columns"]:
+    """Every group of three columns as a vector, turned."""
+    vectors = clouds.unflatten(-1, (-1, 3))
+    return torch.einsum("bij,bpvj->bpvi", matrix, vectors).flatten(-2)

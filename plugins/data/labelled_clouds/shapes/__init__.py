@@ -1,0 +1,1 @@
+"""Generated CAD models: random furniture, vessels and machine parts as closed solids."""

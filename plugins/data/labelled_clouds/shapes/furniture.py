@@ -1,0 +1,317 @@
+"""Furniture as random solids, metres, front towards -y: families that share a shape and differ in parts."""
+
+import numpy as np
+
+from plugins.data.labelled_clouds.shapes.solids import (
+    Solid,
+    box,
+    cylinder,
+    joined,
+    mirrored,
+    ring,
+    rod,
+    tapered,
+)
+
+Random = np.random.Generator
+
+
+def legs(random: Random, width: float, depth: float, height: float, thick: float) -> Solid:
+    """Four, straight or splayed, square or round, below a top of this size."""
+    inset = random.uniform(0.5, 1.6) * thick
+    x, y = width / 2 - inset, depth / 2 - inset
+    splay = random.choice([0.0, 0.0, 0.08, 0.14]) * height
+    if random.random() < 0.5:
+        leg = rod((x + splay, y + splay, 0), (x, y, height), thick / 2)
+    else:
+        leg = tapered(thick * random.uniform(0.6, 1), thick, thick, thick, height, (x, y, 0))
+    return mirrored(mirrored(leg, 0), 1)
+
+
+def rails(random: Random, width: float, depth: float, height: float, thick: float) -> list[Solid]:
+    """Bars between the legs, sometimes."""
+    if random.random() > 0.35:
+        return []
+    z, half = height * random.uniform(0.2, 0.45), thick * 0.35
+    x, y = width / 2 - thick, depth / 2 - thick
+    return [rod((-x, 0, z), (x, 0, z), half), mirrored(rod((x, -y, z), (x, y, z), half), 0)]
+
+
+def top(random: Random, width: float, depth: float, height: float, thick: float, bar: float) -> list[Solid]:
+    """A table's top on four legs, perhaps with an apron."""
+    parts = [
+        box(width, depth, thick, (0, 0, height)),
+        legs(random, width, depth, height, bar),
+        *rails(random, width, depth, height, bar),
+    ]
+    if random.random() < 0.5:
+        apron = random.uniform(0.06, 0.13)
+        parts.append(box(0.88 * width, 0.85 * depth, apron, (0, 0, height - apron)))
+    return parts
+
+
+def table(random: Random) -> Solid:
+    height = random.uniform(0.4, 0.85)
+    width, depth = random.uniform(0.7, 2.1), random.uniform(0.6, 1.1)
+    thick, bar = random.uniform(0.02, 0.07), random.uniform(0.04, 0.1)
+    if random.random() < 0.3:  # round, on a pedestal
+        radius, foot = random.uniform(0.35, 0.75), random.uniform(0.2, 0.4)
+        return joined(
+            [
+                cylinder(radius, thick, (0, 0, height), sides=32),
+                cylinder(bar / 1.5, height),
+                cylinder(foot, 0.03, top=foot * random.uniform(0.6, 1), sides=24),
+            ]
+        )
+    return joined(top(random, width, depth, height, thick, bar))
+
+
+def desk(random: Random) -> Solid:
+    height, width, depth = random.uniform(0.65, 0.8), random.uniform(1.0, 1.9), random.uniform(0.5, 0.85)
+    thick, bar = random.uniform(0.02, 0.05), random.uniform(0.03, 0.07)
+    chest = random.uniform(0.28, 0.5)
+    side = random.choice([-1, 1])
+    x = side * (width - chest) / 2 * 0.96
+    low = random.choice([0.0, 0.0, 0.35]) * height
+    parts = [box(width, depth, thick, (0, 0, height)), box(chest, depth * 0.9, height - low, (x, 0, low))]
+    for number in range(int(random.integers(0, 4))):
+        z = low + (number + 0.5) / 4 * (height - low)
+        parts.append(box(chest * 0.85, 0.02, (height - low) * 0.18, (x, -depth * 0.46, z)))
+    if low or random.random() < 0.5:
+        parts.append(legs(random, width, depth, height, bar))
+    else:
+        parts.append(box(bar, depth * 0.9, height, (-side * (width / 2 - bar), 0, 0)))
+    if random.random() < 0.35:  # a second chest
+        parts.append(box(chest, depth * 0.9, height - low, (-x, 0, low)))
+    if random.random() < 0.5:
+        parts.append(
+            box(width * 0.95, 0.02, height * random.uniform(0.3, 0.7), (0, depth * 0.4, height * 0.3))
+        )
+    return joined(parts)
+
+
+def bench(random: Random) -> Solid:
+    height, width, depth = random.uniform(0.38, 0.5), random.uniform(1.0, 2.0), random.uniform(0.3, 0.5)
+    thick, bar = random.uniform(0.03, 0.07), random.uniform(0.04, 0.09)
+    if random.random() < 0.5:
+        parts = [box(bar, depth * 0.9, height, (side * width * 0.4, 0, 0)) for side in (-1, 1)]
+    else:
+        parts = [legs(random, width, depth, height, bar)]
+    if random.random() < 0.5:
+        parts.append(box(width, depth, thick, (0, 0, height)))
+    else:
+        count = int(random.integers(3, 6))
+        for row in np.linspace(-0.5, 0.5, count) * (depth - depth / count):
+            parts.append(box(width, 0.75 * depth / count, thick, (0, row, height)))
+    if random.random() < 0.45:
+        tall = random.uniform(0.3, 0.5)
+        count = int(random.integers(2, 4))
+        for number in range(count):
+            z = height + tall * (number + 0.6) / count
+            parts.append(box(width, 0.03, 0.6 * tall / count, (0, depth * 0.5, z)))
+        parts += [box(bar, bar, tall, (side * width * 0.42, depth * 0.52, height)) for side in (-1, 1)]
+    return joined(parts)
+
+
+def stool(random: Random) -> Solid:
+    height, size = random.uniform(0.4, 0.8), random.uniform(0.15, 0.24)
+    thick, bar = random.uniform(0.03, 0.08), random.uniform(0.025, 0.05)
+    if random.random() < 0.6:
+        parts = [cylinder(size, thick, (0, 0, height), sides=24)]
+        count = int(random.choice([1, 3, 4, 4]))
+        if count == 1:
+            parts += [cylinder(bar, height), cylinder(size * random.uniform(0.8, 1.2), 0.03, top=size * 0.7)]
+        spread = random.uniform(1, 1.5)
+        for angle in 2 * np.pi * np.arange(count if count > 1 else 0) / max(count, 1) + 0.3:
+            x, y = size * 0.75 * np.cos(angle), size * 0.75 * np.sin(angle)
+            parts.append(rod((spread * x, spread * y, 0), (x, y, height), bar / 2))
+        if random.random() < 0.5:
+            parts.append(
+                ring(size * 0.75 * (1 + spread) / 2, bar * 0.35, (0, 0, height * random.uniform(0.2, 0.5)))
+            )
+        return joined(parts)
+    parts = [box(2 * size, 2 * size * random.uniform(0.75, 1), thick, (0, 0, height))]
+    parts += [
+        legs(random, 2 * size, 1.7 * size, height, bar),
+        *rails(random, 2 * size, 1.7 * size, height, bar),
+    ]
+    return joined(parts)
+
+
+def back(random: Random, width: float, height: float, tall: float, y: float, bar: float) -> list[Solid]:
+    """A chair's: a board, slats upright or lying."""
+    lean = random.uniform(0, 12)
+    style = random.integers(3)
+    if style == 0:
+        parts = [box(width, bar * 0.8, tall * random.uniform(0.6, 1))]
+    else:
+        parts = [box(bar, bar, tall, (side * (width - bar) / 2, 0, 0)) for side in (-1, 1)]
+        count = int(random.integers(2, 6))
+        if style == 1:
+            for number in range(count):
+                parts.append(box(width, bar * 0.5, 0.5 * tall / count, (0, 0, tall * (number + 0.5) / count)))
+        else:
+            parts.append(box(width, bar * 0.8, tall * 0.15, (0, 0, tall * 0.85)))
+            for x in np.linspace(-0.35, 0.35, count):
+                parts.append(rod((x * width, 0, 0), (x * width, 0, tall * 0.9), bar * 0.25))
+    return [joined(parts).turned("x", -lean).moved(0, y, height)]
+
+
+def chair(random: Random) -> Solid:
+    height, width, depth = random.uniform(0.38, 0.5), random.uniform(0.38, 0.52), random.uniform(0.36, 0.5)
+    thick, bar = random.uniform(0.03, 0.08), random.uniform(0.03, 0.055)
+    parts = [box(width, depth, thick, (0, 0, height)), *rails(random, width, depth, height, bar)]
+    if random.random() < 0.2:  # an office chair's foot
+        parts.append(cylinder(bar / 1.5, height))
+        for angle in 2 * np.pi * np.arange(5) / 5:
+            parts.append(rod((0, 0, 0.06), (0.28 * np.cos(angle), 0.28 * np.sin(angle), 0.03), 0.02))
+    else:
+        parts.append(legs(random, width, depth, height, bar))
+    parts += back(random, width, height + thick, random.uniform(0.3, 0.6), depth / 2 - bar / 2, bar)
+    if random.random() < 0.3:
+        z = height + random.uniform(0.18, 0.26)
+        for side in (-1, 1):
+            x = side * width / 2
+            parts += [
+                box(bar, depth, bar * 0.6, (x, 0, z)),
+                box(bar * 0.7, bar * 0.7, z - height, (x, -depth * 0.4, height)),
+            ]
+    return joined(parts)
+
+
+def couch(random: Random, width: float) -> Solid:
+    """A padded seat with arms and a back, `width` between the arms."""
+    height, depth = random.uniform(0.32, 0.46), random.uniform(0.55, 0.85)
+    arm, tall = random.uniform(0.08, 0.2), random.uniform(0.3, 0.5)
+    foot = random.choice([0.0, 0.05, 0.1, 0.15])
+    pad = random.uniform(0.1, 0.22)
+    parts = [
+        box(width, depth, height - foot, (0, 0, foot)),
+        box(width + 2 * arm, pad, height + tall - foot, (0, depth / 2, foot)),
+    ]
+    arm_height = height + random.uniform(0.1, 0.25) - foot
+    for side in (-1, 1):
+        x = side * (width + arm) / 2
+        parts.append(box(arm, depth, arm_height, (x, 0, foot)))
+        if random.random() < 0.4:
+            tube = cylinder(arm * 0.6, depth, sides=12).turned("x", 90)
+            parts.append(tube.moved(x, depth / 2, foot + arm_height))
+    if foot:
+        parts.append(legs(random, width + 2 * arm, depth, foot, 0.06))
+    seats = max(1, round(width / 0.65))
+    if random.random() < 0.7:
+        for number in range(seats):
+            x = width * ((number + 0.5) / seats - 0.5)
+            parts.append(box(width / seats * 0.94, depth * 0.8, 0.1, (x, -depth * 0.06, height)))
+    return joined(parts)
+
+
+def armchair(random: Random) -> Solid:
+    return couch(random, random.uniform(0.45, 0.8))
+
+
+def sofa(random: Random) -> Solid:
+    seat = couch(random, random.uniform(0.95, 2.2))
+    if random.random() < 0.15:  # a corner sofa
+        wing = box(0.7, random.uniform(0.5, 0.9), 0.4, (seat.vertices[:, 0].max() - 0.45, -0.7, 0.02))
+        return joined([seat, wing])
+    return seat
+
+
+def bed(random: Random) -> Solid:
+    width, length = random.choice([0.9, 1.2, 1.6, 1.8]) * random.uniform(0.95, 1.05), random.uniform(1.9, 2.2)
+    height, thick = random.uniform(0.15, 0.4), random.uniform(0.12, 0.28)
+    parts = [
+        box(width, length, 0.1, (0, 0, height - 0.1)),
+        box(width * 0.96, length * 0.97, thick, (0, 0, height)),
+        legs(random, width, length, height, random.uniform(0.05, 0.1)),
+    ]
+    if random.random() < 0.8:
+        parts.append(box(width, 0.05, height + random.uniform(0.3, 0.8), (0, length / 2, 0)))
+    if random.random() < 0.35:
+        parts.append(box(width, 0.05, height + random.uniform(0.1, 0.4), (0, -length / 2, 0)))
+    pillows = 1 if width < 1.3 else 2
+    for number in range(pillows if random.random() < 0.8 else 0):
+        x = width * ((number + 0.5) / pillows - 0.5)
+        parts.append(box(0.7 * width / pillows, 0.35, 0.1, (x, length * 0.36, height + thick)))
+    return joined(parts)
+
+
+def shelf(random: Random) -> Solid:
+    width, depth, height = random.uniform(0.5, 1.4), random.uniform(0.22, 0.4), random.uniform(0.9, 2.2)
+    board = random.uniform(0.02, 0.045)
+    count = int(random.integers(3, 7))
+    levels = np.linspace(random.choice([0.0, 0.08]), height - board, count)
+    parts = [box(width, depth, board, (0, 0, z)) for z in levels]
+    parts += [box(board, depth, height, (side * (width - board) / 2, 0, 0)) for side in (-1, 1)]
+    if random.random() < 0.5:
+        parts.append(box(width, board * 0.5, height, (0, depth / 2, 0)))
+    if random.random() < 0.4:
+        parts.append(box(board, depth, height))
+    for z in levels[:-1]:  # books
+        if random.random() < 0.3:
+            wide = random.uniform(0.1, 0.35) * width
+            tall = 0.7 * height / count
+            parts.append(box(wide, depth * 0.7, tall, (random.uniform(-0.25, 0.25) * width, 0, z + board)))
+    return joined(parts)
+
+
+def dresser(random: Random) -> Solid:
+    width, depth, height = random.uniform(0.5, 1.5), random.uniform(0.35, 0.6), random.uniform(0.6, 1.3)
+    foot = random.choice([0.0, 0.06, 0.12])
+    parts = [box(width, depth, height - foot, (0, 0, foot))]
+    parts.append(box(width * 1.05, depth * 1.06, 0.03, (0, 0, height)))
+    if foot:
+        parts.append(legs(random, width, depth, foot, 0.06))
+    rows, columns = int(random.integers(2, 6)), int(random.choice([1, 2, 2, 3]))
+    for row in range(rows):
+        for column in range(columns):
+            x = width * ((column + 0.5) / columns - 0.5)
+            z = foot + (height - foot) * (row + 0.08) / rows
+            parts.append(box(0.9 * width / columns, 0.025, 0.84 * (height - foot) / rows, (x, -depth / 2, z)))
+            knob = (x, -depth / 2 - 0.03, z + 0.42 * (height - foot) / rows)
+            parts.append(box(random.choice([0.03, 0.12]), 0.03, 0.025, knob))
+    return joined(parts)
+
+
+def night_stand(random: Random) -> Solid:
+    width, depth, height = random.uniform(0.35, 0.6), random.uniform(0.3, 0.5), random.uniform(0.4, 0.75)
+    foot = random.choice([0.0, 0.1, 0.25]) * random.uniform(0.8, 1.2)
+    board, low = 0.025, foot
+    parts = [box(width * 1.05, depth * 1.05, 0.03, (0, 0, height))]
+    if random.random() < 0.5:  # an open lower half
+        low = foot + (height - foot) * random.uniform(0.35, 0.6)
+        parts += [box(board, depth, low - foot, (side * (width - board) / 2, 0, foot)) for side in (-1, 1)]
+        parts.append(box(width, depth, board, (0, 0, foot)))
+    parts.append(box(width, depth, height - low, (0, 0, low)))
+    if foot:
+        parts.append(legs(random, width, depth, foot, 0.05))
+    rows = int(random.integers(1, 4))
+    for row in range(rows):
+        z = low + (height - low) * (row + 0.1) / rows
+        parts.append(box(0.88 * width, 0.025, 0.8 * (height - low) / rows, (0, -depth / 2, z)))
+        parts.append(box(0.06, 0.03, 0.025, (0, -depth / 2 - 0.03, z + 0.4 * (height - low) / rows)))
+    return joined(parts)
+
+
+def wardrobe(random: Random) -> Solid:
+    width, depth, height = random.uniform(0.7, 1.8), random.uniform(0.4, 0.65), random.uniform(1.3, 2.2)
+    foot = random.choice([0.0, 0.08, 0.12])
+    parts = [box(width, depth, height - foot, (0, 0, foot))]
+    if random.random() < 0.5:
+        parts.append(box(width * 1.07, depth * 1.07, 0.07, (0, 0, height)))
+    if foot:
+        parts.append(legs(random, width, depth, foot, 0.07))
+    low = foot
+    if random.random() < 0.4:  # drawers below the doors
+        low = foot + 0.2 * height
+        parts.append(box(0.94 * width, 0.03, 0.16 * height, (0, -depth / 2, foot + 0.02 * height)))
+    doors = int(random.integers(2, 4))
+    for number in range(doors):
+        x = width * ((number + 0.5) / doors - 0.5)
+        parts.append(
+            box(0.93 * width / doors, 0.03, (height - low) * 0.94, (x, -depth / 2, low + 0.02 * height))
+        )
+        handle = x + (0.38 if number % 2 == 0 else -0.38) * width / doors
+        parts.append(box(0.03, 0.04, 0.18, (handle, -depth / 2 - 0.03, low + (height - low) * 0.45)))
+    return joined(parts)

@@ -1,0 +1,108 @@
+"""A generated set of CAD models in ModelNet's layout: `<class>/{train,test}/<class>_<number>.off` and `synthetic.json`.
+
+A root is a function of seed, sizes and classes, to the byte: each object has its own random stream, so that the first
+of more objects are those of fewer. It is written beside its place and renamed when whole.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.storage import cache
+from framework.storage.generated import draw_all
+from framework.storage.generated import generated as whole
+from plugins.data.labelled_clouds.shapes import furniture, objects
+from plugins.data.labelled_clouds.shapes.solids import Solid
+
+VERSION = 1
+"""Of the generator; a change in what it makes takes a new number, and with it a new folder."""
+CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
+    "airplane": objects.airplane,
+    "armchair": furniture.armchair,
+    "bed": furniture.bed,
+    "bench": furniture.bench,
+    "bolt": objects.bolt,
+    "bottle": objects.bottle,
+    "bowl": objects.bowl,
+    "chair": furniture.chair,
+    "desk": furniture.desk,
+    "dresser": furniture.dresser,
+    "flower_pot": objects.flower_pot,
+    "gear": objects.gear,
+    "ladder": objects.ladder,
+    "lamp": objects.lamp,
+    "monitor": objects.monitor,
+    "mug": objects.mug,
+    "night_stand": furniture.night_stand,
+    "shelf": furniture.shelf,
+    "sofa": furniture.sofa,
+    "stool": furniture.stool,
+    "table": furniture.table,
+    "vase": objects.vase,
+    "wardrobe": furniture.wardrobe,
+}
+SPLITS = ("train", "test")
+JITTER_DEG, QUARTERS = 12.0, 0.25
+"""Every object is turned about the up axis by up to so much, and this share of them by a quarter, half or three
+quarters of a turn more: the official models are not aligned either."""
+STRETCH = 0.15
+"""Standard deviation of the logarithm of each axis's own stretch."""
+
+
+class Models(NamedTuple):
+    """How many models of each class are generated for each split, and from which seed."""
+
+    train: int
+    test: int
+    seed: int
+
+
+def generated(models: Models) -> Path:
+    """The root of a generated set; made now unless it is there.
+
+    Raises:
+        DataError: the cache cannot be written, or holds something else in its place.
+    """
+    mark = {"generator_version": VERSION, "seed": models.seed, "train": models.train, "test": models.test}
+    mark |= {"classes": list(CLASSES)}
+    root = cache.folder("modelnet40") / f"v{VERSION}-seed{models.seed}-train{models.train}-test{models.test}"
+    return whole(root, mark, lambda part: _write(part, models))
+
+
+def model(category: str, split: str, number: int, seed: int) -> Solid:
+    """The model of this number, from 0, within its split."""
+    stream = [seed, list(CLASSES).index(category), SPLITS.index(split), number]
+    random = np.random.default_rng(stream)
+    solid = CLASSES[category](random)
+    stretch = np.exp(STRETCH * random.standard_normal(3))
+    turn = JITTER_DEG * random.uniform(-1, 1)
+    if random.random() < QUARTERS:
+        turn += 90 * random.integers(1, 4)
+    return solid.scaled(*map(float, stretch)).turned("z", float(turn))
+
+
+def as_off(solid: Solid) -> str:
+    """The text of an OFF file, to 10 µm: what the last bits of a cosine are differs from one machine to another."""
+    rounded = np.round(solid.vertices, 5) + 0.0  # no -0
+    vertices = [f"{x:g} {y:g} {z:g}" for x, y, z in rounded.tolist()]
+    faces = [f"3 {a} {b} {c}" for a, b, c in solid.faces.tolist()]
+    return "\n".join(["OFF", f"{len(vertices)} {len(faces)} 0", *vertices, *faces, ""])
+
+
+def _write(part: Path, models: Models) -> None:
+    sizes = {"train": models.train, "test": models.test}
+    jobs = [(name, split, number) for name in CLASSES for split in SPLITS for number in range(sizes[split])]
+    for name in CLASSES:
+        for split in SPLITS:
+            (part / name / split).mkdir(parents=True)
+
+    def write(job: int) -> None:
+        name, split, number = jobs[job]
+        # numbered through, as the official files are
+        place = number + 1 + (models.train if split == "test" else 0)
+        text = as_off(model(name, split, number, models.seed))
+        (part / name / split / f"{name}_{place:04d}.off").write_text(text, encoding="ascii", newline="\n")
+
+    draw_all(len(jobs), write, "the synthetic CAD models")

@@ -1,0 +1,157 @@
+"""The reader of the official layout, the generated set, and the data contract."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from framework.errors import DataError
+from framework.geometry.meshes import READERS, read, sample, stream
+from plugins.data.labelled_clouds.shapes import solids
+from plugins.data.labelled_clouds.shapes.generator import CLASSES, as_off
+
+NAME = "modelnet40"
+SIZES = {"train_models": 4, "test_models": 2}
+
+
+def cube(folder, *names, size=1.0, content=None):
+    """Cubes as `<folder>/<name>`, the official way to break a header included."""
+    text = as_off(solids.box(size, size, size)).replace("OFF\n", "OFF", 1)
+    for name in names:
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text if content is None else content)
+
+
+def official(folder):
+    for category in ("cube", "crate", "box"):
+        cube(folder, *(f"{category}/train/{category}_{number:04d}.off" for number in range(5)))
+        cube(folder, *(f"{category}/test/{category}_{number:04d}.off" for number in range(5, 7)))
+    return folder
+
+
+def test_splits_labels_and_attributes(prepared, tmp_path):
+    root = official(tmp_path / "ModelNet40")
+    clouds = prepared(root=root, points=64, validation_share=0.2)
+    assert clouds.target.kind == "class"
+    assert clouds.target.names == ("box", "crate", "cube")
+    assert clouds.input_shape == (64, 3)
+    assert clouds.columns == ("x", "y", "z")
+    assert (clouds.synthetic, clouds.skipped, clouds.varies) == (False, 0, False)
+    sizes = {}
+    for name, split in clouds.splits()._asdict().items():
+        batch = split.__getitems__(range(len(split)))
+        sizes[name] = torch.bincount(batch["target"]).tolist()
+        assert batch["input"].shape == (len(split), 64, 3)
+        assert batch["input"].dtype == torch.float32
+        assert batch["index"].tolist() == list(range(len(split)))
+        assert not batch["group"].any()
+        surface = (batch["input"] - torch.tensor([0, 0, 0.5])).abs().amax(-1)
+        torch.testing.assert_close(surface, torch.full_like(surface, 0.5))
+        assert clouds.augment(batch) is batch
+    assert sizes == {"train": [4, 4, 4], "validation": [1, 1, 1], "test": [2, 2, 2]}
+    print_of = clouds.fingerprint()
+    assert (print_of["train"], print_of["version"]) == ("12", "ModelNet40")
+
+
+def test_points_are_those_of_the_file_whatever_else_is_read(data, prepared, tmp_path):
+    root = official(tmp_path / "ModelNet40")
+    file = root / "cube" / "test" / "cube_0006.off"
+    wanted = sample(read(file), 64, stream(7, "cube_0006.off")).points.astype(np.float32)
+    for config in ({}, {"classes": ["cube", "box"]}):
+        clouds = prepared(root=root, points=64, data_seed=7, **config)
+        last = clouds.splits().test[len(clouds.splits().test) - 1]
+        np.testing.assert_array_equal(last["input"], wanted)
+    unlabelled = data(points=64, data_seed=7).read([file])  # without prepare
+    np.testing.assert_array_equal(unlabelled[0]["input"], wanted)
+    assert set(unlabelled[0]) == {"input", "index"}
+
+
+def test_the_second_run_reads_no_mesh(prepared, tmp_path, monkeypatch):
+    root = official(tmp_path / "ModelNet40")
+    first = prepared(root=root, points=32)
+    monkeypatch.setitem(READERS, ".off", None)
+    again = prepared(root=root, points=32)
+    assert torch.equal(
+        first.splits().train.__getitems__([3, 1])["input"], again.splits().train.__getitems__([3, 1])["input"]
+    )
+    assert first.fingerprint() == again.fingerprint()
+
+
+def test_normals_are_those_of_the_faces(prepared, tmp_path):
+    clouds = prepared(root=official(tmp_path / "ModelNet40"), points=50, normals=True)
+    assert clouds.columns == ("x", "y", "z", "normal_x", "normal_y", "normal_z")
+    assert clouds.input_shape == (50, 6)
+    found = clouds.splits().train.__getitems__(range(len(clouds.splits().train)))["input"]
+    # a cube's normal is along the coordinate that is furthest from its middle, outwards
+    local = found[..., :3] - torch.tensor([0, 0, 0.5])
+    at = local.abs().argmax(-1, keepdim=True)
+    outwards = torch.zeros_like(local).scatter(-1, at, local.gather(-1, at).sign())
+    torch.testing.assert_close(found[..., 3:], outwards, atol=1e-6, rtol=0)
+
+
+def test_rotations_repeat_the_training_split_about_the_up_axis(prepared, tmp_path):
+    config = {"root": official(tmp_path / "ModelNet40"), "points": 40, "normals": True}
+    plain, turned = prepared(**config), prepared(**config, rotations=3)
+    count = len(plain.splits().train)
+    assert len(turned.splits().train) == 3 * count
+    assert len(turned.splits().test) == len(plain.splits().test)
+    one = plain.splits().train.__getitems__(range(count))
+    all_three = turned.splits().train.__getitems__(range(3 * count))
+    torch.testing.assert_close(all_three["input"][:count], one["input"], atol=0, rtol=0)
+    assert all_three["index"].tolist() == list(range(3 * count))
+    assert all_three["target"].tolist() == 3 * one["target"].tolist()
+    for turn in (1, 2):
+        found = all_three["input"][turn * count : (turn + 1) * count]
+        for first in (0, 3):  # as complex numbers: a factor of exp(2πi turn / 3)
+            before = torch.complex(one["input"][..., first].double(), one["input"][..., first + 1].double())
+            after = torch.complex(found[..., first].double(), found[..., first + 1].double())
+            factor = complex(math.cos(2 * math.pi * turn / 3), math.sin(2 * math.pi * turn / 3))
+            torch.testing.assert_close(after, before * factor, atol=1e-6, rtol=0)
+        torch.testing.assert_close(found[..., [2, 5]], one["input"][..., [2, 5]], atol=0, rtol=0)
+    single = turned.splits().train[count + 2]
+    assert torch.equal(single["input"], all_three["input"][count + 2])
+    with pytest.raises(IndexError):
+        turned.splits().train[3 * count]
+
+
+def test_what_cannot_be_read_is_refused_or_skipped_and_counted(prepared, tmp_path):
+    root = official(tmp_path / "ModelNet40")
+    cube(root, "cube/train/cube_0001.off", content="OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n")
+    cube(root, "box/test/box_0005.off", content="OFF 1\n")
+    with pytest.raises(
+        DataError, match=r"(?s)2 of 21 samples cannot.*it has no faces.*data\.unreadable=skip"
+    ):
+        prepared(root=root)
+    clouds = prepared(root=root, unreadable="skip", validation_share=0.2)
+    assert clouds.skipped == 2
+    assert torch.bincount(clouds.splits().test.fields.fields["target"]).tolist() == [1, 2, 2]
+    assert len(clouds.splits().train) + len(clouds.splits().validation) == 14
+
+
+def test_other_layouts_and_classes_are_refused(prepared, tmp_path):
+    root = official(tmp_path / "ModelNet40")
+    with pytest.raises(DataError, match="no such folder"):
+        prepared(root=tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="ModelNet40 has no folders train and test"):
+        prepared(root=tmp_path)
+    with pytest.raises(DataError, match=r"names 'crat', which .* Did you mean 'crate'"):
+        prepared(root=root, classes=["crat", "box"])
+    with pytest.raises(DataError, match="wanted at least two of box, crate, cube"):
+        prepared(root=root, classes=["box"])
+    for file in (root / "crate" / "test").iterdir():
+        file.unlink()
+    with pytest.raises(DataError, match=r"crate/test holds no \.off file"):
+        prepared(root=root)
+
+
+def test_without_a_root_a_marked_set_is_read(prepared):
+    clouds = prepared(points=128, **SIZES)
+    assert clouds.synthetic
+    assert len(clouds.target.names) == len(CLASSES) >= 16
+    assert clouds.fingerprint()["root"] == "synthetic, seed 0"
+    assert torch.bincount(clouds.splits().test.fields.fields["target"]).tolist() == [2] * len(CLASSES)
+    image = clouds.picture(clouds.splits().test[0]["input"])
+    assert image.shape == (160, 160, 3)
+    assert 0.02 < (image < 255).any(-1).mean() < 0.9

@@ -1,0 +1,112 @@
+"""The generated set, and the solids it is made of."""
+
+import hashlib
+import json
+import math
+
+import numpy as np
+import pytest
+
+from framework.geometry.meshes import Mesh, normals, read
+from plugins.data.labelled_clouds.shapes import generator, solids
+from plugins.data.labelled_clouds.shapes.generator import CLASSES, Models, as_off, generated, model
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A generated root of 4 + 2 models a class; its cache too is the module's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FRAMEWORK_CACHE", str(tmp_path_factory.mktemp("cache")))
+        return generated(Models(4, 2, 0))
+
+
+def test_a_root_is_a_function_of_its_seed_to_the_byte(root):
+    again = generated(Models(4, 2, 0))
+    assert again != root
+
+    def content(folder):
+        return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*.off"))}
+
+    assert content(again) == content(root)
+    more = content(generated(Models(5, 2, 0)))
+    first = {name: text for name, text in content(root).items() if name.parts[1] == "train"}
+    assert {name: more[name] for name in first} == first  # the first of more are those of fewer
+    assert content(generated(Models(4, 2, 1))) != content(root)
+    assert json.loads((again / "synthetic.json").read_text())["seed"] == 0
+
+
+def test_the_bytes_are_those_of_this_version():
+    """Whoever changes a family or the writer also raises `generator.VERSION`, or old caches go on being read."""
+    digest = hashlib.sha256()
+    for category in CLASSES:
+        digest.update(as_off(model(category, "train", 0, 0)).encode())
+    assert (generator.VERSION, digest.hexdigest()[:12]) == (1, "ba0375fadc32")
+
+
+@pytest.mark.parametrize("category", CLASSES)
+def test_every_model_is_a_closed_surface_of_sensible_size(root, category):
+    files = sorted((root / category).rglob("*.off"))
+    assert [file.name for file in files] == [f"{category}_{number:04d}.off" for number in (5, 6, 1, 2, 3, 4)]
+    for file in files:
+        mesh = read(file)
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        assert 0.05 < (high - low).max() < 6
+        assert (high - low).min() > 0.01 * (high - low).max()
+        assert 20 <= len(mesh.faces) < 8000
+        # closed, and outwards on the whole: ∮ n dA = 0, and the volume ∮ x · n dA / 3 is positive
+        corners = mesh.vertices[mesh.faces]
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        np.testing.assert_allclose(area.sum(0), 0, atol=1e-4 * np.abs(area).sum())
+        assert (corners.mean(1) * area).sum() / 3 > 0
+
+
+def test_the_models_of_a_class_differ(root):
+    for category in CLASSES:
+        texts = {as_off(model(category, "train", number, 0)) for number in range(10)}
+        assert len(texts) == 10
+
+
+# ---- solids against their own formulas -------------------------------------------------------------------
+
+
+def volume_and_area(solid):
+    corners = solid.vertices[solid.faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    return (corners.mean(1) * area).sum() / 3, np.linalg.norm(area, axis=1).sum()
+
+
+ANGLE = np.arange(400) * math.pi / 200
+CIRCLE = np.stack([np.cos(ANGLE), np.sin(ANGLE)], 1)
+SOLIDS = {
+    "box": (solids.box(2.0, 3.0, 4.0, (5, 5, 5)), 24, 52),
+    "frustum of a pyramid": (solids.tapered(2.0, 2.0, 1.0, 1.0, 3.0), 7, 5 + 4 * 1.5 * math.hypot(3, 0.5)),
+    "cylinder": (solids.cylinder(0.5, 2.0, sides=400), math.pi / 2, 2.5 * math.pi),
+    "cone": (solids.cylinder(1.0, 2.0, top=0.0, sides=400), 2 * math.pi / 3, math.pi * (1 + math.sqrt(5))),
+    "ball": (solids.ball(1.0, (1, 2, 3), 400), 4 * math.pi / 3, 4 * math.pi),
+    "rod": (solids.rod((1, 1, 1), (3, 3, 2), 0.1, 400), 3 * math.pi * 0.01, None),
+    "plate": (solids.slab([(0, 0), (2, 0), (0, 2)], 0.5), 1, None),
+    "washer": (solids.extruded(CIRCLE, 0.5, CIRCLE / 2), 0.375 * math.pi, 3 * math.pi),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("solid, volume, area", SOLIDS.values(), ids=SOLIDS)
+def test_solids_have_their_volume_and_area(solid, volume, area):
+    found = volume_and_area(solid)
+    assert found[0] == pytest.approx(volume, rel=5e-4)
+    if area is not None:
+        assert found[1] == pytest.approx(area, rel=5e-4)
+
+
+def test_a_ring_is_a_torus_and_its_normals_point_outwards():
+    found, area = volume_and_area(solids.ring(1.0, 0.25, sides=400))
+    # its tube has eight sides: the octagon's share of the disc, and of the circle
+    assert found == pytest.approx(2 * math.pi * 0.25**2 * 4 * math.sin(math.pi / 4), rel=2e-3)
+    assert area == pytest.approx(2 * math.pi * 16 * 0.25 * math.sin(math.pi / 8), rel=2e-3)
+
+
+def test_mirror_images_and_turns_keep_the_outside_out():
+    cone = solids.cylinder(0.3, 1.0, top=0.1).moved(1.0)
+    whole = solids.mirrored(cone.turned("x", 30.0).turned("y", 40.0).turned("z", 50.0), 0)
+    assert volume_and_area(whole)[0] == pytest.approx(2 * volume_and_area(cone)[0])
+    mesh = Mesh("both", whole.vertices, whole.faces)
+    assert np.isfinite(normals(mesh)).all()

@@ -1,1 +1,0 @@
-"""How far predicted vertices are from the true ones."""

@@ -1,0 +1,164 @@
+"""Distances between predicted and true vertices, and errors of correspondences through predicted meshes."""
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchmetrics.utilities import dim_zero_cat
+
+from framework.errors import ConfigError, DataError
+from framework.geometry.clouds import denormalised
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.vertices.correspondence import correspondence
+
+BINS, LOWEST, HIGHEST = 2_000, 1e-4, 1e4
+"""Of the histogram of distances, centimetres: equal steps of the logarithm, 0.9 % each."""
+FAUST = """@inproceedings{bogo2014faust,
+  title = {{FAUST}: Dataset and Evaluation for {3D} Mesh Registration},
+  author = {Bogo, Federica and Romero, Javier and Loper, Matthew and Black, Michael J.},
+  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year = {2014}
+}"""
+
+
+class VertexError(Metric):
+    """Euclidean distance between predicted and true vertices, centimetres (thesis §6.5.2).
+
+    The target is x, y, z of each vertex in turn; a batch's "scale" (batch,), metres per unit of the target, leads to
+    centimetres. Each body's mean over its vertices is averaged over bodies, with its standard error; median and 95th
+    percentile are those of all vertices of all bodies, from a histogram and so to 1 %.
+
+    Raises:
+        ConfigError: the target is no vertices.
+        DataError: a batch has no "scale".
+    """
+
+    bibtex = FAUST
+    columns: ClassVar[dict[str, str]] = {
+        "vertex_error_cm": "vertex error cm",
+        "vertex_error_median_cm": "median cm",
+        "vertex_error_95_cm": "95 % cm",
+    }
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
+    count: Tensor
+    total: Tensor
+    squares: Tensor
+    histogram: Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        require_vertices(target, "vertex_error")
+        zero = torch.zeros((), dtype=torch.float64)
+        for name in ("count", "total", "squares"):
+            self.add_state(name, zero.clone(), dist_reduce_fx="sum")
+        self.add_state("histogram", torch.zeros(BINS, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        (scale,) = fields(prediction, "vertex_error", {"scale": "metres per unit of the target"})
+        distance = distances(prediction.point, prediction.target, scale)
+        each = distance.mean(1)
+        self.count += len(each)
+        self.total += each.sum()
+        self.squares += each.square().sum()
+        self.histogram += torch.bincount(bins(distance).flatten(), minlength=BINS)
+
+    def compute(self) -> dict[str, Tensor]:
+        mean = self.total / self.count
+        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
+        return {
+            "vertex_error_cm": mean,
+            "vertex_error_cm_sem": (spread / (self.count - 1).clamp(min=0)).sqrt(),
+            "vertex_error_median_cm": quantile(self.histogram, 0.5),
+            "vertex_error_95_cm": quantile(self.histogram, 0.95),
+        }
+
+
+class CorrespondenceError(Metric):
+    """Error of correspondences through predicted meshes, centimetres, over all ordered pairs of test scans (Table 6.4).
+
+    `intra_cm` is of scans of one person, `inter_cm` of two people; the target is the true registration. Holds every
+    predicted and true mesh until the end.
+
+    Raises:
+        ConfigError: the target is no vertices.
+        DataError: a batch without "centre", "scale" or "subject".
+    """
+
+    bibtex = FAUST
+    columns: ClassVar[dict[str, str]] = {"intra_cm": "intra cm", "inter_cm": "inter cm"}
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
+    registered: list[Tensor]
+    truth: list[Tensor]
+    subject: list[Tensor]
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        require_vertices(target, "correspondence")
+        for name in ("registered", "truth", "subject"):
+            self.add_state(name, [], dist_reduce_fx="cat")
+
+    def update(self, prediction: Prediction) -> None:
+        wanted = {
+            "centre": "metres",
+            "scale": "metres per unit of the target",
+            "subject": "who each scan is of",
+        }
+        centre, scale, subject = fields(prediction, "correspondence", wanted)
+        for name, mesh in (("registered", prediction.point), ("truth", prediction.target)):
+            getattr(self, name).append(denormalised(mesh.unflatten(1, (-1, 3)), centre, scale))
+        self.subject.append(subject)
+
+    def compute(self) -> dict[str, Tensor]:
+        if not sum(map(len, self.subject)):
+            return dict.fromkeys(self.columns, torch.tensor(torch.nan))
+        parts = (dim_zero_cat(state) for state in (self.truth, self.registered, self.subject))
+        return correspondence(*parts)._asdict()
+
+
+def require_vertices(target: Target, name: str) -> None:
+    """Refuse a target that is not x, y, z of every vertex; raises ConfigError."""
+    target.require("real", by=f"metric {name}")
+    if len(target.names) % 3:
+        raise ConfigError(
+            f"metric {name} reads x, y, z of every vertex, but the target has {len(target.names)} numbers. "
+            "Choose data whose target is a mesh, or leave this metric out."
+        )
+
+
+def fields(prediction: Prediction, name: str, wanted: Mapping[str, str]) -> list[Tensor]:
+    """The fields of a batch that a metric reads, given with what they mean; DataError where one is not there."""
+    for field, meaning in wanted.items():
+        if field not in prediction.batch:
+            raise DataError(
+                f"metric {name} reads {field!r}, {meaning}, which this data set does not give. Choose data that has "
+                "it (faust), or leave this metric out."
+            )
+    return [prediction.batch[field] for field in wanted]
+
+
+def distances(
+    point: Float[Tensor, "batch number"], target: Float[Tensor, "batch number"], scale: Float[Tensor, "batch"]
+) -> Float[Tensor, "batch vertex"]:
+    """Of each vertex, centimetres, float64."""
+    gap = (point.double() - target.double()).unflatten(1, (-1, 3))
+    return 100 * scale.double()[:, None] * torch.linalg.vector_norm(gap, dim=-1)
+
+
+def bins(distance: Float[Tensor, "batch vertex"]) -> Tensor:
+    """The bin of each; what is nearer or further than the histogram reaches is in the first or last; NaN too."""
+    place = (distance.clamp(min=LOWEST) / LOWEST).log() * (
+        BINS / torch.tensor(HIGHEST / LOWEST).double().log()
+    )
+    return place.nan_to_num(BINS).clamp(0, BINS - 1).long()
+
+
+def quantile(histogram: Float[Tensor, "bins"], share: float) -> Float[Tensor, ""]:
+    """The middle of the bin below whose upper end this share of all lies; 0 of the first bin, NaN of nothing."""
+    total = histogram.sum()
+    place = torch.searchsorted(histogram.cumsum(0), share * total).clamp(max=BINS - 1)
+    middle = LOWEST * (HIGHEST / LOWEST) ** ((place.double() + 0.5) / BINS)
+    return torch.where(total > 0, middle.where(place > 0, 0), torch.nan)

@@ -1,0 +1,98 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import sem
+from torch.distributions import MultivariateNormal
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError
+from framework.prediction import Prediction
+from framework.target import Target
+from plugins.metric.vertices.metric import VertexError
+from plugins.metric.vertices.rows import mesh
+
+
+def predicted(point, target, scale):
+    eye = torch.eye(point.shape[1], dtype=point.dtype)
+    density = MultivariateNormal(point, scale_tril=eye, validate_args=False)
+    return Prediction(density, {"target": target, "scale": scale})
+
+
+def measured(*batches, vertices):
+    metric = build("metric", resolve("metric", "vertex_error"), target=mesh(vertices))
+    for batch in batches:
+        metric.update(predicted(*batch))
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+def loop(point, target, scale):
+    """One vertex at a time, centimetres."""
+    return np.array(
+        [
+            [100 * s * math.dist(p[3 * v : 3 * v + 3], t[3 * v : 3 * v + 3]) for v in range(len(p) // 3)]
+            for p, t, s in zip(point.tolist(), target.tolist(), scale.tolist(), strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_agrees_with_a_loop(dtype):
+    generator = torch.Generator().manual_seed(0)
+    point, target = (torch.randn(30, 120, generator=generator).to(dtype) for _ in range(2))
+    scale = (0.5 + torch.rand(30, generator=generator)).to(dtype)
+    found = measured((point[:7], target[:7], scale[:7]), (point[7:], target[7:], scale[7:]), vertices=40)
+    wanted = loop(point, target, scale)
+    assert found["vertex_error_cm"] == pytest.approx(wanted.mean(), rel=1e-12)
+    assert found["vertex_error_cm_sem"] == pytest.approx(sem(wanted.mean(1)), rel=1e-9)
+    assert found["vertex_error_median_cm"] == pytest.approx(np.median(wanted), rel=0.01)
+    assert found["vertex_error_95_cm"] == pytest.approx(np.quantile(wanted, 0.95), rel=0.01)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(2e-4, 9e3), min_size=1, max_size=30), st.sampled_from([0.5, 0.95]))
+def test_a_quantile_is_one_of_the_distances(distances, share):
+    distance = torch.tensor(distances, dtype=torch.float64)
+    point = torch.zeros(len(distances), 3, dtype=torch.float64)
+    point[:, 2] = distance / 100
+    found = measured((point, torch.zeros_like(point), torch.ones(len(point))), vertices=1)
+    wanted = np.quantile(distances, share, method="inverted_cdf")
+    key = "vertex_error_median_cm" if share == 0.5 else "vertex_error_95_cm"
+    assert found[key] == pytest.approx(wanted, rel=0.01)
+
+
+def test_a_millimetre_is_a_tenth_of_a_centimetre_whatever_the_scale():
+    target = torch.zeros(1, 3, dtype=torch.float64)
+    for scale in (1e-3, 1.0, 250.0):
+        point = torch.tensor([[0.0, 0.001 / scale, 0.0]], dtype=torch.float64)
+        found = measured((point, target, torch.tensor([scale])), vertices=1)
+        assert found["vertex_error_cm"] == pytest.approx(0.1, rel=1e-6)
+
+
+def test_nothing_seen_is_nan_and_a_perfect_prediction_is_0():
+    nothing = (torch.zeros(0, 6), torch.zeros(0, 6), torch.ones(0))
+    assert all(math.isnan(value) for value in measured(nothing, vertices=2).values())
+    point = torch.randn(3, 6)
+    found = measured((point, point, torch.ones(3)), vertices=2)
+    assert set(found.values()) == {0.0}
+
+
+def test_predictions_that_are_not_numbers_are_not_hidden():
+    point = torch.tensor([[0.0, math.nan, 0.0], [0.0, 0.0, 0.0]])
+    found = measured((point, torch.zeros(2, 3), torch.ones(2)), vertices=1)
+    assert math.isnan(found["vertex_error_cm"])
+    assert found["vertex_error_95_cm"] > 9e3
+
+
+def test_targets_and_data_that_are_no_meshes_are_refused():
+    with pytest.raises(ConfigError, match="describes targets of kind 'real'"):
+        VertexError(Target("angle", ("azimuth",)))
+    with pytest.raises(ConfigError, match="the target has 4 numbers"):
+        VertexError(Target("real", ("a", "b", "c", "d")))
+    prediction = predicted(torch.zeros(2, 3), torch.zeros(2, 3), torch.ones(2))
+    del prediction.batch["scale"]
+    with pytest.raises(DataError, match="reads 'scale'"):
+        VertexError(mesh(1)).update(prediction)
