@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from framework.configuration.assembly import build_metrics, build_outliers, build_predictor, citations
+from framework.configuration.registry import load
 from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
@@ -50,7 +51,7 @@ def _run(run: Run, options: _Options) -> None:
     data = data_for(run, described, str(sources[0]))
     config["uncertainty"] = [
         *config["uncertainty"],
-        resolve("uncertainty", {"name": options.wrapper, "members": len(members)}, "mode.wrapper"),
+        wrapping(options.wrapper, len(members)),
         *(
             resolve("uncertainty", part, f"uncertainty.{key}")
             for key, part in (run.values.get("uncertainty") or {}).items()
@@ -58,7 +59,7 @@ def _run(run: Run, options: _Options) -> None:
     ]
     outliers = build_outliers(config, data)
     record_citations(run, citations(config))
-    predictor = joined(config, data, [member for member, _ in members], options.wrapper)
+    predictor = joined(config, data, [member for member, _ in members])
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     predictor.eval().to(device)
@@ -123,22 +124,27 @@ def common(members: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return first
 
 
-def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wrapper: str) -> Predictor:
-    """The predictor of `config` around the members.
+def wrapping(wrapper: str, count: int) -> dict[str, Any]:
+    """The config of a wrapper around `count` members.
 
     Raises:
         ConfigError: the wrapper cannot take members that were trained apart.
     """
+    kind = load("uncertainty", wrapper)
+    if not issubclass(kind, Joining):
+        raise ConfigError(
+            f"mode.wrapper={wrapper} has no members that could have been trained apart. Give a wrapper that has, one "
+            "that derives from framework.uncertainty.Joining."
+        )
+    return resolve("uncertainty", {"name": wrapper, **kind.parameters_of(count)}, "mode.wrapper")
+
+
+def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:
+    """The predictor of `config`, of which `wrapping` is part, around the members."""
     predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
     if isinstance(predictor, Preceded):
         members = [_inner(predictor, member, index) for index, member in enumerate(members)]
-    joining = next((module for module in predictor.modules() if isinstance(module, Joining)), None)
-    if joining is None:
-        raise ConfigError(
-            f"mode.wrapper={wrapper} has no members that could have been trained apart. Give one that has, such as "
-            "`ensemble`."
-        )
-    joining.join(members)
+    next(module for module in predictor.modules() if isinstance(module, Joining)).join(members)
     return predictor
 
 
