@@ -46,17 +46,17 @@ def minimise(
     worse = first + 1 + abs(first)
 
     def trial(numbers: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = value_and_slope(terms, torch.from_numpy(numbers).to(start))
+        value, slope = value_and_slope(terms, torch.tensor(numbers).to(start))
         return (value, slope) if np.isfinite([value, *slope]).all() else (worse, np.zeros_like(slope))
 
     options = {"ftol": rounding, "gtol": 1e-12, "maxiter": 200}
     found = optimize.minimize(
         trial, start.tolist(), jac=True, method="L-BFGS-B", bounds=np.stack([low, high], 1), options=options
     )
-    down, up = (found.x <= low) & (found.jac > 0), (found.x >= high) & (found.jac < 0)
-    return Minimum(
-        torch.from_numpy(found.x), float(found.fun), torch.from_numpy(up.astype(int) - down.astype(int))
-    )
+    point = torch.tensor(found.x).to(start)
+    value, slope = value_and_slope(terms, point)
+    down, up = (found.x <= low) & (slope > 0), (found.x >= high) & (slope < 0)
+    return Minimum(point, value, torch.from_numpy(up.astype(int) - down.astype(int)))
 
 
 def total(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:

@@ -5,6 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 from scipy import optimize, special
 from torch import nn
 from torch.distributions import Categorical, Independent, Normal
@@ -254,6 +257,23 @@ def test_calibrated_angles_of_the_contract_are_densities():
             worst = Worst()
             check(wrapper(inputs[:3]), worst)
             assert worst.error <= limit
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    arrays.arrays(np.float64, (12, 3), elements=st.floats(-1e4, 1e4)),
+    arrays.arrays(np.int64, 12, elements=st.integers(0, 2)),
+    st.floats(0.01, 1),
+    st.floats(1, 100),
+)
+def test_never_outside_its_bounds_and_never_worse(logits, label, lower, upper):
+    inputs, target = torch.from_numpy(logits), torch.from_numpy(label)
+    wrapper = around(Given(classes), lower=lower, upper=upper).eval()
+    before = wrapper(inputs).log_prob(target).mean()
+    wrapper.calibrate(once(inputs, target))
+    assert lower <= wrapper.temperature <= upper
+    after = wrapper(inputs).log_prob(target).mean()
+    assert after.isfinite() and after >= before - 1e-12 * before.abs()
 
 
 @pytest.mark.parametrize("config", [{"lower": 0.0}, {"lower": 2.0}, {"upper": 0.5}, {"upper": math.inf}])
