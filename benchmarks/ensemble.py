@@ -29,7 +29,7 @@ from framework.data import Data
 from framework.model import Model, Predictor
 from framework.training.batches import Batches, epoch_order
 from framework.training.module import Training
-from plugins.uncertainty.members.ensemble.wrapper import Ensemble, network
+from plugins.uncertainty.members.ensemble import Ensemble, network
 
 MEMBERS, BATCH, EPOCHS, ROUNDS = 10, 50, 20, 3
 LEARNING_RATE = 1e-3

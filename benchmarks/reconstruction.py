@@ -31,8 +31,8 @@ from framework.geometry.nearest import chamfer
 from framework.reports.table import csv, markdown
 from plugins.encoder.bps.basis import Strategy, basis
 from plugins.encoder.bps.encoding import decode, encode, prepared
-from plugins.encoder.grids.occupancy.grid import decode as centres
-from plugins.encoder.grids.occupancy.grid import occupancy
+from plugins.encoder.grids.occupancy import decode as centres
+from plugins.encoder.grids.occupancy import occupancy
 from plugins.encoder.points.subset import chosen
 
 HERE = Path(__file__).resolve()

@@ -39,6 +39,9 @@ class Encoder(nn.Module, ABC):
     """Whether the linear layer to the head starts with weights of 0 where this encoder is last, so that all inputs are
     given one density at first: for heads of very many numbers, whose usual first weights are noise that takes long to
     unlearn. May be set by the constructor."""
+    initial: ClassVar[frozenset[str]] = frozenset()
+    """Parameters that only say what training starts from: a file of weights, say. A loaded model needs none of them,
+    for its checkpoint holds the weights; it is built with None for each."""
     output_shape: tuple[int, ...]
     """Shape of the features of one sample; set by the constructor. The last encoder's is (length,)."""
 

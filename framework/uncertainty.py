@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -47,6 +47,11 @@ class Uncertainty(Predictor):
 
 class Joining(ABC):
     """What a wrapper derives from as well when models that were trained apart can become its members (mode=combine)."""
+
+    @classmethod
+    @abstractmethod
+    def parameters_of(cls, count: int) -> dict[str, Any]:
+        """The config that builds such a wrapper around `count` members: {"members": count}, say."""
 
     @abstractmethod
     def join(self, members: Sequence[Predictor]) -> None:

@@ -11,7 +11,7 @@ from framework.configuration.assembly import build_outliers, resolve_all
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.modes.combine import common, found, joined
+from framework.modes.combine import common, found, wrapping
 from tests.conftest import Done, Framework, listed
 
 SMALL = [
@@ -145,12 +145,9 @@ def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
     assert found(str(tmp_path)) == [tmp_path / "9", tmp_path / "10"]
     with pytest.raises(ConfigError, match="gives 1 trained models"):
         found(["alone"])
-    data = build("data", resolve("data", "moons"))
-    data.prepare()
-    config = {"encoder": [resolve("encoder", "mlp")], "density_head": resolve("density_head", "bernoulli")}
-    config["uncertainty"] = [resolve("uncertainty", "temperature")]
-    with pytest.raises(ConfigError, match="no members that could have been trained apart"):
-        joined(config, data, [], "temperature")
+    assert wrapping("ensemble", 3) == resolve("uncertainty", {"name": "ensemble", "members": 3})
+    with pytest.raises(ConfigError, match="temperature has no members that could have been trained apart"):
+        wrapping("temperature", 3)
 
 
 def chosen(outliers: object, *metrics: str) -> dict[str, object]:

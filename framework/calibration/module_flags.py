@@ -1,18 +1,25 @@
-"""One flag of some of a model's modules, otherwise for a while: dropout that acts in evaluation, batch norm that learns
-nothing from inputs which are not training data."""
+"""Temporarily sets one flag on selected modules (dropout active in evaluation, say)."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torch import nn
 
+BATCH_NORM = (
+    *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
+    *(nn.LazyBatchNorm1d, nn.LazyBatchNorm2d, nn.LazyBatchNorm3d),
+)
+"""Every batch norm that torch has."""
+
 
 @contextmanager
 def flagged(
     model: nn.Module, kinds: type[nn.Module] | tuple[type[nn.Module], ...], flag: str, value: bool
 ) -> Iterator[None]:
-    """In here `flag` ("training", say) of the model's modules of these kinds is `value`; afterwards, also after an
-    error, it is of each what it was."""
+    """Sets `flag` ("training", say) to `value` on the model's modules of these kinds while the block runs.
+
+    Afterwards, also after an error, each module has its own value again.
+    """
     before = [(module, getattr(module, flag)) for module in model.modules() if isinstance(module, kinds)]
     try:
         for module, _ in before:

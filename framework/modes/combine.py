@@ -8,6 +8,7 @@ import torch
 
 from framework.configuration.assembly import build_predictor
 from framework.configuration.config import Config, Options
+from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
@@ -34,7 +35,7 @@ def run(config: Config) -> None:
     members = [load_with_description(source, uri=config.settings.logger.uri) for source in sources]
     described = common([described for _, described in members])
     wrappers = [
-        resolve("uncertainty", {"name": options.wrapper, "members": len(members)}, "mode.wrapper"),
+        wrapping(options.wrapper, len(members)),
         *(
             resolve("uncertainty", part, f"uncertainty.{key}")
             for key, part in (config.values.get("uncertainty") or {}).items()
@@ -42,7 +43,7 @@ def run(config: Config) -> None:
     ]
     parts = {**described["config"], "uncertainty": [*described["config"]["uncertainty"], *wrappers]}
     session = around(config, members[0][0], {**described, "config": parts}, str(sources[0]), console)
-    session.predictor = joined(parts, session.data, [member for member, _ in members], options.wrapper)
+    session.predictor = joined(parts, session.data, [member for member, _ in members])
     with opened(config) as run:
         session.record(run)
         calibrate(session)
@@ -111,22 +112,27 @@ def common(members: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return first
 
 
-def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor], wrapper: str) -> Predictor:
-    """The predictor of `config` around the members.
+def wrapping(wrapper: str, count: int) -> dict[str, Any]:
+    """The config of a wrapper around `count` members.
 
     Raises:
         ConfigError: the wrapper cannot take members that were trained apart.
     """
+    kind = load("uncertainty", wrapper)
+    if not issubclass(kind, Joining):
+        raise ConfigError(
+            f"mode.wrapper={wrapper} has no members that could have been trained apart. Give a wrapper that has, one "
+            "that derives from framework.uncertainty.Joining."
+        )
+    return resolve("uncertainty", {"name": wrapper, **kind.parameters_of(count)}, "mode.wrapper")
+
+
+def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:
+    """The predictor of `config`, of which `wrapping` is part, around the members."""
     predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
     if isinstance(predictor, FrozenFrontEnd):
         members = [_inner(predictor, member, index) for index, member in enumerate(members)]
-    joining = next((module for module in predictor.modules() if isinstance(module, Joining)), None)
-    if joining is None:
-        raise ConfigError(
-            f"mode.wrapper={wrapper} has no members that could have been trained apart. Give one that has, such as "
-            "`ensemble`."
-        )
-    joining.join(members)
+    next(module for module in predictor.modules() if isinstance(module, Joining)).join(members)
     return predictor
 
 

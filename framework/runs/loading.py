@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from framework.configuration import registry
 from framework.configuration.assembly import Resolved, build_predictor
 from framework.configuration.schema import resolve
 from framework.data import Data
@@ -61,8 +62,8 @@ def load_with_description(
         )
     resolved = checked(described["config"])
     for part in resolved["encoder"]:
-        # The checkpoint holds the weights now; the file they were started from may be gone.
-        part.update({"weights": None} if "weights" in part else {})
+        # the checkpoint holds the weights now; the file they were started from may be gone
+        part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
     target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
     columns = tuple(described.get("columns", ()))
     predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)

@@ -66,15 +66,7 @@ class PoolLauncher(Launcher):
         finally:
             comparison.summarise(folder, self.launched)
         failure = sweep.failure(jobs)
-        return [
-            JobReturn(
-                overrides=job.overrides,
-                working_dir=str(job.folder),
-                status=JobStatus.COMPLETED if job.completed else JobStatus.FAILED,
-                _return_value=job.value() if job.completed else failure,
-            )
-            for job in jobs
-        ]
+        return [_returned(job, failure) for job in jobs]
 
     def _jobs(
         self, folder: Path, configs: Sequence[DictConfig], job_overrides: Sequence[Sequence[str]], first: int
@@ -124,6 +116,13 @@ class PoolLauncher(Launcher):
             *(override for override in given if not override.startswith(_OF_THE_SWEEP)),
             "hydra.mode=RUN",
         ]
+
+
+def _returned(job: sweep.Job, failure: Exception | None) -> JobReturn:
+    status = JobStatus.COMPLETED if job.completed else JobStatus.FAILED
+    found = JobReturn(overrides=job.overrides, working_dir=str(job.folder), status=status)
+    found.return_value = job.value() if job.completed else failure
+    return found
 
 
 def _place(folder: Path, config: DictConfig, number: int) -> Path:

@@ -72,7 +72,7 @@ class BPS(Encoder):
         self.rotation_invariant = rotation_invariant
         made = sets.basis(basis, points, radius, basis_seed).to(torch.get_default_dtype())
         self.register_buffer("basis", made)
-        self._prepared: tuple[Tensor, int, Basis] | None = None
+        self._prepared: Basis | None = None
         total = sum(width(feature) for feature in features)
         self.output_shape = (total, *[sets.side(points)] * 3) if basis == "grid" else (total * points,)
 
@@ -88,9 +88,13 @@ class BPS(Encoder):
         return channels(found).reshape(-1, *self.output_shape)
 
     def prepared(self) -> Basis:
-        """The basis, prepared again only where it was moved, cast or loaded since."""
-        version = 0 if self.basis.is_inference() else self.basis._version
+        """The basis, prepared again only where it was moved, cast or given other numbers since."""
         known = self._prepared
-        if known is None or known[0] is not self.basis or known[1] != version:
-            known = self._prepared = (self.basis, version, prepared(self.basis))
-        return known[2]
+        if known is None or not _same(known.points, self.basis):
+            # of a copy, which stays what it was when the basis is changed in place
+            known = self._prepared = prepared(self.basis.clone())
+        return known
+
+
+def _same(some: Tensor, other: Tensor) -> bool:
+    return some.device == other.device and some.dtype == other.dtype and torch.equal(some, other)

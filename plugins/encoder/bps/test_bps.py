@@ -388,6 +388,16 @@ def test_the_basis_is_stored_and_followed_when_it_is_loaded_cast_or_copied():
         assert torch.equal(encoder(points=16)(clouds), other(clouds))
 
 
+def test_a_basis_is_prepared_once_and_anew_when_its_numbers_change_in_place():
+    clouds, made = batch_of([30]), encoder(points=16)
+    first = made(clouds)
+    assert made.prepared() is made.prepared()
+    made.basis.data.mul_(0.5)  # unseen by autograd's count of changes
+    halved = encoder(points=16, radius=0.5)(clouds)
+    torch.testing.assert_close(made(clouds), halved, rtol=0, atol=1e-6)
+    assert not torch.equal(made(clouds), first)
+
+
 def test_the_runs_seed_has_no_part_in_it():
     clouds = batch_of([30])
     torch.manual_seed(1)

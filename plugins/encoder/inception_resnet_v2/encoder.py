@@ -41,6 +41,7 @@ class InceptionResNetV2(Encoder):
         CheckpointError: the weights do not fit, or are damaged.
     """
 
+    initial = frozenset({"weights"})
     bibtex = """@inproceedings{szegedy2017inception,
   author    = {Szegedy, Christian and Ioffe, Sergey and Vanhoucke, Vincent and Alemi, Alexander A.},
   title     = {Inception-v4, Inception-ResNet and the Impact of Residual Connections on Learning},

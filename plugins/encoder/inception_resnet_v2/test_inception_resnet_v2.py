@@ -76,29 +76,11 @@ def test_features_are_timms_from_a_weight_file(encoder, tmp_path):
     np.testing.assert_allclose(found[:, ::400].numpy(), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_bytes_and_grey_images_are_read(encoder):
+def test_a_grey_image_is_read_as_three_equal_channels(encoder):
     torch.manual_seed(1)
     pixels = torch.randint(0, 256, (1, 1, 80, 75), dtype=torch.uint8)
     with torch.no_grad():
-        found = encoder(pixels)
-        torch.testing.assert_close(found, encoder(pixels.float() / 255))
-        torch.testing.assert_close(found, encoder(pixels.expand(-1, 3, -1, -1)))
-
-
-def test_an_empty_batch_gives_no_features(encoder):
-    assert encoder(torch.rand(0, 3, 75, 75)).shape == (0, 1536)
-
-
-def test_a_gradient_reaches_every_parameter():
-    torch.manual_seed(0)
-    trained = InceptionResNetV2((3, 107, 75), dropout=0.0)
-    features = trained(torch.rand(2, 3, 107, 75))
-    (features * torch.randn(1536)).sum().backward()
-    assert all(
-        parameter.grad is not None and parameter.grad.isfinite().all() for parameter in trained.parameters()
-    )
-    # a bias in front of ReLU and the like may have no gradient for two images; a weight tensor always has
-    assert all(parameter.grad.abs().sum() > 0 for parameter in trained.parameters() if parameter.dim() == 4)
+        torch.testing.assert_close(encoder(pixels), encoder(pixels.expand(-1, 3, -1, -1)))
 
 
 def test_a_residual_block_is_its_formula():

@@ -1,8 +1,6 @@
 """Weights trained elsewhere: fills a network from a local file of named tensors, or says what differs."""
 
-import json
 import logging
-import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +9,8 @@ from typing import Any
 
 import torch
 from jaxtyping import Shaped
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from framework.errors import CheckpointError, ConfigError
@@ -18,15 +18,8 @@ from framework.model import describe_mismatch
 
 _log = logging.getLogger(__name__)
 
-# of the safetensors format, https://github.com/huggingface/safetensors#format
-_DTYPES = {
-    "F64": torch.float64,
-    "F32": torch.float32,
-    "F16": torch.float16,
-    "BF16": torch.bfloat16,
-    "I64": torch.int64,
-    "I32": torch.int32,
-}
+NUMBERS = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32)
+"""What weights may be made of; complex numbers would lose half of theirs without a word."""
 
 
 def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...]) -> None:
@@ -107,29 +100,16 @@ def _torch(path: Path) -> Any:
 
 
 def _safetensors(path: Path) -> dict[str, Tensor]:
-    """Eight bytes: length of the header; the header, JSON: type, shape and place by name; the numbers."""
-    data = path.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    if len(data) < 8 or 8 + length > len(data):
-        raise _damaged(path, "it is cut short")
     try:
-        header = json.loads(data[8 : 8 + length])
-        header.pop("__metadata__", None)
-        body = bytearray(data[8 + length :])
-        return {name: _tensor(body, **entry) for name, entry in header.items()}
-    except (ValueError, TypeError, AttributeError, RuntimeError) as error:
+        found = load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
         raise _damaged(path, _first_line(error)) from None
-
-
-def _tensor(body: bytearray, dtype: str, shape: list[int], data_offsets: list[int]) -> Tensor:
-    if dtype not in _DTYPES:
-        raise ValueError(f"numbers of type {dtype} are not read, only {', '.join(_DTYPES)}")
-    kind, (start, end), count = _DTYPES[dtype], data_offsets, math.prod(shape)
-    if not 0 <= start <= end <= len(body) or end - start != count * kind.itemsize:
-        raise ValueError(f"bytes {start} to {end} of {len(body)} do not hold {shape} of {dtype}")
-    if count == 0:
-        return torch.empty(shape, dtype=kind)
-    return torch.frombuffer(body, dtype=kind, count=count, offset=start).reshape(shape)
+    for name, tensor in found.items():
+        if tensor.dtype not in NUMBERS:
+            raise _damaged(
+                path, f"{name} has numbers of type {tensor.dtype}, wanted {', '.join(map(str, NUMBERS))}"
+            )
+    return found
 
 
 def _damaged(path: Path, why: str) -> CheckpointError:

@@ -37,22 +37,9 @@ def test_agrees_with_numpy(shape, widths, batch_norm):
     np.testing.assert_allclose(found.detach().numpy(), by_hand(encoder, inputs.numpy()), rtol=1e-4, atol=1e-5)
 
 
-def test_bytes_are_read_as_0_to_1():
-    torch.manual_seed(0)
-    encoder = MLP((1, 4, 4), widths=[3]).eval()
-    pixels = torch.randint(0, 256, (5, 1, 4, 4), dtype=torch.uint8)
-    torch.testing.assert_close(encoder(pixels), encoder(pixels.float() / 255))
-
-
-def test_float64_stays_float64():
-    encoder = MLP((4,), widths=[3]).double()
-    assert encoder(torch.randn(2, 4, dtype=torch.float64)).dtype == torch.float64
-
-
-@pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("batch_norm", [False, True])
-def test_an_empty_batch_gives_no_features(training, batch_norm):
-    encoder = MLP((4,), widths=[3, 2], batch_norm=batch_norm).train(training)
+def test_an_empty_batch_in_training_gives_no_features(batch_norm):
+    encoder = MLP((4,), widths=[3, 2], batch_norm=batch_norm).train()
     assert encoder(torch.randn(0, 4)).shape == (0, 2)
 
 
@@ -67,13 +54,6 @@ def test_dropout_acts_in_training_alone():
     assert share == pytest.approx(0.25, abs=0.1)  # about 500 units: five standard errors
     still = alive & (dropped > 0)
     torch.testing.assert_close(dropped[still], kept[still] / 0.75)
-
-
-def test_a_gradient_reaches_every_parameter():
-    torch.manual_seed(0)
-    encoder = MLP((4,), widths=[8, 8], batch_norm=True)
-    encoder(torch.randn(16, 4)).square().sum().backward()
-    assert all(parameter.grad.abs().sum() > 0 for parameter in encoder.parameters())
 
 
 def test_refuses_samples_without_numbers():

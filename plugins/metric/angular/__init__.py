@@ -1,1 +1,1 @@
-"""Angular deviations: mean and median."""
+"""Angular deviation of the point prediction, its mean and its median."""

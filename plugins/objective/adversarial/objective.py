@@ -6,9 +6,8 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
-from torch.nn.modules.batchnorm import _BatchNorm
 
-from framework.calibration.module_flags import flagged
+from framework.calibration.module_flags import BATCH_NORM, flagged
 from framework.data import Batch
 from framework.errors import ConfigError, DataError, NonFiniteLoss
 from framework.model import Predictor
@@ -56,7 +55,7 @@ class Adversarial(Objective):
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         inputs = as_floats(batch["input"], predictor)
         # x' belongs to the training distribution no more than it is in the batch: no running moments from it
-        with flagged(predictor, _BatchNorm, "track_running_stats", False):
+        with flagged(predictor, BATCH_NORM, "track_running_stats", False):
             moved = inputs + self.epsilon * self._direction(predictor, inputs, batch)
             if batch["input"].dtype == torch.uint8:
                 moved = moved.clamp(0, 1)

@@ -7,10 +7,9 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
-from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.data import DataLoader
 
-from framework.calibration.module_flags import flagged
+from framework.calibration.module_flags import BATCH_NORM, flagged
 from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
 from framework.errors import ConfigError
@@ -91,7 +90,7 @@ class OutlierExposure(Objective):
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
         if self.clearance > 0:
             drawn = drawn[clear_of(drawn, inputs, self.clearance)]
-        with flagged(predictor, _BatchNorm, "training", False):
+        with flagged(predictor, BATCH_NORM, "training", False):
             found = each_alone(self._divergences(predictor.training_densities(drawn)))
         return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
 

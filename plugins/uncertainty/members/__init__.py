@@ -1,1 +1,1 @@
-"""Several members, or several passes of one."""
+"""Mixtures over the members of an ensemble, or over the dropout masks of one network."""

@@ -1,1 +1,1 @@
-"""Post-hoc scaling: temperature and Platt."""
+"""Post-hoc scaling of densities, fitted by maximum likelihood to the validation set: temperature and Platt."""

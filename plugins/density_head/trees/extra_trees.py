@@ -1,0 +1,182 @@
+"""Extremely randomised trees (Geurts et al. 2006) as a density head."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Categorical, Distribution
+
+from framework.density_head import DensityHead, Fitted
+from framework.distributions.density import Mixture
+from framework.target import Target
+from plugins.density_head.trees.forest import frequencies, leaves
+from plugins.density_head.trees.heads_without_gradient import (
+    FLOOR,
+    IndependentNormals,
+    load_any_shape,
+    require_fitted,
+    require_no_angle,
+    single,
+    with_gradient_of_0,
+)
+
+INTEGERS = ("feature", "branch", "root", "start", "label", "count")
+ROUNDS = 200
+"""Of expectation and maximisation at most; they end when no width changes by a millionth."""
+
+
+class ExtraTreesHead(DensityHead, Fitted):
+    """A forest of trees with random thresholds, fitted to all training samples at once (Geurts et al. 2006).
+
+    Classes: with f_k the mean over T trees of the share of class k in the leaf, p_k = (T f_k + a) / (T + a K), which is
+    Laplace's rule on T votes: no class has probability 0, and their order is the forest's. `smoothing` is a.
+    Reals: the mixture over the trees of normal densities about each tree's mean, with one width for each number of the
+    target. After the fit that is the targets' standard deviation; `calibrate` fits it to the validation set by maximum
+    likelihood. What the trees say is piecewise constant in the features, and its gradient 0.
+
+    Stored are flat arrays of whole numbers and thresholds; scikit-learn grows the forest and is not needed to use it.
+
+    Attributes:
+        trees: how many of the forest's trees are used, the first ones (a knob).
+
+    Args:
+        trees: how many are grown.
+        features: share of the features tried at each split; None: their square root for classes, all for reals.
+        leaf: least training samples of a leaf.
+        depth: most splits from root to leaf.
+        smoothing: a.
+
+    Raises:
+        ConfigError: the target is an angle.
+        UserError: it is used before it was fitted.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"trees": (1, 3, 10, 30, 100, 300)}
+    bibtex = """@article{geurts2006extremely,
+  author  = {Geurts, Pierre and Ernst, Damien and Wehenkel, Louis},
+  title   = {Extremely randomized trees},
+  journal = {Machine Learning},
+  volume  = {63},
+  pages   = {3--42},
+  year    = {2006}
+}"""
+
+    feature: Tensor
+    threshold: Tensor
+    branch: Tensor
+    root: Tensor
+    start: Tensor
+    label: Tensor
+    count: Tensor
+    mean: Tensor
+    width: Tensor
+    read: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        trees: Annotated[int, Field(gt=0)] = 300,
+        features: Annotated[float, Field(gt=0, le=1)] | None = None,
+        leaf: Annotated[int, Field(gt=0)] = 1,
+        depth: Annotated[int, Field(gt=0)] | None = None,
+        smoothing: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    ) -> None:
+        super().__init__()
+        require_no_angle(target, by="density_head extra_trees")
+        self.classes = len(target.names) if target.kind == "class" else 0
+        self.trees = trees
+        self.share, self.leaf, self.depth = features, leaf, depth
+        self.smoothing = smoothing
+        numbers = 0 if self.classes else len(target.names)
+        for name in INTEGERS:
+            self.register_buffer(name, torch.zeros(0, dtype=torch.int32))
+        self.register_buffer("threshold", torch.zeros(0))
+        self.register_buffer("mean", torch.zeros(0, numbers, dtype=torch.float64))
+        self.register_buffer("width", torch.ones(numbers, dtype=torch.float64))
+        self.register_buffer("read", torch.zeros((), dtype=torch.int64))
+        self.size = 0
+        load_any_shape(self, ExtraTreesHead._open)
+
+    def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        from plugins.density_head.trees.growing import (
+            grown,
+        )  # scikit-learn, which a stored forest does not need
+
+        wanted = target.cpu().numpy() if self.classes else target.cpu().double().numpy()
+        arrays = grown(
+            single(features).numpy(),
+            wanted,
+            classes=self.classes,
+            trees=self.trees,
+            share=self.share,
+            leaf=self.leaf,
+            depth=self.depth,
+            seed=seed,
+        )
+        for name, array in arrays.items():
+            setattr(self, name, torch.from_numpy(np.ascontiguousarray(array)).to(target.device))
+        if not self.classes:
+            self.width.copy_(target.double().std(0, correction=0).clamp(min=FLOOR))
+        self.read.fill_(features.shape[1])
+        self._open()
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        raw = require_fitted(raw, self.size, by="density_head extra_trees")
+        batch = raw.shape[:-1]
+        root = self.root[: max(1, self.trees)]
+        feature, threshold, branch = map(array, (self.feature, self.threshold, self.branch))
+        leaf = leaves(single(raw.reshape(-1, self.size)).numpy(), feature, threshold, branch, array(root))
+        if self.classes:
+            start, label, count = map(array, (self.start, self.label, self.count))
+            share = frequencies(leaf, start, label, count, self.classes)
+            votes = torch.from_numpy(share).to(raw).reshape(*batch, self.classes) * len(root)
+            logits = (votes + self.smoothing).log()  # Categorical divides by their sum, T + a K
+            return Categorical(logits=with_gradient_of_0(logits, raw), validate_args=False)
+        means = self.mean[torch.from_numpy(leaf).long().to(self.mean.device)]  # (tree, sample, number)
+        means = means.movedim(0, 1).to(raw).reshape(*batch, len(root), self.mean.shape[1])
+        means = with_gradient_of_0(means, raw)
+        components = IndependentNormals(means, self.width.to(raw).expand_as(means))
+        return Mixture(means.new_zeros(means.shape[:-1]), components)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        if self.classes:
+            return
+        if len(raw) == 0:
+            raise ValueError("widths are calibrated on validation data, but got none of it.")
+        density = self(raw.double())
+        assert isinstance(density, Mixture)
+        means = density.components.mean  # (sample, tree, number)
+        self.width.copy_(fitted_width(target.double().unsqueeze(1) - means))
+
+    def _open(self, *_: Any) -> None:
+        """Read how many features the stored forest asks for."""
+        self.size = int(self.read)
+
+
+def fitted_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "number"]:
+    """Widths σ of greatest Σ_i log (1/T) Σ_t Π_d N(residual_itd; 0, σ_d²), by expectation and maximisation.
+
+    r_it = N(residual_it; 0, σ²) / Σ_s N(residual_is; 0, σ²) and σ_d² = mean_i Σ_t r_it residual_itd² (Dempster, Laird &
+    Rubin 1977), from the widest that can be of use, at which every tree has a say. Each round raises the likelihood.
+    """
+    squares = residual.square()
+    variance = squares.mean((0, 1)).clamp(min=FLOOR**2)
+    for _ in range(ROUNDS):
+        share = (-(squares / (2 * variance)).sum(-1)).softmax(-1)
+        before, variance = variance, (share.unsqueeze(-1) * squares).sum(1).mean(0).clamp(min=FLOOR**2)
+        if bool(((variance / before).log().abs() < 1e-6).all()):
+            break
+    return variance.sqrt()
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    return tensor.cpu().numpy()

@@ -1,1 +1,0 @@
-"""Extremely randomised trees as a density head."""

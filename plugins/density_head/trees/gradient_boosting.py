@@ -1,0 +1,163 @@
+"""Gradient-boosted trees (Chen & Guestrin 2016) as a density head."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+import xgboost
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Categorical, Distribution
+
+from framework.density_head import DensityHead, Fitted
+from framework.errors import ConfigError
+from framework.target import Target
+from plugins.density_head.trees.heads_without_gradient import (
+    FLOOR,
+    IndependentNormals,
+    load_any_shape,
+    require_fitted,
+    require_no_angle,
+    single,
+    with_gradient_of_0,
+)
+
+Share = Annotated[float, Field(gt=0, le=1)]
+
+
+class XGBoostHead(DensityHead, Fitted):
+    """Trees that each correct the sum of those before, fitted to all training samples at once.
+
+    Classes: the softmax of the trees' sums, one for each class, trained by cross-entropy. Reals: a normal density about
+    the trees' sum, trained by squared error, of one standard deviation for each number of the target: the root of the
+    mean squared residual, after the fit of the training set and after `calibrate` of the validation set. What the trees
+    say is piecewise constant in the features, and its gradient 0. Predictions are float32.
+
+    Stored is the library's own portable binary format (UBJSON) as bytes, in which there is no code.
+
+    Attributes:
+        rounds: how many rounds' trees are used, the first ones (a knob).
+
+    Args:
+        rounds: of boosting.
+        depth: most splits from root to leaf.
+        rate: by which each round's trees are shrunk.
+        samples: share of the training samples drawn in each round.
+        features: share of the features drawn for each tree.
+        weight: least sum of second derivatives of the loss in a leaf.
+        splits: "hist" tries the borders of at most 256 bins of each feature, "exact" every sample's; for few samples of
+            very many features the latter is faster and takes less memory, which for bins grows with the features.
+
+    Raises:
+        ConfigError: the target is an angle, or a single class.
+        UserError: it is used before it was fitted.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"rounds": (1, 3, 10, 30, 100)}
+    bibtex = """@inproceedings{chen2016xgboost,
+  author    = {Chen, Tianqi and Guestrin, Carlos},
+  title     = {{XGBoost}: A Scalable Tree Boosting System},
+  booktitle = {ACM SIGKDD International Conference on Knowledge Discovery and Data Mining},
+  pages     = {785--794},
+  year      = {2016}
+}"""
+
+    model: Tensor
+    width: Tensor
+    read: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        rounds: Annotated[int, Field(gt=0)] = 100,
+        depth: Annotated[int, Field(gt=0)] = 6,
+        rate: Share = 0.3,
+        samples: Share = 1.0,
+        features: Share = 1.0,
+        weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0,
+        splits: Literal["hist", "exact"] = "hist",
+    ) -> None:
+        super().__init__()
+        require_no_angle(target, by="density_head xgboost")
+        self.classes = len(target.names) if target.kind == "class" else 0
+        if self.classes == 1:
+            raise ConfigError(
+                f"density_head xgboost tells two classes or more apart; this data set has one, {target.names[0]}. "
+                "Choose other data."
+            )
+        self.numbers = self.classes or len(target.names)
+        self.rounds = rounds
+        self.options = {
+            "max_depth": depth,
+            "learning_rate": rate,
+            "subsample": samples,
+            "colsample_bytree": features,
+            "min_child_weight": weight,
+            "tree_method": splits,
+        }
+        self.register_buffer("model", torch.zeros(0, dtype=torch.uint8))
+        self.register_buffer("width", torch.ones(0 if self.classes else self.numbers, dtype=torch.float64))
+        self.register_buffer("read", torch.zeros((), dtype=torch.int64))
+        self.size = 0
+        self.booster: xgboost.Booster | None = None
+        load_any_shape(self, XGBoostHead._open)
+
+    def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        options: dict[str, Any] = {
+            **self.options,
+            "seed": seed % 2**31,
+            "nthread": torch.get_num_threads(),
+            "objective": "multi:softprob" if self.classes else "reg:squarederror",
+        }
+        if self.classes:
+            options["num_class"] = self.classes
+        matrix = xgboost.DMatrix(single(features).numpy(), target.cpu().numpy())
+        fitted = xgboost.train(options, matrix, self.rounds, verbose_eval=False)
+        stored = torch.frombuffer(fitted.save_raw("ubj"), dtype=torch.uint8)
+        self.model = stored.clone().to(target.device)
+        self.read.fill_(features.shape[1])
+        self._open()
+        if not self.classes:
+            self._measure_width(features, target)
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        raw = require_fitted(raw, self.size, by="density_head xgboost")
+        sums = self._sums(raw.reshape(-1, self.size)).to(raw).reshape(*raw.shape[:-1], self.numbers)
+        sums = with_gradient_of_0(sums, raw)
+        if self.classes:
+            return Categorical(logits=sums.log_softmax(-1), validate_args=False)
+        return IndependentNormals(sums, self.width.to(raw).expand_as(sums))
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        if self.classes:
+            return
+        if len(raw) == 0:
+            raise ValueError("a standard deviation is calibrated on validation data, but got none of it.")
+        self._measure_width(raw, target)
+
+    def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        residual = target.double() - self._sums(raw).to(target.device)
+        self.width.copy_(residual.square().mean(0).sqrt().clamp(min=FLOOR))
+
+    def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:
+        """Of the trees, float32."""
+        assert self.booster is not None
+        rounds = min(max(1, self.rounds), self.booster.num_boosted_rounds())
+        found = self.booster.inplace_predict(
+            single(raw).numpy(), iteration_range=(0, rounds), predict_type="margin"
+        )
+        return torch.from_numpy(found).reshape(len(raw), self.numbers)
+
+    def _open(self, *_: Any) -> None:
+        """Read the stored model."""
+        self.size = int(self.read)
+        self.booster = None
+        if self.size:
+            self.booster = xgboost.Booster({"nthread": torch.get_num_threads()})
+            self.booster.load_model(bytearray(self.model.cpu().numpy()))

@@ -1,0 +1,24 @@
+"""Rows of the contract: few trees, for classes and for reals. The checks fit them to drawn features first.
+
+No reference is given: the trees against the libraries that grow them are in test_extra_trees.py and
+test_gradient_boosting.py.
+"""
+
+from framework.target import Target
+from framework.testing.rows import HeadRow
+
+TWO, FIVE = Target("class", ("a", "b")), Target("class", ("a", "b", "c", "d", "e"))
+ONE_REAL, TWO_REALS = Target("real", ("height",)), Target("real", ("x", "y"))
+ROWS = {
+    "extra_trees": (
+        HeadRow("five classes", FIVE, {"trees": 7}),
+        HeadRow("one real", ONE_REAL, {"trees": 7, "leaf": 5}),
+        HeadRow("two reals", TWO_REALS, {"trees": 5, "leaf": 5}),
+    ),
+    "xgboost": (
+        HeadRow("five classes", FIVE, {"rounds": 5}),
+        HeadRow("exact splits", TWO, {"rounds": 5, "splits": "exact"}),
+        HeadRow("one real", ONE_REAL, {"rounds": 5, "depth": 2}),
+        HeadRow("two reals", TWO_REALS, {"rounds": 5, "depth": 2}),
+    ),
+}

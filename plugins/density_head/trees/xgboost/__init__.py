@@ -1,1 +1,0 @@
-"""Gradient-boosted trees as a density head."""

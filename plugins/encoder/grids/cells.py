@@ -1,0 +1,59 @@
+"""What encoders of clouds on a grid over [-1, 1]³ share: how they read clouds, and the way back to points."""
+
+from collections.abc import Callable
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from framework.errors import DataError
+from framework.geometry.clouds import (
+    Normalisation,
+    Normalised,
+    cell_centres,
+    denormalised,
+    normalised,
+    pad,
+    require_normalised,
+    sizes,
+)
+
+
+def on_cells(
+    clouds: Float[Tensor, "batch points columns"],
+    normalise: Normalisation,
+    by: str,
+    numbers: Callable[[Tensor, int], Tensor],
+    side: int,
+) -> Float[Tensor, "batch 1 side side side"]:
+    """What `numbers` says of normalised clouds on a grid of side³ cells, x slowest, one number a cell.
+
+    Raises:
+        DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
+    """
+    counts = sizes(clouds)
+    local = normalised(clouds, normalise, counts).clouds
+    if normalise == "none":
+        require_normalised(local[..., :3], 1.0, counts, by=by)
+    return numbers(local, side).reshape(-1, 1, side, side, side)
+
+
+def centres_of(
+    chosen: Bool[Tensor, "batch cells"], like: Tensor, side: int, normalised: Normalised, what: str
+) -> Float[Tensor, "batch points 3"]:
+    """Centres of the chosen cells in the clouds' own units (§6.4.1), padded as clouds are, of the dtype of `like`.
+
+    Args:
+        normalised: of the clouds that were encoded; its centre and scale lead back.
+        what: is said of a chosen cell: "occupied".
+
+    Raises:
+        DataError: no cell of a cloud is chosen, all its points being outside the cube.
+    """
+    empty = (~chosen).all(1).nonzero()
+    if len(empty):
+        raise DataError(
+            f"No cell of cloud {int(empty[0])} is {what}; wanted one at least. All its points are outside of "
+            "[-1, 1]³: choose normalise=unit_ball."
+        )
+    centres = cell_centres(side).to(like)
+    return denormalised(pad([centres[cells] for cells in chosen]), normalised.centre, normalised.scale)

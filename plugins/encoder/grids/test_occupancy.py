@@ -1,0 +1,119 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError
+from framework.geometry.clouds import normalised, pad, sizes
+from plugins.encoder.grids.occupancy import decode, occupancy
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def encoder(shape=(40, 3), **config):
+    return build("encoder", resolve("encoder", {"name": "occupancy", **config}), input_shape=shape)
+
+
+def batch_of(lengths, columns=3, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(0)
+    clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
+    return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])
+
+
+def by_hand(cloud, side):
+    """A loop over points: the number of the cell, lower faces included, and at the last also the upper."""
+    flags = np.zeros((side, side, side))
+    for point in cloud:
+        place = [math.floor((x + 1) / 2 * side) for x in point]
+        if all(-1 <= x <= 1 for x in point):
+            flags[tuple(min(axis, side - 1) for axis in place)] = 1
+    return flags
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("side", [1, 2, 7, 32])
+@pytest.mark.parametrize("normalise", ["unit_ball", "robust"])
+def test_agrees_with_a_loop(normalise, side, dtype):
+    lengths = [200, 1, 30]
+    clouds = batch_of(lengths, 5, dtype)
+    found = encoder((200, 5), side=side, normalise=normalise)(clouds)
+    assert found.dtype == dtype
+    assert found.shape == (3, 1, side, side, side)
+    local = normalised(clouds, normalise).clouds[..., :3].double().numpy()
+    for number, length in enumerate(lengths):
+        np.testing.assert_array_equal(found[number, 0].numpy(), by_hand(local[number, :length], side))
+
+
+coordinate = st.floats(-1, 1, width=32) | st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0])
+
+
+@given(
+    st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=20),
+    st.integers(1, 9),
+    st.sampled_from([1e-8, 1.0, 1e8]),
+)
+@settings(max_examples=100, deadline=None)
+def test_wild_clouds_occupy_as_many_cells_as_points_at_most(points, side, scale):
+    clouds = torch.tensor(points)[None] * scale
+    flags = encoder(side=side)(clouds)
+    assert set(flags.unique().tolist()) <= {0.0, 1.0}
+    assert 1 <= flags.sum() <= min(len(points), side**3)
+    np.testing.assert_array_equal(
+        occupancy(torch.tensor(points)[None], side).reshape(side, side, side).numpy(), by_hand(points, side)
+    )
+
+
+def test_points_at_the_edge_are_in_and_beyond_it_out():
+    clouds = torch.tensor([[[1.0, 1, 1], [-1, -1, -1], [1 + 6e-8, 0, 0], [1.1, 0, 0], [0, 0, -1.1]]])
+    flags = occupancy(clouds, 2).reshape(2, 2, 2)
+    assert flags.tolist() == [[[1, 0], [0, 0]], [[0, 0], [0, 1]]]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_cells_lead_back_to_within_half_their_diagonal(dtype):
+    lengths, side = [200, 3], 16
+    clouds = batch_of(lengths, dtype=dtype)
+    local = normalised(clouds, "unit_ball")
+    flags = occupancy(local.clouds, side)
+    back = decode(flags, side, local)
+    assert back.dtype == dtype
+    counts = sizes(back)
+    for number, length in enumerate(lengths):
+        assert counts[number] == flags[number].sum()
+        cloud, cells = clouds[number, :length].numpy(), back[number, : counts[number]].numpy()
+        distance = np.linalg.norm(cloud[:, None] - cells, axis=-1)
+        limit = math.sqrt(3) / side * local.scale[number].item() * (1 + 1e-6)
+        assert distance.min(0).max() <= limit  # every cell has a point,
+        assert distance.min(1).max() <= limit  # every point a cell
+
+
+def test_a_cloud_outside_the_cube_does_not_lead_back():
+    far = torch.full((1, 4, 3), 5.0)
+    flags = occupancy(far, 4)
+    assert flags.sum() == 0
+    with pytest.raises(DataError, match="No cell of cloud 0 is occupied"):
+        decode(flags, 4, normalised(far, "none"))
+
+
+def test_the_features_are_fixed_and_nothing_is_learned():
+    made = encoder(side=8)
+    assert made.fixed
+    assert not made.state_dict()
+    assert made(torch.zeros(0, 40, 3)).shape == made(torch.zeros(0, 0, 3)).shape == (0, 1, 8, 8, 8)
+
+
+@pytest.mark.parametrize("config", [{"side": 0}, {"side": 1000}, {"normalise": "ball"}])
+def test_a_config_out_of_range_is_refused(config):
+    with pytest.raises(ConfigError, match=r"encoder\."):
+        encoder(**config)
+
+
+def test_clouds_that_were_not_normalised_are_refused_by_none():
+    with pytest.raises(
+        DataError, match=r"Cloud 0 of the batch reaches .* encoder occupancy with normalise=none"
+    ):
+        encoder(normalise="none")(batch_of([5, 3]) * 1e8)

@@ -1,1 +1,0 @@
-"""Convolutions over grids of numbers in space."""

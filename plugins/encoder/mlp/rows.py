@@ -1,0 +1,11 @@
+"""Rows of the contract: vectors and flattened images, with and without batch norm."""
+
+from framework.testing.rows import EncoderRow
+
+ROWS = {
+    "mlp": (
+        EncoderRow("defaults", (7,)),
+        EncoderRow("images", (3, 4, 5), {"widths": [16, 8], "dropout": 0.2}),
+        EncoderRow("batch norm", (6, 4), {"widths": [12, 8], "batch_norm": True}),
+    )
+}

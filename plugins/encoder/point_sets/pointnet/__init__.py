@@ -1,1 +1,0 @@
-"""PointNet: one network for every point, and the largest number over the cloud."""

@@ -1,1 +1,0 @@
-"""Mean absolute angular deviation of the point prediction."""

@@ -1,0 +1,141 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import sem
+from torch.distributions import Distribution
+
+from framework.configuration.schema import build, resolve
+from framework.distributions.protocol import median
+from framework.errors import ConfigError
+from framework.prediction import Prediction
+from framework.target import Target
+from framework.testing.metrics import Cardioid
+from plugins.metric.angular.metric import MeanAngularDeviation, MedianAngularDeviation
+
+ONE = Target("angle", ("azimuth",))
+THREE = Target("angle", ("azimuth", "elevation", "tilt"))
+
+
+class At(Distribution):
+    """A density of which only the point prediction is known."""
+
+    arg_constraints = {}  # noqa: RUF012 - as torch has it
+
+    def __init__(self, point):
+        self.point = point
+        super().__init__(point.shape[:-1], point.shape[-1:], validate_args=False)
+
+
+@median.register
+def _(density: At, samples: int) -> torch.Tensor:
+    return density.point
+
+
+def prediction(point, target, dtype=torch.float64):
+    return Prediction(
+        At(torch.as_tensor(point, dtype=dtype)), {"target": torch.as_tensor(target, dtype=dtype)}
+    )
+
+
+def measured(target, *batches, dtype=torch.float64):
+    metric = MeanAngularDeviation(target)
+    for point, true in batches:
+        metric.update(prediction(point, true, dtype))
+    return {name: value.item() for name, value in metric.compute().items()}
+
+
+def loop(point, target):
+    """Deviations in degrees by the shorter of the two ways round, one number at a time."""
+    rows = []
+    for predicted, true in zip(point, target, strict=True):
+        row = []
+        for a, b in zip(predicted, true, strict=True):
+            way = math.degrees(math.fmod(abs(float(a) - float(b)), 2 * math.pi))
+            row.append(min(way, 360 - way))
+        rows.append(row)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_agrees_with_a_loop(dtype):
+    generator = np.random.default_rng(0)
+    point, target = generator.uniform(-9, 9, (2, 150, 3)).astype(str(dtype).removeprefix("torch."))
+    metric = build("metric", resolve("metric", "angular_deviation"), target=THREE)
+    metric.update(prediction(point, target, dtype))
+    found = metric.compute()
+    expected = loop(point, target)
+    assert found["maad_deg"].item() == pytest.approx(expected.mean(), abs=1e-9)
+    assert found["maad_deg_sem"].item() == pytest.approx(sem(expected.mean(1)), abs=1e-9)
+    for index, name in enumerate(THREE.names):
+        assert found[f"maad_{name}_deg"].item() == pytest.approx(expected[:, index].mean(), abs=1e-9)
+        assert found[f"maad_{name}_deg_sem"].item() == pytest.approx(sem(expected[:, index]), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "point, target, deviation",
+    [
+        (math.radians(359), math.radians(1), 2),
+        (math.radians(1), math.radians(359), 2),
+        (math.radians(179), math.radians(-179), 2),
+        (0.0, math.pi, 180),
+        (math.radians(90) + 2e5 * math.pi, 0.0, 90),
+        (1.0, 1.0, 0),
+    ],
+)
+def test_the_shorter_way_round(point, target, deviation):
+    found = measured(ONE, ([[point]], [[target]]))
+    assert found["maad_deg"] == pytest.approx(deviation, abs=1e-7)
+    assert found["maad_azimuth_deg"] == found["maad_deg"]
+
+
+def test_nothing_seen_is_nan_and_one_sample_has_no_error():
+    empty = measured(ONE, (np.zeros((0, 1)), np.zeros((0, 1))))
+    assert all(np.isnan(value) for value in empty.values())
+    one = measured(ONE, ([[0.5]], [[0.0]]))
+    assert one["maad_deg"] == pytest.approx(math.degrees(0.5))
+    assert np.isnan(one["maad_deg_sem"])
+
+
+def test_equal_deviations_have_no_spread():
+    assert measured(ONE, (np.full((50, 1), 0.1), np.zeros((50, 1))))["maad_deg_sem"] == pytest.approx(
+        0, abs=1e-6
+    )
+
+
+def test_a_prediction_that_is_not_a_number_is_not_hidden():
+    assert np.isnan(measured(ONE, ([[np.nan], [0.0]], [[0.0], [0.0]]))["maad_deg"])
+
+
+def test_merged_halves_are_the_whole():
+    generator = np.random.default_rng(1)
+    point, target = generator.uniform(-4, 4, (2, 40, 3))
+    first, second, whole = (MeanAngularDeviation(THREE) for _ in range(3))
+    first.update(prediction(point[:7], target[:7]))
+    second.update(prediction(point[7:], target[7:]))
+    whole.update(prediction(point, target))
+    first.merge_state(second)
+    expected = whole.compute()
+    for name, value in first.compute().items():
+        torch.testing.assert_close(value, expected[name], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+@pytest.mark.parametrize("angles", [1, 3])
+def test_the_median_agrees_with_numpy(count, angles):
+    metric = MedianAngularDeviation(Target("angle", ("a", "b", "c")[:angles]))
+    predicted, true = 9 * torch.randn(count, angles), 9 * torch.randn(count, angles)
+    for part in torch.arange(count).split(4):
+        metric.update(Prediction(Cardioid(predicted[part]), {"target": true[part]}))
+    gap = (predicted - true).double().numpy()
+    wanted = np.median(np.degrees(np.abs(np.arctan2(np.sin(gap), np.cos(gap)))).mean(-1))
+    assert metric.compute()["median_deviation_deg"].item() == pytest.approx(wanted, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "kind, name", [(MeanAngularDeviation, "angular_deviation"), (MedianAngularDeviation, "median_deviation")]
+)
+def test_refuses_targets_that_are_not_angles(kind, name):
+    with pytest.raises(ConfigError, match=f"{name} describes targets of kind 'angle'"):
+        kind(Target("real", ("x",)))

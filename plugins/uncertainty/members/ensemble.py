@@ -1,0 +1,175 @@
+"""Deep ensembles: several models trained from different starts, their densities mixed."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated, Any, cast
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from framework.data import Batch
+from framework.density_head import DensityHead, Fitted
+from framework.distributions.batch_shapes import Stacked
+from framework.errors import ConfigError, UserError
+from framework.model import Model, Predictor, each_alone
+from framework.uncertainty import Joining, Uncertainty
+from plugins.uncertainty.members.equal_mixture import equal_mixture
+from plugins.uncertainty.members.side_by_side import SideBySide
+
+WORTH_TRYING = (1, 2, 3, 5, 10, 20, 50)
+
+
+class Ensemble(Uncertainty, Joining):
+    """T models that differ in their initial weights; p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
+
+    All members see the same batches. Where every encoder vectorises (`Encoder.vectorises`), their parameters lie side
+    by side and one pass trains and evaluates all; otherwise they are computed one after the other. Either way each
+    member's gradient is its own, so that it becomes what it would become alone (but for a clipping of the gradient's
+    norm, which is taken over all of them). One member is the wrapped model itself, to the last bit.
+
+    Attributes:
+        members: how many of the trained members are used, the first ones; may be lowered after training (a knob).
+
+    Raises:
+        ConfigError: more members are used than were trained.
+        UserError: a member's numbers are not finite; it is named and not averaged in.
+    """
+
+    bibtex = """@inproceedings{lakshminarayanan2017simple,
+  author    = {Lakshminarayanan, Balaji and Pritzel, Alexander and Blundell, Charles},
+  title     = {Simple and Scalable Predictive Uncertainty Estimation using Deep Ensembles},
+  booktitle = {Advances in Neural Information Processing Systems},
+  pages     = {6402--6413},
+  year      = {2017}
+}"""
+
+    def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 5) -> None:
+        super().__init__()
+        self.trained = members
+        self.members = members
+        self.knobs = {"members": tuple(count for count in WORTH_TRYING if count <= members)}
+        built = [model() for _ in range(members)]
+        self.apart = nn.ModuleList()
+        self.heads = nn.ModuleList()
+        self.together: SideBySide | None = None
+        if members > 1 and all(vectorises(one) for one in built):
+            models = cast(list[Model], built)
+            self.together = SideBySide([network(one) for one in models])
+            self.heads.extend(one.head for one in (models if has_state(models[0].head) else models[:1]))
+        else:
+            self.apart.extend(built)
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        if not 1 <= self.members <= self.trained:
+            raise ConfigError(
+                f"members = {self.members} of an ensemble of {self.trained}: wanted a number from 1 to {self.trained}."
+            )
+        if self.together is None:
+            found = [self._of(index, inputs) for index in range(self.members)]
+            if len(found) == 1:
+                return found[0]
+            components: Distribution = Stacked(found)
+        else:
+            components = self._densities(self.together(inputs, self.members))
+        return equal_mixture(components, self, inputs.device)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        if self.together is None:
+            losses = torch.stack([member.loss(inputs, target) for member in self._apart()], 1)
+        else:
+            raw = self.together(inputs)
+            if len(self.heads) == 1:
+                wide = target.unsqueeze(1).expand(target.shape[0], self.trained, *target.shape[1:])
+                losses = self._head(0).loss(raw, wide)
+            else:
+                parts = [self._head(index).loss(raw[:, index], target) for index in range(self.trained)]
+                losses = torch.stack(parts, 1)
+        return each_alone(losses)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        if self.together is not None:
+            return self._densities(self.together(inputs))
+        found = [member.training_densities(inputs) for member in self._apart()]
+        return found[0] if len(found) == 1 else Stacked(found)
+
+    @torch.no_grad()
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        seen = list(batches)
+        if self.together is None:
+            for member in self._apart():
+                member.calibrate(seen)
+        elif len(self.heads) > 1:
+            raw = torch.cat([self.together(batch["input"]) for batch in seen])
+            target = torch.cat([batch["target"] for batch in seen])
+            for index in range(self.trained):
+                self._head(index).calibrate(raw[:, index], target)
+
+    @classmethod
+    def parameters_of(cls, count: int) -> dict[str, Any]:
+        return {"members": count}
+
+    def join(self, members: Sequence[Predictor]) -> None:
+        if len(members) != self.trained:
+            raise ConfigError(
+                f"an ensemble of {self.trained} was given {len(members)} members; wanted as many."
+            )
+        for index, member in enumerate(members):
+            if self.together is None:
+                self.apart[index].load_state_dict(member.state_dict())
+            else:
+                assert isinstance(member, Model)
+                self.together.write(index, dict(network(member).named_parameters()))
+                if len(self.heads) > 1:
+                    self.heads[index].load_state_dict(member.head.state_dict())
+
+    def _of(self, index: int, inputs: Tensor) -> Distribution:
+        try:
+            return self._apart()[index](inputs)
+        except ValueError as error:  # a head that was given NaN says in which row
+            raise UserError(f"member {index} of {self.trained} of the ensemble: {error} {REMEDY}") from error
+
+    def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
+        """Batch_shape (batch, member)."""
+        bad = (~raw.isfinite()).any(-1).nonzero()
+        if len(bad):
+            row, index = bad[0].tolist()
+            others = len(bad[:, 1].unique()) - 1
+            more = f" (and {others} other members)" if others else ""
+            raise UserError(
+                f"member {index} of {self.trained} of the ensemble{more} gives numbers that are not finite, first for "
+                f"row {row} of the batch. {REMEDY}"
+            )
+        if len(self.heads) == 1:
+            return self._head(0)(raw)
+        return Stacked([self._head(index)(raw[:, index]) for index in range(raw.shape[1])])
+
+    def _head(self, index: int) -> DensityHead:
+        return cast(DensityHead, self.heads[index])
+
+    def _apart(self) -> list[Predictor]:
+        return cast(list[Predictor], list(self.apart))
+
+
+REMEDY = (
+    "It is not averaged in. Look at the inputs; if they are sound, train the ensemble again with a lower "
+    "optimizer.learning_rate, or join the sound runs of a sweep with mode=combine."
+)
+
+
+def vectorises(member: Predictor) -> bool:
+    """Whether members like this one can be computed side by side."""
+    if not isinstance(member, Model) or isinstance(member.head, Fitted):
+        return False
+    return all(encoder.vectorises for encoder in member.encoders)
+
+
+def network(member: Model) -> nn.Sequential:
+    """From inputs to what the head reads."""
+    return nn.Sequential(member.encoders, member.projection)
+
+
+def has_state(head: nn.Module) -> bool:
+    """Whether heads of two members can differ."""
+    return bool(head.state_dict())

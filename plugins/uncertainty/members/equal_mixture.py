@@ -1,0 +1,14 @@
+"""What members and dropout masks have in common: their densities are mixed with equal weights."""
+
+import torch
+from torch import nn
+from torch.distributions import Distribution
+
+from framework.distributions.density import Mixture
+
+
+def equal_mixture(components: Distribution, model: nn.Module, device: torch.device) -> Mixture:
+    """(1/S) Σ_s p_s over the last batch dimension of `components`; weights have the dtype of the model's parameters."""
+    dtypes = (parameter.dtype for parameter in model.parameters())
+    dtype = next(dtypes, torch.get_default_dtype())  # trees have no parameters
+    return Mixture(torch.zeros(components.batch_shape, dtype=dtype, device=device), components)

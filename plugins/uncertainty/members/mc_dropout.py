@@ -1,0 +1,178 @@
+"""Dropout that stays active in evaluation, and the mixture over its masks."""
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from framework.calibration.module_flags import flagged
+from framework.data import Batch
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.errors import ConfigError, UserError
+from framework.model import Model, Predictor
+from framework.uncertainty import Uncertainty
+from plugins.uncertainty.members.equal_mixture import equal_mixture
+
+DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
+AT_ONCE = 2**24
+"""Numbers that may enter a dropout layer together (64 MiB in float32); more samples are taken in parts."""
+
+
+class Layout(NamedTuple):
+    """How samples are computed.
+
+    Attributes:
+        vectorised: whether `torch.vmap` runs the network, and so everything before the first dropout only once.
+        widest: numbers of one input, or of what enters a dropout layer, whichever is repeated and more.
+    """
+
+    vectorised: bool
+    widest: int
+
+
+class MCDropout(Uncertainty):
+    """The mixture, with equal weights, of the densities under S dropout masks (thesis eq. 2.16; Gal & Ghahramani 2016).
+
+    Training, and the validation loss, are those of what is wrapped. In evaluation its dropout layers (`DROPOUT`) stay
+    active, and nothing else: batch norm normalises as in any evaluation. Every input of a batch has its own S masks,
+    drawn from torch's global generator. What is wrapped calibrates its own density without dropout.
+
+    Layers before the first dropout are computed once and not S times, where the network can be vectorised.
+
+    Args:
+        model: what is wrapped; needs a dropout layer of probability above 0.
+        samples: S, also a knob; 1 is one stochastic pass.
+
+    Raises:
+        ConfigError: there is no such dropout layer, or `samples` was set below 1.
+        UserError: the network's numbers are not finite under some mask; it is named and not averaged in.
+    """
+
+    knobs = {"samples": (1, 3, 10, 30, 100)}  # noqa: RUF012 - never written
+    bibtex = """@inproceedings{gal2016dropout,
+  author    = {Gal, Yarin and Ghahramani, Zoubin},
+  title     = {Dropout as a {Bayesian} Approximation: Representing Model Uncertainty in Deep Learning},
+  booktitle = {International Conference on Machine Learning},
+  pages     = {1050--1059},
+  year      = {2016}
+}"""
+
+    def __init__(self, model: Callable[[], Predictor], *, samples: Annotated[int, Field(ge=1)] = 50) -> None:
+        super().__init__()
+        self.model = model()
+        self.samples = samples
+        self.layout: Layout | None = None  # found out at the first prediction
+        if not any(layer.p > 0 for layer in _dropouts(self.model)):
+            raise ConfigError(
+                "uncertainty mc_dropout: the model has no dropout layer of probability above 0, so that every sample "
+                "would be the same. Give the encoder dropout, e.g. encoder.mlp.dropout=0.2."
+            )
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        if self.training:
+            return self.model(inputs)
+        if self.samples < 1:
+            raise ConfigError(f"uncertainty mc_dropout: samples = {self.samples}; wanted 1 or more.")
+        with flagged(self.model, DROPOUT, "training", True):
+            components = self._components(inputs)
+        return equal_mixture(components, self.model, inputs.device)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        return self.model.loss(inputs, target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self.model.training_densities(inputs)
+
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        self.model.calibrate(batches)
+
+    def _components(self, inputs: Tensor) -> Distribution:
+        """The densities under S masks each: batch_shape (batch, S)."""
+        whole = (len(inputs), self.samples)
+        if self.samples == 1 or len(inputs) == 0:
+            one = self.model(inputs)
+            return Reshaped(one, whole) if self.samples == 1 else Stacked([one] * self.samples)
+        if isinstance(self.model, Model):
+            return self.model.head(require_finite(self._raws(self.model, inputs)))
+        if inputs.numel() * self.samples <= AT_ONCE:
+            return Reshaped(self.model(inputs.repeat_interleave(self.samples, 0)), whole)
+        return Stacked([self.model(inputs) for _ in range(self.samples)])
+
+    def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample size"]:
+        """What the head reads under each mask."""
+        self.layout = self.layout or layout_of(model, inputs)
+        at_once = max(1, AT_ONCE // (len(inputs) * self.layout.widest))
+        counts = [min(at_once, self.samples - start) for start in range(0, self.samples, at_once)]
+        compute = _vectorised if self.layout.vectorised else _repeated
+        return torch.cat([compute(model, inputs, count) for count in counts], 1)
+
+
+def require_finite(raw: Float[Tensor, "batch sample size"]) -> Float[Tensor, "batch sample size"]:
+    """`raw` itself.
+
+    Raises:
+        UserError: a number is not finite; says under which mask of which input.
+    """
+    bad = (~raw.isfinite().all(-1)).nonzero()
+    if len(bad):
+        row, sample = bad[0].tolist()
+        raise UserError(
+            f"uncertainty mc_dropout: the network gives numbers that are not finite under {len(bad)} dropout masks, "
+            f"first sample {sample} of row {row} of the batch. Look at this input, or train with a lower "
+            "optimizer.learning_rate."
+        )
+    return raw
+
+
+def _dropouts(model: nn.Module) -> Iterator[Any]:
+    return (module for module in model.modules() if isinstance(module, DROPOUT))
+
+
+def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
+    """`count` passes in one: torch.vmap repeats nothing until a dropout layer makes the samples differ."""
+    sampled = torch.vmap(lambda _: model.raw(inputs), randomness="different", out_dims=1)
+    return sampled(torch.empty(count, device=inputs.device))
+
+
+def _repeated(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
+    """The same in one pass over `count` copies of every input."""
+    return model.raw(inputs.repeat_interleave(count, 0)).unflatten(0, (len(inputs), count))
+
+
+def layout_of(model: Model, inputs: Tensor) -> Layout:
+    """How to compute samples of a model in whose dropout layers are active; tries two on one input.
+
+    A network with operations that torch.vmap cannot run, or only slowly, which it warns of, is run on copies of the
+    inputs. The global generators are left as they were.
+    """
+    devices = [inputs.device] if inputs.device.type == "cuda" else []
+    with torch.random.fork_rng(devices), torch.no_grad(), warnings.catch_warnings(), _widths(model) as widths:
+        warnings.simplefilter("error")
+        try:
+            _vectorised(model, inputs[:1], 2)
+        except (RuntimeError, Warning):
+            warnings.simplefilter("default")
+            model.raw(inputs[:1])
+            return Layout(False, max(1, inputs[0].numel(), *widths))
+        return Layout(True, max(1, *widths))
+
+
+@contextmanager
+def _widths(model: Model) -> Iterator[list[int]]:
+    """How many numbers enter each dropout layer in a pass."""
+    widths: list[int] = [0]
+    hooks = [
+        layer.register_forward_pre_hook(lambda _, given: widths.append(given[0].numel()))
+        for layer in _dropouts(model)
+    ]
+    try:
+        yield widths
+    finally:
+        for hook in hooks:
+            hook.remove()

@@ -1,1 +1,0 @@
-"""Monte Carlo dropout (thesis §2.3.2)."""

@@ -1,0 +1,78 @@
+"""The parameters of highest likelihood in a box, by SciPy's L-BFGS-B (Byrd, Lu, Nocedal & Zhu 1995)."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import optimize
+from torch import Tensor
+
+Term = Callable[[Tensor], Tensor]
+"""Part of the mean negative log-likelihood: parameters (n,), float64 → a scalar, differentiable."""
+
+
+class Minimum(NamedTuple):
+    """Where `minimise` ended.
+
+    Attributes:
+        point: within the box, float64.
+        value: there, never above that at the start.
+        active: -1 at a lower bound, 1 at an upper one beyond which the sum still falls, else 0.
+    """
+
+    point: Float[Tensor, "n"]
+    value: float
+    active: Int[Tensor, "n"]
+
+
+def minimise(
+    terms: Sequence[Term],
+    start: Float[Tensor, "n"],
+    lower: Float[Tensor, "n"],
+    upper: Float[Tensor, "n"],
+    *,
+    rounding: float = 2e-16,
+) -> Minimum:
+    """A local minimum of Σ terms in the box lower ≤ point ≤ upper. Only one term's graph is held at a time.
+
+    Args:
+        rounding: of the values, relative to 1 + |value|; nothing below it is gained.
+    """
+    low, high = lower.cpu().numpy(), upper.cpu().numpy()
+    first, _ = value_and_slope(terms, start)
+    # a point where the sum is not finite is a step that failed: no trial may be better, and it points nowhere
+    worse = first + 1 + abs(first)
+
+    def trial(numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = value_and_slope(terms, torch.tensor(numbers).to(start))
+        return (value, slope) if np.isfinite([value, *slope]).all() else (worse, np.zeros_like(slope))
+
+    options = {"ftol": rounding, "gtol": 1e-12, "maxiter": 200}
+    found = optimize.minimize(
+        trial, start.tolist(), jac=True, method="L-BFGS-B", bounds=np.stack([low, high], 1), options=options
+    )
+    point = torch.tensor(found.x).to(start)
+    value, slope = value_and_slope(terms, point)
+    down, up = (found.x <= low) & (slope > 0), (found.x >= high) & (slope < 0)
+    return Minimum(point, value, torch.from_numpy(up.astype(int) - down.astype(int)))
+
+
+def total(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Σ terms, float64, without gradient."""
+    with torch.no_grad():
+        return torch.stack([term(point).double() for term in terms]).sum()
+
+
+def value_and_slope(terms: Sequence[Term], point: Float[Tensor, "n"]) -> tuple[float, np.ndarray]:
+    """Σ terms and its gradient, float64."""
+    value, slope = 0.0, torch.zeros_like(point)
+    for term in terms:
+        with torch.enable_grad():
+            here = point.detach().clone().requires_grad_()
+            part = term(here).double()
+            value += part.item()
+            if part.requires_grad:  # no constant
+                slope += torch.autograd.grad(part, here)[0]
+    return value, slope.cpu().numpy()

@@ -1,0 +1,143 @@
+"""Platt scaling: a slope and biases on log-probabilities, fitted on the validation set."""
+
+import logging
+from collections.abc import Callable, Iterable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.calibration.validation import densities, repeatable, require_numbers
+from framework.data import Batch
+from framework.distributions.tempering import RescaledClasses, log_probabilities
+from framework.model import Predictor
+from framework.target import Target
+from framework.uncertainty import Uncertainty
+from plugins.uncertainty.scaling.likelihood import minimise
+
+STEEPEST = 20.0
+"""Largest slope; the smallest is 0."""
+LARGEST_BIAS = 50.0
+"""Of a class, nats, before their mean is taken off."""
+LEAST = -1e5
+"""Log-probabilities below it, -∞ among them, are read as it, nats."""
+_log = logging.getLogger(__name__)
+
+
+class Platt(Uncertainty):
+    """Class log-probabilities l become a·l + b, normalised (thesis eq. 2.18-2.19).
+
+    One slope a ≥ 0, and a bias for each class, of sum 0; of two classes this is a slope and a bias on the log-odds.
+    The thesis writes the network's output probability in the exponent; here as in Platt 1999 and Guo et al. 2017 it is
+    the log-odds, with which a = 1, b = 0 changes nothing: so it stands before `calibrate`. What is wrapped may be any
+    density over classes, also a mixture.
+
+    A slope below 0 would turn what is wrapped upside down: labels that contradict it stop the slope at 0, where only
+    the classes' shares are left. Slope and biases have upper bounds too. Where one is reached the log says so.
+
+    Args:
+        smoothing: towards labels of which one more of each class had been seen, (N₊+1)/(N₊+2) and 1/(N₋+2) of two
+            classes (Platt 1999, §2.2); the fit is then finite also on separable and one-class sets.
+
+    Attributes:
+        slope: a, a float64 buffer.
+        biases: b, (class,), nats, a float64 buffer.
+
+    Raises:
+        ConfigError: the target is not of classes.
+        UserError: an empty validation set, or a likelihood that is NaN (its samples are named).
+    """
+
+    bibtex = """@incollection{platt1999probabilistic,
+  author    = {Platt, John C.},
+  title     = {Probabilistic Outputs for Support Vector Machines and Comparisons to Regularized Likelihood Methods},
+  booktitle = {Advances in Large Margin Classifiers},
+  publisher = {MIT Press},
+  pages     = {61--74},
+  year      = {1999}
+}"""
+    slope: Tensor
+    biases: Tensor
+
+    def __init__(self, model: Callable[[], Predictor], target: Target, *, smoothing: bool = True) -> None:
+        super().__init__()
+        target.require("class", by="uncertainty platt")
+        self.knobs = {}
+        self.model = model()
+        self.smoothing = smoothing
+        self.register_buffer("slope", torch.ones((), dtype=torch.float64))
+        self.register_buffer("biases", torch.zeros(len(target.names), dtype=torch.float64))
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        density = self.model(inputs)
+        if self.slope == 1 and not self.biases.any():
+            return density
+        log_prob = log_probabilities(density)
+        logits = self.slope * log_prob.double().clamp(min=LEAST) + self.biases
+        return RescaledClasses(logits.log_softmax(-1).to(log_prob.dtype), density, self.slope)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        return self.model.loss(inputs, target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self.model.training_densities(inputs)
+
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        seen = repeatable(batches, by="platt")
+        self.model.calibrate(seen)
+        found = densities(self.model, seen)
+        log_prob = torch.cat([log_probabilities(density) for density in found]).detach().double()
+        require_numbers(log_prob.sum(-1), seen, "class probabilities")
+        label = torch.cat([batch["target"] for batch in seen])
+        slope, biases = fit(log_prob, label, smoothing=self.smoothing)
+        self.slope.fill_(slope)
+        self.biases.copy_(biases)
+
+
+def fit(
+    log_prob: Float[Tensor, "sample label"], label: Int[Tensor, "sample"], *, smoothing: bool
+) -> tuple[float, Float[Tensor, "label"]]:
+    """Slope and biases of least mean cross-entropy to (smoothed) labels (eq. 2.19); convex."""
+    classes = log_prob.shape[-1]
+    wanted = targets(label, classes, smoothing=smoothing)
+    heights = log_prob.clamp(min=LEAST)
+    heights = heights - heights.mean(-1, keepdim=True)
+    # in units of their spread, so that slope and biases are of one size to the minimiser
+    unit = heights.square().mean().sqrt().clamp(min=torch.finfo(torch.float64).eps)
+    heights = heights / unit
+
+    def cross_entropy(point: Tensor) -> Tensor:
+        logits = point[0] * heights + point[1:]
+        return -(wanted * logits.log_softmax(-1)).sum(-1).mean()
+
+    bound = torch.full((classes + 1,), LARGEST_BIAS, dtype=torch.float64, device=log_prob.device)
+    lower, upper = -bound, bound.clone()
+    lower[0], upper[0] = 0.0, STEEPEST * unit
+    start = torch.zeros_like(bound)
+    start[0] = unit
+    best = minimise([cross_entropy], start, lower, upper)
+    slope = min((best.point[0] / unit).item(), STEEPEST)
+    biases = best.point[1:] - best.point[1:].mean()
+    if best.active[0] < 0:
+        _log.warning(
+            "platt: the slope stopped at 0: the validation labels do not follow what is wrapped, and only the classes' "
+            "shares are left of its probabilities."
+        )
+    elif best.active.any():
+        _log.warning(
+            "platt: the %s stopped at its bound %g, where the likelihood of the validation set still rises: the set is "
+            "perfectly separable, or lacks a class. Use smoothing: true.",
+            *("slope", STEEPEST) if best.active[0] else ("bias of a class", LARGEST_BIAS),
+        )
+    return slope, biases
+
+
+def targets(label: Int[Tensor, "sample"], classes: int, *, smoothing: bool) -> Float[Tensor, "sample label"]:
+    """What the probabilities are fitted to: 1 for the label, or with N_k samples of it and K classes (N_k+1)/(N_k+K),
+    and 1/(N_k+K) for each other (of two classes Platt 1999, §2.2)."""
+    exact = torch.nn.functional.one_hot(label, classes).double()
+    if not smoothing:
+        return exact
+    count = exact.sum(0)[label].unsqueeze(-1)
+    return (exact * count + 1) / (count + classes)

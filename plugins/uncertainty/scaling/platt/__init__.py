@@ -1,1 +1,0 @@
-"""Slope and biases for the log-probabilities of classes."""

@@ -1,1 +1,0 @@
-"""One temperature for all densities."""
