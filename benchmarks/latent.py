@@ -22,7 +22,8 @@ from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.monte_carlo import NormalPoints, estimate, lattice, normal_quantile
-from framework.evaluation.work_precision import front, run_times
+from framework.evaluation.pareto import front
+from framework.evaluation.tradeoff import run_times
 from framework.reports import table
 from framework.target import Target
 
@@ -325,7 +326,7 @@ def main() -> None:
     for method, config in HEADS.items():
         rows += curve(method, *trained(config))
     mark(rows)
-    table.csv(rows, {key: key for key in [*COLUMNS, "family_excess_nats"]}, HERE.with_suffix(".csv"))
+    table.csv(rows, [*COLUMNS, "family_excess_nats"], HERE.with_suffix(".csv"))
     picture(rows)
     shown = [
         row

@@ -59,6 +59,7 @@ class Moons(Data):
     def prepare(self) -> None:
         self.target = Target("class", LABELS)
         self.input_shape = (2,)
+        self.plane = True
         self.groups = ("moons",)
         self.synthetic = True
         self.skipped = 0
