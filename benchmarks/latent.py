@@ -23,7 +23,8 @@ from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.closed_forms import normal_quantile
 from framework.distributions.protocol import estimate
-from framework.evaluation.work_precision import front, run_times
+from framework.evaluation.pareto import front
+from framework.evaluation.tradeoff import run_times
 from framework.reports import table
 from framework.target import Target
 from plugins.density_head.latent.monte_carlo import NormalPoints, lattice
@@ -326,7 +327,7 @@ def main() -> None:
     for method, config in HEADS.items():
         rows += curve(method, *trained(config))
     mark(rows)
-    table.csv(rows, {key: key for key in [*COLUMNS, "family_excess_nats"]}, HERE.with_suffix(".csv"))
+    table.csv(rows, [*COLUMNS, "family_excess_nats"], HERE.with_suffix(".csv"))
     picture(rows)
     shown = [
         row

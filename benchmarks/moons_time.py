@@ -19,8 +19,9 @@ import framework
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import as_batch
-from framework.evaluation.tradeoff import rows, tradeoff, write
-from framework.reports.tradeoff_picture import tradeoff as drawn
+from framework.evaluation.tradeoff import rows, tradeoff
+from framework.reports.table import csv
+from framework.reports.tradeoff_picture import error_against_run_time
 
 HERE = Path(__file__).parent
 KNOBS = {
@@ -30,7 +31,7 @@ KNOBS = {
     "ensemble_temperature": ("ensemble + temperature", "members", (1, 2, 3, 5, 10, 20)),
     "mc_dropout": ("MC dropout", "samples", (1, 3, 10, 30, 100)),
 }
-KEYS = {"nll": "NLL (nats)", "ece": "ECE"}
+LABELS = {"nll": "NLL (nats)", "ece": "ECE"}
 
 
 def main() -> None:
@@ -55,11 +56,17 @@ def main() -> None:
             seed=0,
             repeats=5 if knob == "samples" else 1,
         )
-    found = rows(curves, list(KEYS), dict.fromkeys(KEYS, True), synthetic=True)
-    write(found, HERE / "moons_time.csv")
-    where = f"batches of 500, one thread; {machine('torch')}"
-    title = "Two moons: NLL and ECE against run time, 512-512 networks"
-    drawn(curves, KEYS, title=title, synthetic=True, note=where).savefig(HERE / "moons_time.png", dpi=110)
+    found = rows(curves, dict.fromkeys(LABELS, "lower"), synthetic=True)
+    csv(found, None, HERE / "moons_time.csv")
+    figure = error_against_run_time(
+        found,
+        LABELS,
+        dict.fromkeys(LABELS, "lower"),
+        title="Two moons: NLL and ECE against run time, 512-512 networks",
+        synthetic=True,
+        note=f"batches of 500, one thread; {machine('torch')}",
+    )
+    figure.savefig(HERE / "moons_time.png", dpi=110)
     for row in found:
         sys.stdout.write(f"{row['method']}, {row['value']}: NLL {row['nll']:.4f}, ECE {row['ece']:.4f}, ")
         sys.stdout.write(f"{row['milliseconds_per_sample'] * 1e3:.2f} µs\n")

@@ -56,6 +56,8 @@ class Data(ABC):
     """Shape of one input, without the batch dimension; of point clouds (points, columns), of the largest of them."""
     columns: tuple[str, ...] = ()
     """What the numbers of an input's last dimension are called, where they have names: ("x", "y", "z", "red", ...)."""
+    plane: bool = False
+    """Whether an input is two numbers, a place in a plane, over which what a classifier says can be drawn."""
     varies: bool = True
     """Whether `augment` may change a batch."""
     groups: tuple[str, ...]

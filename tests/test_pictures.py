@@ -17,16 +17,9 @@ from matplotlib.text import Annotation, Text
 from scipy.special import logsumexp
 from scipy.stats import vonmises
 
-from framework.evaluation.work_precision import Point
-from framework.reports.pictures import (
-    RING,
-    choose,
-    comparison,
-    peaks,
-    training_curve,
-    viewing_circles,
-    work_precision,
-)
+from framework.reports.tradeoff_picture import Floor, error_against_run_time
+from framework.reports.training_curve import training_curve
+from framework.reports.viewing_circles import RING, choose, peaks, viewing_circles
 
 ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
 
@@ -245,13 +238,23 @@ def test_nothing_recorded_is_an_empty_training_curve(tmp_path: Path) -> None:
     drawn(training_curve([], [], [], best_epoch=None, title="run", synthetic=False), tmp_path)
 
 
-# work-precision diagrams
+# error against run time along a knob
 
-CURVES = {
-    "first": [Point("samples", value, 0.5 / value, 0.1 / value, 1 + 0.01 * value) for value in (1, 10, 100)],
-    "second": [Point("tolerance", 1e-3, 0.4, math.nan, 3.0), Point("tolerance", 1e-6, 0.0, 0.0, 9.0)],
-    "third": [Point("members", 4, math.inf, math.nan, 0.5)],
-}
+
+def curve(method: str, knob: str, points: list[tuple[float, float, float, float]]) -> list[dict]:
+    """Rows of value, error, standard error and milliseconds."""
+    keys = ("value", "error", "error_sem", "ms")
+    return [{"method": method, "knob": knob, **dict(zip(keys, point, strict=True))} for point in points]
+
+
+FIRST = curve("first", "samples", [(n, 0.5 / n, 0.1 / n, 1 + 0.01 * n) for n in (1, 10, 100)])
+SECOND = curve("second", "tolerance", [(1e-3, 0.4, math.nan, 3.0), (1e-6, 0.0, 0.0, 9.0)])
+CURVES = [*FIRST, *SECOND, *curve("third", "members", [(4, math.inf, math.nan, 0.5)])]
+
+
+def diagram(rows: list[dict], **changed) -> Figure:
+    options = {"better": {"error": "lower"}, "title": "", "synthetic": False, "time": "ms"}
+    return error_against_run_time(rows, {"error": "error (nats)"}, **(options | changed))
 
 
 def lines_with(figure: Figure, **wanted) -> list[Line2D]:
@@ -263,18 +266,20 @@ def lines_with(figure: Figure, **wanted) -> list[Line2D]:
 
 
 def test_the_diagram_is_logarithmic_with_units_bars_and_knob_values(tmp_path: Path) -> None:
-    figure = work_precision(CURVES, title="Diagram", synthetic=True, reference_error=0.004)
+    floor = Floor(0.004, "below 0.004 nats the reference itself is uncertain")
+    figure = diagram(CURVES, title="Diagram", synthetic=True, floors={"error": floor}, note="one core")
     (axes,) = figure.axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     assert "ms per sample" in axes.get_xlabel() and "nats" in axes.get_ylabel()
-    assert len(axes.containers) == 3
+    assert len(axes.containers) == 2
     assert axes.containers[0].lines[0].get_xydata() == pytest.approx(
-        np.array([(point.milliseconds, point.error) for point in CURVES["first"]])
+        np.array([(row["ms"], row["error"]) for row in FIRST])
     )
     notes = [text.get_text() for text in axes.texts if isinstance(text, Annotation)]
     assert notes == ["1", "10", "100", "0.001", "1e-06: error 0"]
     text = words(figure)
-    assert "first (samples)" in text and "second (tolerance)" in text
+    assert "first (samples)" in text and "second (tolerance)" in text and "third" not in text
+    assert text.count("one core") == 1
     assert "below 0.004 nats the reference itself is uncertain" in text
     assert "not drawn for want of a finite error and run time: 1" in text
     assert "Diagram (synthetic data)" in text
@@ -282,57 +287,88 @@ def test_the_diagram_is_logarithmic_with_units_bars_and_knob_values(tmp_path: Pa
 
 
 def test_rings_mark_the_pareto_points_of_all_methods() -> None:
-    (rings,) = lines_with(work_precision(CURVES, title="", synthetic=False), markersize=13)
-    best = [*CURVES["first"], CURVES["second"][1]]
-    assert rings.get_xdata() == pytest.approx([point.milliseconds for point in best])
+    (rings,) = lines_with(diagram(CURVES), markersize=13)
+    assert rings.get_xdata() == pytest.approx([row["ms"] for row in [*FIRST, SECOND[1]]])
 
 
 def test_everything_drawn_stands_inside_the_axes_and_bars_show_standard_errors() -> None:
-    figure = work_precision({"first": CURVES["first"]}, title="", synthetic=False, reference_error=1e-3)
-    axes = figure.axes[0]
+    axes = diagram(FIRST, floors={"error": Floor(1e-3, "uncertain")}).axes[0]
     (bars,) = axes.containers[0].lines[2]
-    for point, (low, high) in zip(CURVES["first"], bars.get_segments(), strict=True):
-        assert high[1] - low[1] == pytest.approx(2 * point.error_sem)
+    for row, (low, high) in zip(FIRST, bars.get_segments(), strict=True):
+        assert high[1] - low[1] == pytest.approx(2 * row["error_sem"])
     bottom, top = axes.get_ylim()
     assert bottom < 1e-3 < top
-    assert bottom < min(point.error for point in CURVES["first"])
+    assert bottom < min(row["error"] for row in FIRST)
+
+
+@pytest.mark.parametrize("height, seen", [(0.0, False), (1e-30, False), (1e-3, True), (2.0, True)])
+def test_a_reference_known_to_rounding_does_not_stretch_the_diagram(height: float, seen: bool) -> None:
+    axes = diagram(FIRST, floors={"error": Floor(height, "uncertain")}).axes[0]
+    bottom, top = axes.get_ylim()
+    assert bottom > 1e-5 and top > height
+    assert bool(axes.patches) is seen
+
+
+def test_narrow_errors_fill_their_panel_and_negative_ones_are_not_logarithmic() -> None:
+    axes = diagram(curve("first", "members", [(1, 0.30, 0.01, 1.0), (2, 0.29, 0.01, 2.0)])).axes[0]
+    bottom, top = axes.get_ylim()
+    assert axes.get_yscale() == "log" and 0.25 < bottom < 0.28 and 0.31 < top < 0.33
+    below_zero = curve("first", "members", [(1, 0.3, 0.01, 1.0), (2, -0.1, 0.01, 2.0)])
+    assert diagram(below_zero).axes[0].get_yscale() == "linear"
+
+
+def test_several_numbers_have_a_panel_each(tmp_path: Path) -> None:
+    rows = [{**row, "accuracy": 0.9, "nll": 0.1 * row["error"]} for row in FIRST]
+    labels = {"error": "error", "accuracy": "accuracy", "nll": "NLL", "error_sem": "its error"}
+    figure = error_against_run_time(
+        rows,
+        labels,
+        {"error": "lower", "nll": "lower", "accuracy": "higher", "error_sem": "lower"},
+        title="t",
+        synthetic=True,
+        time="ms",
+    )
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_ylabel() for axes in shown] == list(labels.values())
+    assert [axes.get_yscale() for axes in shown] == ["log", "linear", "log", "log"]
+    assert figure.get_suptitle() == "t (synthetic data)"
+    assert words(figure).count("first (samples)") == 1
+    drawn(figure, tmp_path)
 
 
 def test_knob_values_do_not_cover_each_other() -> None:
-    crowded = [
-        Point("samples", value, 0.1 * (1 + 0.02 * value), 0.001, 1 + 0.002 * value) for value in range(1, 7)
-    ]
-    figure = work_precision({"first": crowded, "second": CURVES["first"]}, title="", synthetic=False)
+    points = [(value, 0.1 * (1 + 0.02 * value), 0.001, 1 + 0.002 * value) for value in range(1, 7)]
+    figure = diagram([*curve("crowded", "samples", points), *FIRST])
     boxes = [text.get_window_extent() for text in figure.axes[0].texts if isinstance(text, Annotation)]
     assert len(boxes) == 9
     assert not any(box.overlaps(other) for index, box in enumerate(boxes) for other in boxes[:index])
 
 
 @pytest.mark.parametrize(
-    "curves",
+    "points",
     [
-        {},
-        {"nothing": []},
-        {"exact": [Point("members", 1, 0.0, 0.0, 1.0)]},
-        {"lost": [Point("members", 1, math.inf, math.nan, 1.0)]},
-        {"wide": [Point("samples", 10**n, 10.0**-n, 0.0, 10.0**n) for n in range(9)]},
-        {"equal": [Point("samples", n, 0.5, 0.0, 2.0) for n in range(3)]},
+        [],
+        [(1, 0.0, 0.0, 1.0)],
+        [(1, math.inf, math.nan, 1.0)],
+        [(10**n, 10.0**-n, 0.0, 10.0**n) for n in range(9)],
+        [(n, 0.5, 0.0, 2.0) for n in range(3)],
     ],
+    ids=["nothing", "exact", "lost", "wide", "equal"],
 )
-def test_odd_diagrams_are_drawn(curves: dict[str, list[Point]], tmp_path: Path) -> None:
-    figure = work_precision(curves, title="odd", synthetic=False)
+def test_odd_diagrams_are_drawn(points: list[tuple[float, float, float, float]], tmp_path: Path) -> None:
+    figure = diagram(curve("odd", "samples", points), title="odd")
     drawn(figure, tmp_path)
     assert all(re.fullmatch(r"[\d.e+-]*", label.get_text()) for label in figure.axes[0].get_xticklabels())
 
 
 def test_a_narrow_range_of_times_still_has_ticks() -> None:
-    points = [Point("samples", n, 0.5 / n, 0.0, 1.1 + 0.01 * n) for n in (1, 2, 3)]
-    axes = work_precision({"first": points}, title="", synthetic=False).axes[0]
+    points = [(n, 0.5 / n, 0.0, 1.1 + 0.01 * n) for n in (1, 2, 3)]
+    axes = diagram(curve("first", "samples", points)).axes[0]
     low, high = axes.get_xlim()
     assert sum(low <= tick <= high for tick in axes.get_xticks()) >= 2
 
 
-# comparisons
+# results side by side
 
 ROWS = [
     {"method": method, "class": name, "error": error, "error_std": 0.5, "ms": time}
@@ -344,12 +380,11 @@ ROWS = [
         ("b", "bus", 9.5, 2.0),
     ]
 ]
-LABELS = {"x_label": "run time (ms)", "y_label": "error (°)", "title": "Comparison"}
 
 
 def test_comparison_gives_methods_colours_and_groups_markers(tmp_path: Path) -> None:
     rows = [*ROWS, {"method": "broken", "class": "car", "error": None, "ms": 1.0}]
-    figure = comparison(rows, "error", "ms", group="class", synthetic=True, **LABELS)
+    figure = diagram(rows, group="class", synthetic=True, title="Comparison")
     (axes,) = figure.axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     points = [container.lines[0] for container in axes.containers]
@@ -375,15 +410,15 @@ def test_comparison_gives_methods_colours_and_groups_markers(tmp_path: Path) -> 
 
 
 def test_comparison_rings_the_front_of_each_group() -> None:
-    figure = comparison(ROWS, "error", "ms", group="class", synthetic=False, **LABELS)
+    figure = diagram(ROWS, group="class")
     rings = [line.get_xydata().tolist() for line in lines_with(figure, markersize=13)]
     assert rings == [[[1, 5], [2, 4]], [[1, 9]]]
-    together = comparison(ROWS, "error", "ms", synthetic=False, **LABELS)
+    together = diagram(ROWS)
     assert [line.get_xydata().tolist() for line in lines_with(together, markersize=13)] == [[[1, 5], [2, 4]]]
 
 
 def test_higher_is_better_turns_the_front_and_keeps_a_linear_axis() -> None:
-    figure = comparison(ROWS, "error", "ms", group="class", synthetic=False, better="higher", **LABELS)
+    figure = diagram(ROWS, group="class", better={"error": "higher"})
     assert figure.axes[0].get_yscale() == "linear"
     rings = [line.get_xydata().tolist() for line in lines_with(figure, markersize=13)]
     assert rings == [[[1, 5], [3, 6]], [[1, 9], [2, 9.5]]]
@@ -393,7 +428,7 @@ def test_higher_is_better_turns_the_front_and_keeps_a_linear_axis() -> None:
     "rows", [[], ROWS[:1], [{"method": "a", "error": -1.0, "ms": 2.0, "error_sem": math.nan}]]
 )
 def test_odd_comparisons_are_drawn(rows: list[dict], tmp_path: Path) -> None:
-    drawn(comparison(rows, "error", "ms", synthetic=False, **LABELS), tmp_path)
+    drawn(diagram(rows), tmp_path)
 
 
 def test_many_methods_and_classes_stay_apart(tmp_path: Path) -> None:
@@ -402,7 +437,7 @@ def test_many_methods_and_classes_stay_apart(tmp_path: Path) -> None:
         for m in range(9)
         for c in range(12)
     ]
-    figure = comparison(rows, "error", "ms", group="class", synthetic=False, **LABELS)
+    figure = diagram(rows, group="class")
     looks = {
         (point.get_color(), point.get_markerfacecolor(), point.get_marker())
         for point in (container.lines[0] for container in figure.axes[0].containers)
@@ -415,7 +450,8 @@ def test_tables_import_no_torch_costs_no_matplotlib_and_pictures_no_pyplot() -> 
     code = (
         "import sys, framework.reports.table; assert not {'torch', 'matplotlib'} & set(sys.modules)\n"
         "import framework.evaluation.cost; assert 'matplotlib' not in sys.modules\n"
-        "import framework.reports.pictures; assert 'matplotlib.pyplot' not in sys.modules"
+        "from framework.reports import tradeoff_picture, viewing_circles, training_curve, class_picture\n"
+        "from framework.reports import landscape_picture; assert 'matplotlib.pyplot' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -1,40 +1,58 @@
-"""Any metric against run time as a knob is turned: how much an ensemble's next member or a further pass buys."""
+"""Error against run time as a knob is turned: any metric, and the error of log-likelihoods against a reference."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+import statistics
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache
+from time import perf_counter
+from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
-from framework.evaluation.cost import device_name
+from framework.evaluation.cost import device_name, seconds
+from framework.evaluation.pareto import front
+from framework.evaluation.reference import COLUMNS, LogProbs, Reference, errors, reference_value
 from framework.evaluation.splits import evaluate
-from framework.evaluation.work_precision import front, run_times
 from framework.metric import Metric
-from framework.model import Predictor
-from framework.reports import table
+from framework.model import Model, Predictor
 from framework.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True)
-class Turn:
+class Point:
     """What one value of a knob gives.
 
     Attributes:
         value: where the knob stood.
-        metrics: by name, averaged over repeats.
-        spreads: their standard deviations over the repeats; NaN for one.
+        numbers: of each metric "<key>", its mean over the repeats, and "<key>_std", their standard deviation; and
+            what `framework.evaluation.reference.errors` tells.
         milliseconds: median wall time per sample, from input to log-likelihood.
     """
 
     value: int
-    metrics: Mapping[str, float]
-    spreads: Mapping[str, float]
+    numbers: Mapping[str, float]
     milliseconds: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The points of one method, in the order of the knob's values, and how they were measured."""
+
+    knob: str
+    points: list[Point]
+    reference: Reference | None
+    repeats: int
+    samples: int
+    batch_size: int
+    device: str
+    threads: int
 
 
 def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
@@ -45,7 +63,7 @@ def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
     """
     if not knob:
         return []
-    parts = [part for part in predictor.modules() if isinstance(part, Uncertainty | DensityHead)]
+    parts = parts_with_knobs(predictor)
     found = [part for part in parts if knob in part.knobs]
     if not found:
         known = sorted({name for part in parts for name in part.knobs})
@@ -57,129 +75,231 @@ def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
     return list(wrappers) or list(found)
 
 
+def first_knob(predictor: Predictor) -> str:
+    """The knob of the outermost part that has one.
+
+    Raises:
+        ConfigError: no part has one.
+    """
+    for part in parts_with_knobs(predictor):
+        return next(iter(part.knobs))
+    raise ConfigError("No part of this model has a knob: there is nothing to trade for run time.")
+
+
+def parts_with_knobs(predictor: Predictor) -> list[Uncertainty | DensityHead]:
+    """Wrappers and heads that have knobs, from the outermost to the innermost."""
+    parts = [part for part in predictor.modules() if isinstance(part, Uncertainty | DensityHead)]
+    return [part for part in parts if part.knobs]
+
+
 def tradeoff(
     predictor: Predictor,
-    batches: Sequence[Batch],
-    metrics: Sequence[Metric],
+    batches: Iterable[Batch],
+    metrics: Sequence[Metric] = (),
     *,
     knob: str,
     values: Sequence[int],
-    samples: int,
-    seed: int,
+    reference: int | None = None,
+    samples: int = 1,
     repeats: int = 5,
+    seed: int = 0,
     timed_calls: int = 20,
     budget_seconds: float = 20.0,
-) -> list[Turn]:
-    """The curve of one trained predictor; its knob, its mode and torch's random numbers are left as they were.
+) -> Curve:
+    """The curve of one trained predictor: metrics, and errors against a reference, for each value of its knob.
+
+    The times are those of the whole predictor, input to log-likelihood, on the first batch. The predictor, its knob
+    and torch's random numbers are left as they were.
 
     Args:
-        batches: labelled, on the predictor's device; the first is also the one that is timed.
+        batches: labelled, on the predictor's device.
+        knob: as of `owners`.
+        values: of the knob, to be tried.
+        reference: a value so large that its own error does not matter, at least the largest of `values`; None where
+            nothing is compared with a reference.
         samples: as of `Prediction`.
-        seed: of the first repeat; the others follow it.
-        timed_calls, budget_seconds: as of `framework.evaluation.work_precision.run_times`.
+        repeats: seeds for each value and for the reference, which needs two.
+        seed: of all random numbers.
+        timed_calls, budget_seconds: as of `run_times`.
 
     Raises:
-        ConfigError: no batch, no value, or no such knob.
+        ConfigError: no batch, no value, no such knob, a reference below the largest value or too few repeats for it.
     """
-    if not batches or not values:
-        raise ConfigError(
-            f"wanted batches and values of {knob} to try, got {len(batches)} and {len(values)}."
+    kept, parts = list(batches), owners(predictor, knob)
+    _check(kept, parts, knob, values, reference, repeats)
+    inputs, target = kept[0]["input"], kept[0]["target"]
+
+    def turn(value: int) -> None:
+        for part in parts:
+            setattr(part, knob, value)
+
+    def predict(value: int) -> None:
+        turn(value)
+        predictor(inputs).log_prob(target)
+
+    def measured(value: int, repeat: int) -> dict[str, float]:
+        turn(value)
+        found = evaluate(
+            predictor,
+            kept,
+            metrics,
+            groups=("all",),
+            samples=samples,
+            seed=seed + repeat,
+            device=inputs.device,
         )
-    inputs, target = batches[0]["input"], batches[0]["target"]
-    with _undisturbed(predictor, knob), torch.no_grad():
-        found = []
-        for value in values:
-            _turn(predictor, knob, value)
-            runs = [
-                evaluate(
-                    predictor,
-                    batches,
-                    metrics,
-                    groups=("all",),
-                    samples=samples,
-                    seed=seed + repeat,
-                    device=inputs.device,
-                ).total
-                for repeat in range(repeats)
-            ]
-            found.append(runs)
+        return found.total
 
-        def predict(value: int) -> None:
-            _turn(predictor, knob, value)
-            predictor(inputs).log_prob(target)
-
+    points: list[Point] = []
+    with _undisturbed(predictor, parts, knob, inputs.device), torch.no_grad():
+        # no two estimates share random numbers
+        *own, last = (
+            _seeds(stream, repeats) for stream in np.random.SeedSequence(seed).spawn(len(values) + 1)
+        )
+        log_probs, compared = _log_probs(predictor, kept, turn), None
+        if reference is not None:
+            compared = reference_value(log_probs, reference, last)
         taken = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
-    return [
-        Turn(value, _over(runs, _mean), _over(runs, _spread), 1e3 * seconds / len(inputs))
-        for value, runs, seconds in zip(values, found, taken, strict=True)
-    ]
+        for value, seeds, time in zip(values, own, taken, strict=True):
+            numbers = averaged([measured(value, repeat) for repeat in range(repeats)]) if metrics else {}
+            if compared is not None:
+                numbers |= errors(log_probs, value, seeds, compared)
+            points.append(Point(value, numbers, 1e3 * time / len(inputs)))
+    count = sum(len(batch["input"]) for batch in kept)
+    device, threads = device_name(inputs.device), torch.get_num_threads()
+    return Curve(knob, points, compared, repeats, count, len(inputs), device, threads)
 
 
-def rows(
-    curves: Mapping[str, Sequence[Turn]], keys: Sequence[str], lower: Mapping[str, bool], *, synthetic: bool
-) -> list[dict[str, object]]:
-    """A row per method and value, for `framework.reports.table`, with a column "<key>_pareto" for each metric.
+def averaged(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Of each number its mean over the runs and, as "<key>_std", its standard deviation; NaN of one run.
 
-    Args:
-        keys: the metrics to tell of.
-        lower: whether less of it is better.
+    The standard errors "<key>_sem" over the samples of a run are left out.
     """
-    found: list[dict[str, object]] = []
-    for method, turns in curves.items():
-        times = [turn.milliseconds for turn in turns]
-        best = {
-            key: front([turn.metrics[key] * (1 if lower[key] else -1) for turn in turns], times)
-            for key in keys
-        }
-        for index, turn in enumerate(turns):
-            row: dict[str, object] = {"method": method, "value": turn.value}
-            for key in keys:
-                row |= {key: turn.metrics[key], f"{key}_std": turn.spreads[key]}
-                row[f"{key}_pareto"] = best[key][index]
-            row |= {"milliseconds_per_sample": turn.milliseconds, "synthetic": synthetic}
-            found.append(row)
+    found: dict[str, float] = {}
+    for key in (key for key in runs[0] if not key.endswith("_sem")):
+        numbers = [run[key] for run in runs]
+        found[key] = float(np.mean(numbers))
+        found[f"{key}_std"] = float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan
     return found
 
 
-def write(found: Sequence[Mapping[str, object]], path: Path) -> None:
-    """Write all columns as CSV."""
-    keys = [key for key in found[0] if not key.endswith("_std")]
-    table.csv(found, {key: key for key in keys}, path)
+def run_times(
+    predict: Callable[[int], object],
+    values: Sequence[int],
+    device: torch.device,
+    *,
+    calls: int = 20,
+    budget_seconds: float = 20.0,
+) -> list[float]:
+    """Median wall time of `predict(value)` for each value, seconds, after two calls to warm up.
+
+    The values take turns, so that a machine that slows down meanwhile slows all of them; an untimed call goes
+    before each timed one, so that none pays for the caches its neighbour left behind. Where turns would last
+    longer than `budget_seconds`, there are fewer than `calls`, but three.
+    """
+    taken: list[list[float]] = [[] for _ in values]
+    start = perf_counter()
+    for turn in range(calls + 1):
+        for value, times in zip(values, taken, strict=True):
+            predict(value)
+            time = seconds(lambda value=value: predict(value), device)
+            if turn > 0:  # the first turn is to warm up
+                times.append(time)
+        if turn >= 3 and perf_counter() - start > budget_seconds:
+            break
+    return [statistics.median(times) for times in taken]
 
 
-def _turn(predictor: Predictor, knob: str, value: int) -> None:
-    for part in owners(predictor, knob):
-        setattr(part, knob, value)
+def rows(
+    curves: Mapping[str, Curve], better: Mapping[str, Literal["higher", "lower"]], *, synthetic: bool
+) -> list[dict[str, object]]:
+    """A row per method and value, for a result table; every number that has a unit has it in its key.
+
+    Args:
+        better: the metrics to tell of, and which way they are better; each gets a column "<key>_pareto".
+    """
+    told = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
+    found: list[dict[str, object]] = []
+    for method, curve in curves.items():
+        times = [point.milliseconds for point in curve.points]
+        best = {}
+        for key, way in better.items():
+            sign = 1 if way == "lower" else -1
+            best[f"{key}_pareto"] = front([sign * point.numbers[key] for point in curve.points], times)
+        circumstances: dict[str, object] = {"repeats": curve.repeats}
+        if curve.reference is not None:
+            circumstances["reference_value"] = curve.reference.value
+            circumstances["reference_log_likelihood_nats"] = curve.reference.mean
+            circumstances["reference_log_likelihood_nats_sem"] = curve.reference.standard_error
+        circumstances |= {"samples": curve.samples, "batch_size": curve.batch_size}
+        circumstances |= {"device": curve.device, "threads": curve.threads, "synthetic": synthetic}
+        for index, point in enumerate(curve.points):
+            row: dict[str, object] = {"method": method, "value": point.value, "knob": curve.knob}
+            row |= {key: number for key, number in point.numbers.items() if key in told}
+            row |= {key: kept[index] for key, kept in best.items()}
+            found.append({**row, "milliseconds_per_sample": point.milliseconds, **circumstances})
+    return found
 
 
-def _over(runs: Sequence[Mapping[str, float]], of: Callable[[list[float]], float]) -> dict[str, float]:
-    return {key: of([run[key] for run in runs]) for key in runs[0]}
+def _log_probs(predictor: Predictor, batches: Sequence[Batch], turn: Callable[[int], None]) -> LogProbs:
+    def unchanged(inputs: Tensor) -> Tensor:
+        return inputs
+
+    density, read = (
+        (predictor.head, predictor.raw) if isinstance(predictor, Model) else (predictor, unchanged)
+    )
+
+    @cache  # the encoder of a model runs once, since the knob is the head's
+    def pairs() -> list[tuple[Tensor, Tensor]]:
+        return [(read(batch["input"]), batch["target"]) for batch in batches]
+
+    def log_probs(value: int, seed: int) -> Tensor:
+        turn(value)
+        torch.manual_seed(seed)
+        return torch.cat([density(numbers).log_prob(target) for numbers, target in pairs()])
+
+    return log_probs
 
 
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values))
-
-
-def _spread(values: Sequence[float]) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+def _check(
+    batches: Sequence[Batch],
+    parts: Sequence[Uncertainty | DensityHead],
+    knob: str,
+    values: Sequence[int],
+    reference: int | None,
+    repeats: int,
+) -> None:
+    if not batches:
+        raise ConfigError("Error against run time is measured on at least one batch, got none.")
+    if not values:
+        worth = f"; those of {type(parts[0]).__name__} worth trying: {parts[0].knobs[knob]}" if parts else ""
+        raise ConfigError(f"No values of {knob} to try{worth}.")
+    if reference is None:
+        return
+    if reference < max(values):
+        raise ConfigError(
+            f"The reference {knob}={reference} is below the largest value tried, {max(values)}; wanted more."
+        )
+    if repeats < 2:
+        raise ConfigError(f"repeats = {repeats}: two at least are needed to know an error's error.")
 
 
 @contextmanager
-def _undisturbed(predictor: Predictor, knob: str) -> Iterator[None]:
+def _undisturbed(
+    predictor: Predictor, parts: Sequence[Uncertainty | DensityHead], knob: str, device: torch.device
+) -> Iterator[None]:
     """Evaluation mode inside; afterwards mode, knob and random numbers are as before."""
     training = predictor.training
-    before = [(part, getattr(part, knob)) for part in owners(predictor, knob)]
-    device = next(predictor.parameters()).device
+    before = [getattr(part, knob) for part in parts]
     try:
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             predictor.eval()
             yield
     finally:
-        for part, value in before:
+        for part, value in zip(parts, before, strict=True):
             setattr(part, knob, value)
         predictor.train(training)
 
 
-def device_note(predictor: Predictor) -> str:
-    """What it ran on, for a caption."""
-    return f"{device_name(next(predictor.parameters()).device)}, {torch.get_num_threads()} threads"
+def _seeds(stream: np.random.SeedSequence, count: int) -> list[int]:
+    return [int(seed) for seed in stream.generate_state(count, np.uint64) >> np.uint64(1)]

@@ -1,27 +1,25 @@
 """mode=work_precision: error against run time along a declared knob of a trained model."""
 
-from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
-import torch
 from pydantic import Field
-from rich.console import Console
 
-from framework.configuration.assembly import build_metrics
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Positive
-from framework.data import Batch, Data
+from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
+from framework.evaluation import reference
 from framework.evaluation.splits import on_device
-from framework.evaluation.work_precision import COLUMNS, rows, work_precision, write
-from framework.model import Model, Predictor
+from framework.evaluation.tradeoff import first_knob, owners, rows, tradeoff
+from framework.metric import Metric
 from framework.reports.report import picture
-from framework.reports.table import results_table
+from framework.reports.table import Better, csv, results_table
 from framework.runs.run import Run, opened
 from framework.runs.session import Session, for_trained
-from framework.training.batches import Batches
-from framework.uncertainty import Uncertainty
+
+ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
+"""What is drawn of a head's knob where no metrics are named, and the label of its axis."""
 
 
 class WorkPrecisionOptions(Options):
@@ -45,122 +43,94 @@ def run(config: Config) -> None:
 
 
 def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
-    from framework.reports import pictures
+    from framework.reports.tradeoff_picture import Floor, error_against_run_time
 
-    predictor, data, described = session.predictor, session.data, {"config": session.parts}
-    if options.metrics is not None or not isinstance(predictor, Model):
-        _metrics_against_time(run, options, predictor, data, described)
-        return
-    knobs = predictor.head.knobs
-    knob = options.knob or next(iter(knobs), "")
-    settings = run.settings
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    predictor.to(device)
-    kept = _kept(run, data, device, options.limit)
-    curve = work_precision(
+    predictor, data, parts, settings = session.predictor, session.data, session.parts, session.settings
+    metrics = [metric for metric in session.metrics if "outliers" not in metric.splits]
+    knob = options.knob or first_knob(predictor)
+    owner = owners(predictor, knob)[0]
+    better = _chosen(options.metrics, metrics, own=isinstance(owner, DensityHead))
+    measured = [key for key in better if key not in reference.COLUMNS]
+    compared = len(measured) < len(better)
+    predictor.to(session.device)
+    curve = tradeoff(
         predictor,
-        kept,
+        _kept(session, options.limit),
+        metrics if measured else (),
         knob=knob,
-        values=options.values or knobs.get(knob, ()),
-        reference=options.reference,
+        values=options.values or owner.knobs[knob],
+        reference=options.reference if compared else None,
+        samples=settings.samples,
         repeats=options.repeats,
         seed=settings.seed,
     )
-    name = described["config"]["density_head"]["name"]
+    name = " + ".join([parts["density_head"]["name"], *(part["name"] for part in parts["uncertainty"])])
+    found = rows({name: curve}, better, synthetic=data.synthetic)
     path = run.folder / "work_precision.csv"
-    write({name: curve}, path, synthetic=data.synthetic)
+    csv(found, None, path)
     run.tracker.log_artifact(path)
-    for point in curve.points:
-        numbers = {key: value for key, value in asdict(point).items() if isinstance(value, float)}
+    for row, point in zip(found, curve.points, strict=True):
+        numbers = {key: value for key, value in point.numbers.items() if key in row}
+        numbers["milliseconds"] = point.milliseconds
         run.tracker.log_metrics(
-            {f"work_precision/{key}": value for key, value in numbers.items()}, int(point.value), 0
+            {f"work_precision/{key}": value for key, value in numbers.items()}, point.value, 0
         )
-    figure = pictures.work_precision(
-        {name: curve.points},
-        title=f"{name} on {', '.join(data.groups)}: error against run time along {knob}",
+    headings = {key: heading for metric in metrics for key, heading in metric.columns.items()}
+    headings = (reference.COLUMNS if compared else {}) | {key: headings[key] for key in measured}
+    floors = {}
+    if curve.reference is not None:
+        error = curve.reference.standard_error
+        floors[ERROR] = Floor(error, f"below {error:.1g} nats the reference itself is uncertain")
+    figure = error_against_run_time(
+        found,
+        {key: AXIS if key == ERROR else headings[key] for key in better},
+        better,
+        title=f"{name} on {', '.join(data.groups)}: {'metrics' if measured else 'error'} against run time along {knob}",
         synthetic=data.synthetic,
-        reference_error=curve.reference.standard_error,
+        floors=floors,
+        note=f"{curve.device}, {curve.threads} threads",
     )
     where = picture(run, figure, "work_precision.png")
-    console = Console()
-    console.print(
-        results_table(
-            rows({name: curve}, synthetic=data.synthetic), COLUMNS, title=f"{name}: {curve.samples} samples"
-        )
-    )
+    columns = {"method": "method", "value": knob, **headings, "milliseconds_per_sample": "ms / sample"}
+    for key in better:
+        columns[f"{key}_pareto"] = "Pareto" if len(better) == 1 else f"Pareto: {headings[key]}"
+    console = session.console
+    console.print(results_table(found, columns, title=f"{name}: {curve.samples} samples"))
     console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)
 
 
-def _kept(run: Run, data: Data, device: torch.device, limit: int) -> list[Batch]:
+def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:
+    """The keys to measure, and which way they are better.
+
+    Args:
+        names: the keys asked for; None: the error against a reference, or every metric where the knob is not the
+            model's `own`, its head's.
+
+    Raises:
+        ConfigError: nothing of such a name says which way it is better.
+    """
+    known: dict[str, Literal["higher", "lower"]] = {
+        key: metric.better[key] for metric in metrics for key in metric.columns if key in metric.better
+    }
+    keys = names or ([ERROR] if own else list(known))
+    known |= reference.BETTER
+    for key in keys:
+        if key not in known:
+            raise ConfigError(
+                f"mode.metrics: no metric gives {key!r} and says which way it is better.{did_you_mean(key, known)} "
+                f"There are: {', '.join(known)}."
+            )
+    if not keys:
+        raise ConfigError("No metric says which way it is better; choose some with metric=[...].")
+    return {key: known[key] for key in keys}
+
+
+def _kept(session: Session, limit: int) -> list[Batch]:
     """The first `limit` test samples, in batches."""
-    settings = run.settings
-    batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=settings.seed)
     kept, seen = [], 0
-    for batch in on_device(batches.test_dataloader(), device):
+    for batch in on_device(session.batches().test_dataloader(), session.device):
         kept.append({name: tensor[: limit - seen] for name, tensor in batch.items()})
         seen += len(kept[-1]["index"])
         if seen >= limit:
             break
     return kept
-
-
-def _metrics_against_time(
-    run: Run, options: WorkPrecisionOptions, predictor: Predictor, data: Data, described: dict[str, Any]
-) -> None:
-    """The metrics of the test split themselves, where there is no reference to be off from: of wrappers, say."""
-    from framework.evaluation import tradeoff
-    from framework.reports import tradeoff_picture
-
-    config = described["config"]
-    metrics = [metric for metric in build_metrics(config, data.target) if "outliers" not in metric.splits]
-    headings = {key: heading for metric in metrics for key, heading in metric.columns.items()}
-    lower = {key: way == "lower" for metric in metrics for key, way in metric.better.items()}
-    keys = options.metrics or [key for key in headings if key in lower]
-    for key in keys:
-        if key not in lower:
-            raise ConfigError(
-                f"mode.metrics: no metric gives {key!r} and says which way it is better.{did_you_mean(key, lower)} "
-                f"There are: {', '.join(lower) or 'none; choose some with metric=[...]'}."
-            )
-    parts = [part for part in predictor.modules() if isinstance(part, Uncertainty | DensityHead)]
-    knob = options.knob or next((name for part in parts for name in part.knobs), "")
-    values = options.values or tradeoff.owners(predictor, knob)[0].knobs[knob]
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    predictor.to(device)
-    turns = tradeoff.tradeoff(
-        predictor,
-        _kept(run, data, device, options.limit),
-        metrics,
-        knob=knob,
-        values=values,
-        samples=run.settings.samples,
-        seed=run.settings.seed,
-        repeats=options.repeats,
-    )
-    name = " + ".join([config["density_head"]["name"], *(part["name"] for part in config["uncertainty"])])
-    found = tradeoff.rows({name: turns}, keys, lower, synthetic=data.synthetic)
-    path = run.folder / "work_precision.csv"
-    tradeoff.write(found, path)
-    run.tracker.log_artifact(path)
-    for turn in turns:
-        numbers = {**{key: turn.metrics[key] for key in keys}, "milliseconds": turn.milliseconds}
-        run.tracker.log_metrics(
-            {f"work_precision/{key}": value for key, value in numbers.items()}, turn.value, 0
-        )
-    figure = tradeoff_picture.tradeoff(
-        {name: turns},
-        {key: headings[key] for key in keys},
-        title=f"{name} on {', '.join(data.groups)}: metrics against run time along {knob}",
-        synthetic=data.synthetic,
-        note=tradeoff.device_note(predictor),
-    )
-    where = picture(run, figure, "work_precision.png")
-    console = Console()
-    columns = {
-        "method": "method",
-        "value": knob,
-        **{key: headings[key] for key in keys},
-        "milliseconds_per_sample": "ms / sample",
-    }
-    console.print(results_table(found, columns, title=f"{name}: {options.limit} samples at most"))
-    console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)

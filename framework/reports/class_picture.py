@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from framework.figures.style import BLUE, GREEN, GREY, RED, titled_figure
+from framework.figures.style import BLUE, GREEN, RED
+from framework.reports.sample_sheet import sample_sheet
 
 LISTED = 3
 """Classes named below each sample."""
@@ -66,22 +67,11 @@ def classified(
         names: of the classes.
         rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
     """
-    across = max(4, *rows.values())
-    tall = [size for count in rows.values() for size in ((2.0, 0.8) if count else (0.3, 0.05))]
-    figure = titled_figure((1.75 * across + 0.4, 0.62 * sum(tall) + 1.2), title, synthetic)
-    panels = figure.subplots(2 * len(rows), across, squeeze=False, height_ratios=tall)
-    for axes in panels.flat:
-        axes.set(xticks=[], yticks=[], frame_on=False)
-    sample = 0
-    for line, (heading, count) in enumerate(rows.items()):
-        above, below = panels[2 * line], panels[2 * line + 1]
-        above[0].set_ylabel(heading, fontsize=11, weight="bold")
-        if count == 0:
-            above[0].text(0.5, 0.5, "no such sample", ha="center", va="center", color=GREY)
-        for top, bottom in zip(above[:count], below[:count], strict=True):
-            top.imshow(images[sample])
-            _bars(bottom, probability[sample], int(label[sample]), names)
-            sample += 1
+    size = {"least": 4, "width": 1.75, "heights": (1.24, 0.496), "flat": (0.186, 0.031), "margin": 1.2}
+    figure, panels = sample_sheet(rows, **size, title=title, synthetic=synthetic)
+    for sample, (above, below) in enumerate(panels):
+        above.imshow(images[sample])
+        _bars(below, probability[sample], int(label[sample]), names)
     handles = [
         Patch(color=GREEN, alpha=0.5, label="true class"),
         Patch(color=RED, alpha=0.5, label="wrong, and the likeliest"),

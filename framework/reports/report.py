@@ -2,35 +2,26 @@
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from rich.console import Console
-from torch.utils.data import Subset
 
 from framework.configuration.assembly import Resolved
-from framework.data import Batch, Data
-from framework.distributions.circular import angular_distance
-from framework.distributions.class_probabilities import class_probabilities
-from framework.distributions.density import circular_entropy, circular_grid
+from framework.data import Data
 from framework.evaluation.cost import Cost
-from framework.evaluation.splits import Evaluation, cost, evaluate, on_device
+from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.metric import Metric, Pictured
 from framework.model import Predictor
-from framework.prediction import Prediction
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table
 from framework.runs.run import Run, stored_overrides
 from framework.training.batches import Batches
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-PICTURED = 128
-"""How many test samples the gallery of predicted densities is chosen from."""
 
 
 def report_test(
@@ -69,22 +60,16 @@ def report_test(
     results["synthetic"] = synthetic
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
-    step = 0
-    run.tracker.log_metrics({f"test/{key}": value for key, value in found.total.items()}, step, 0)
-    for name, numbers in found.groups.items():
-        run.tracker.log_metrics({f"test/{name}/{key}": value for key, value in numbers.items()}, step, 0)
-    run.tracker.log_metrics(
-        {
-            f"cost/{key}": float(value)
-            for key, value in asdict(spent).items()
-            if isinstance(value, int | float)
-        },
-        step,
-        0,
-    )
+    numbers = {key: float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)}
+    groups = {f"test/{name}": some for name, some in found.groups.items()}
+    for part, values in {"test": found.total, **groups, "cost": numbers}.items():
+        run.tracker.log_metrics({f"{part}/{key}": value for key, value in values.items()}, 0, 0)
     run.tracker.log_artifact(path)
     if settings.pictures:
-        for name, figure in _pictures(run, predictor, data, batches, outliers, device, results):
+        from framework.reports.prediction_pictures import prediction_pictures
+
+        options = {"samples": settings.samples, "caption": results["method"]}
+        for name, figure in prediction_pictures(predictor, data, batches, outliers, device, **options):
             picture(run, figure, name)
         for metric in found.metrics:
             if isinstance(metric, Pictured):
@@ -99,24 +84,6 @@ def report_test(
         results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
     )
     _next_steps(run, spent, console)
-
-
-def _pictures(
-    run: Run,
-    predictor: Predictor,
-    data: Data,
-    batches: Batches,
-    outliers: Data | None,
-    device: torch.device,
-    results: dict[str, Any],
-) -> Iterator[tuple[str, "Figure"]]:
-    """Those that the kind of data calls for, with their file names."""
-    if data.target.kind == "angle":
-        yield "predicted_densities.png", gallery(predictor, data, batches, device, run.settings.samples)
-    if data.target.kind == "class" and data.input_shape == (2,):
-        yield "landscape.png", landscape(predictor, data, outliers, device, results["method"])
-    elif data.target.kind == "class":
-        yield "classified.png", contact_sheet(predictor, data, batches, device)
 
 
 def _results(
@@ -161,7 +128,7 @@ def report_training(run: Run, *, kept_epoch: int, synthetic: bool) -> None:
     """The training curve, from the journal; nothing where pictures are not wanted."""
     if not run.settings.pictures:
         return
-    from framework.reports.pictures import training_curve
+    from framework.reports.training_curve import training_curve
 
     train: list[tuple[float, float]] = []
     validation: list[tuple[float, float]] = []
@@ -190,142 +157,6 @@ def picture(run: Run, figure: "Figure", name: str) -> Path:
     figure.savefig(path, dpi=110)
     run.tracker.log_artifact(path, "figures")
     return path
-
-
-@torch.no_grad()
-def gallery(
-    predictor: Predictor, data: Data, batches: Batches, device: torch.device, samples: int
-) -> "Figure":
-    """Predicted densities of the first angle on the viewing circle, over their images: certain, ambiguous, failed."""
-    from framework.reports.pictures import choose, viewing_circles
-
-    images: list[np.ndarray] = []
-    columns: dict[str, list[np.ndarray]] = {
-        "density": [],
-        "truth": [],
-        "point": [],
-        "entropy": [],
-        "error": [],
-        "symmetry": [],
-    }
-    angles = np.zeros(0)
-    for batch in on_device(batches.test_dataloader(), device):
-        if len(images) >= PICTURED:
-            break
-        angles = _collect(predictor, data, batch, samples, images, columns)
-    joined = {key: np.concatenate(value, axis=-1) for key, value in columns.items()}
-    chosen = choose(joined["entropy"], joined["error"], joined["density"])
-    order = [index for row in chosen.values() for index in row]
-    symmetry = joined["symmetry"][order]
-    return viewing_circles(
-        [images[index] for index in order],
-        joined["density"][:, order],
-        angles,
-        joined["truth"][order],
-        joined["point"][order],
-        [
-            _caption(
-                float(joined["entropy"][index]),
-                float(joined["error"][index]),
-                int(joined["symmetry"][index]),
-            )
-            for index in order
-        ],
-        modes=[
-            _modes(truth, int(fold)) for truth, fold in zip(joined["truth"][order], symmetry, strict=True)
-        ],
-        rows={name: len(row) for name, row in chosen.items()},
-        title=f"{', '.join(data.groups)}: predicted density of the {data.target.names[0]}",
-        synthetic=data.synthetic,
-    )
-
-
-@torch.no_grad()
-def contact_sheet(predictor: Predictor, data: Data, batches: Batches, device: torch.device) -> "Figure":
-    """Classified samples from all over the test split: certain, ambiguous, failed."""
-    from framework.reports.class_picture import choose_classified, classified
-
-    dataset = data.splits().test
-    length: int = len(dataset)  # pyright: ignore[reportArgumentType]
-    some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
-    inputs: list[torch.Tensor] = []
-    probabilities, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
-    for batch in on_device(batches.of(some), device):
-        probabilities.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
-        labels.append(batch["target"].cpu().numpy())
-        inputs.extend(batch["input"].cpu())
-    probability, label = np.concatenate(probabilities), np.concatenate(labels)
-    chosen = choose_classified(probability, label)
-    order = [index for row in chosen.values() for index in row]
-    return classified(
-        [data.picture(inputs[index]) for index in order],
-        probability[order],
-        label[order],
-        data.target.names,
-        rows={name: len(row) for name, row in chosen.items()},
-        title=f"{', '.join(data.groups)}: samples of the test split",
-        synthetic=data.synthetic,
-    )
-
-
-def landscape(
-    predictor: Predictor, data: Data, outliers: Data | None, device: torch.device, caption: str
-) -> "Figure":
-    """The probabilities of a classifier of two inputs over their plane, with test samples and outliers."""
-    from framework.reports.landscape_picture import Plane, half_width, landscapes, probabilities
-
-    points, labels = _points_of(data)
-    others = _points_of(outliers)[0] if outliers is not None else points[:0]
-    plane = Plane(points, labels, others, data.target.names, half_width(points, others))
-    return landscapes(
-        {caption: probabilities(predictor.cpu(), plane.half_width)},
-        plane,
-        title=f"{', '.join(data.groups)}: probability landscape",
-        synthetic=data.synthetic,
-    )
-
-
-def _points_of(data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs and targets of the first PICTURED test samples."""
-    dataset = data.splits().test
-    count = min(PICTURED, len(dataset))  # type: ignore[arg-type]
-    items = [dataset[index] for index in range(count)]
-    inputs = torch.stack([item["input"] for item in items]).numpy()
-    return inputs, torch.stack([item["target"] for item in items]).numpy()
-
-
-def _caption(entropy: float, error: float, symmetry: int) -> str:
-    note = {0: ", no true direction", 1: ""}.get(symmetry, f", {symmetry}-fold symmetric")
-    return f"error {math.degrees(error):.0f}°, entropy {entropy:.2f} nats{note}"
-
-
-def _collect(
-    predictor: Predictor,
-    data: Data,
-    batch: Batch,
-    samples: int,
-    images: list[np.ndarray],
-    columns: dict[str, list[np.ndarray]],
-) -> np.ndarray:
-    """Add a batch to the columns; the grid angles its densities are given at."""
-    prediction = Prediction(predictor(batch["input"]), batch, samples)
-    first = prediction.marginal(0)
-    images.extend(data.picture(item) for item in batch["input"].cpu())
-    angles, log_density = circular_grid(first)
-    columns["density"].append(log_density.cpu().numpy())
-    columns["entropy"].append(circular_entropy(first).cpu().numpy())
-    truth, point = batch["target"][:, 0], prediction.point[:, 0]
-    columns["truth"].append(truth.cpu().numpy())
-    columns["point"].append(point.cpu().numpy())
-    columns["error"].append(angular_distance(truth, point).cpu().numpy())
-    symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
-    columns["symmetry"].append(symmetry.cpu().numpy())
-    return angles.cpu().numpy()
-
-
-def _modes(truth: float, symmetry: int) -> np.ndarray:
-    """Every angle that is as right as the annotated one; none marked where all angles are."""
-    return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
 
 
 def _next_steps(run: Run, spent: Cost, console: Console) -> None:

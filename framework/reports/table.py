@@ -3,7 +3,7 @@
 import math
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from csv import writer
 from numbers import Integral
 from pathlib import Path
@@ -78,8 +78,14 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
     return f"{text}\n{caption}\n" if caption else text
 
 
-def csv(rows: Sequence[Row], columns: Mapping[str, str], path: Path) -> None:
-    """Write the columns under their keys, all digits, errors beside; what is not available is left empty."""
+def csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
+    """Write the columns under their keys, all digits, errors beside; what is not available is left empty.
+
+    Args:
+        columns: the keys, in order; None: all that any row has.
+    """
+    if columns is None:
+        columns = dict.fromkeys(key for row in rows for key in row if not key.endswith(tuple(SPREADS)))
     keys = [
         f"{key}{suffix}"
         for key in columns

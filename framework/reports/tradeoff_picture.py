@@ -1,57 +1,242 @@
-"""The picture of metrics against run time: a panel a metric, a curve a method, the knob's values beside the points."""
+"""Error against run time: a panel a metric, a colour a method; curves along a knob, or results side by side."""
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from framework.evaluation.tradeoff import Turn
+from framework.evaluation.pareto import front
 from framework.figures.style import COLOURS, GREY, MARKERS, titled_figure
+from framework.reports.table import SPREADS, Better, Row
+
+# where a word may stand beside its point, in order of preference, typographical points
+SIDES = ((9, 6), (9, -6), (-9, 6), (-9, -6), (0, 13), (0, -13), (12, 15), (12, -15), (-12, 15))
+
+Style = dict[str, Any]
+PARETO: Style = {"ls": "", "marker": "o", "mfc": "none", "markersize": 13, "mec": "black"}
+SHADE = "0.87"
+ACROSS = 3
+"""Panels beside each other, at most."""
 
 
-def tradeoff(
-    curves: Mapping[str, Sequence[Turn]],
-    keys: Mapping[str, str],
+@dataclass(frozen=True)
+class Floor:
+    """Below which number an error means nothing, and what the legend says of that."""
+
+    height: float
+    meaning: str
+
+
+@dataclass(frozen=True)
+class _Series:
+    """Rows that look alike: those of a method, or of a method in a group."""
+
+    method: str
+    group: str
+    rows: list[Row]
+    style: Style
+
+
+def error_against_run_time(
+    rows: Sequence[Row],
+    labels: Mapping[str, str],
+    better: Better,
     *,
     title: str,
     synthetic: bool,
+    time: str = "milliseconds_per_sample",
+    x_label: str = "run time (ms per sample)",
+    group: str | None = None,
+    floors: Mapping[str, Floor] | None = None,
     note: str = "",
 ) -> Figure:
-    """Every metric of `keys` against run time, which is logarithmic.
+    """Some numbers of each result against its run time, which is logarithmic; so is an error without negative values.
 
-    Bars are standard deviations over repeats. The knob's values stand beside the points of a method that has several.
+    Rows of a method that have a "knob" are joined in their order, and the knob's "value" stands beside each point.
+    Bars are a row's "<key>_std" or "<key>_sem". Rings mark the points that no other of the same group beats: errors
+    on different groups do not compare. On a logarithmic axis 0 sits on the lower edge and says so.
 
     Args:
-        keys: metric → label of its axis.
-        note: what it ran on.
+        rows: as for `framework.reports.table`, each with its "method".
+        labels: key → label of its axis.
+        better: which way a key is better; "lower" is an error.
+        time, group: keys; without `group` all rows are one. Up to 14 methods and 12 groups look different.
+        floors: of keys; shaded up to there.
+        note: what the run times were measured on.
     """
-    figure = titled_figure((5.4 * len(keys), 4.6), title, synthetic)
-    panels = figure.subplots(1, len(keys), squeeze=False)[0]
-    for axes, (key, label) in zip(panels, keys.items(), strict=True):
-        for index, (name, turns) in enumerate(curves.items()):
-            shown = [turn for turn in turns if math.isfinite(turn.metrics[key])]
-            style = {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}
-            times, found = [turn.milliseconds for turn in shown], [turn.metrics[key] for turn in shown]
-            spread = np.nan_to_num([turn.spreads[key] for turn in shown])
-            axes.errorbar(times, found, spread, label=name, capsize=2.5, markersize=5, **style)
-            if len(shown) > 1:
-                for turn in shown:
-                    axes.annotate(
-                        f"{turn.value}",
-                        (turn.milliseconds, turn.metrics[key]),
-                        (5, 4),
-                        textcoords="offset points",
-                        fontsize=7.5,
-                        color=style["color"],
-                    )
-        axes.set(xscale="log", xlabel="run time (ms per sample)", ylabel=label)
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(alpha=0.35)
-        axes.spines[["top", "right"]].set_visible(False)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    if note:
-        figure.text(0.995, 0.005, note, ha="right", va="bottom", fontsize=7, color=GREY)
+    across = min(ACROSS, len(labels))
+    down = -(-len(labels) // across)
+    size = (7.5, 5.2) if len(labels) == 1 else (5.4 * across, 4.3 * down + 0.6)
+    figure = titled_figure(size, title, synthetic)
+    panels = list(figure.subplots(down, across, squeeze=False).flat)
+    for axes in panels[len(labels) :]:
+        axes.set_visible(False)
+    series = _series([row for row in rows if any(_drawable(row, key, time) for key in labels)], group)
+    floors = floors or {}
+    words = []
+    for axes, (key, label) in zip(panels, labels.items(), strict=False):
+        axes.set(xscale="log", xlabel=x_label, ylabel=label)
+        words.append(_panel(axes, series, key, time, lower=better.get(key) == "lower", floor=floors.get(key)))
+        left_out = len(rows) - sum(_drawable(row, key, time) for row in rows)
+        if left_out:
+            text = f"not drawn for want of a finite error and run time: {left_out}"
+            axes.set_title(text, loc="right", fontsize=8, color=GREY)
+    _legends(figure, series, group, [floor.meaning for floor in floors.values() if floor.height > 0], note)
+    figure.draw_without_rendering()  # settles the layout, so that places on the page are known
+    for axes, (notes, lines) in zip(panels, words, strict=False):
+        _annotate(axes, notes, lines)
     return figure
+
+
+def _series(rows: Sequence[Row], group: str | None) -> list[_Series]:
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        kind = "" if group is None else str(row.get(group))
+        found.setdefault((str(row.get("method")), kind), []).append(row)
+    methods, kinds = (list(dict.fromkeys(names)) for names in zip(*found, strict=True)) if found else ([], [])
+    series = []
+    for (method, kind), members in found.items():
+        place = methods.index(method)
+        colour = COLOURS[place % len(COLOURS)]
+        style: Style = {
+            "color": colour,
+            "marker": MARKERS[(place if group is None else kinds.index(kind)) % len(MARKERS)],
+            "markerfacecolor": "none" if place // len(COLOURS) % 2 else colour,  # first filled, then hollow
+            "linestyle": "-" if "knob" in members[0] else "",
+        }
+        series.append(_Series(method, kind, members, style))
+    return series
+
+
+def _panel(
+    axes: Axes, series: Sequence[_Series], key: str, time: str, *, lower: bool, floor: Floor | None
+) -> tuple[list[tuple[Any, ...]], list[np.ndarray]]:
+    """Draw one key; gives the words to stand beside points (x, y, text, colour), and the lines to stand clear of."""
+    kept = [[row for row in one.rows if _drawable(row, key, time)] for one in series]
+    places = [
+        np.array([(_value(row, time), _value(row, key)) for row in rows]).reshape(-1, 2) for rows in kept
+    ]
+    spreads = [np.array([_spread(row, key) for row in rows]) for rows in kept]
+    everything = np.concatenate([np.zeros((0, 2)), *places])
+    errors, bars = everything[:, 1], np.concatenate([np.zeros(0), *spreads])
+    bottom = -math.inf
+    if lower and (errors >= 0).all():
+        ends = np.concatenate([np.maximum(errors - bars, errors / 2), errors + bars])
+        ends = ends[ends > 0] if (ends > 0).any() else np.ones(1)
+        low, high = ends.min(), ends.max()
+        if floor is not None and floor.height > 0:
+            # a reference known to rounding must not stretch the panel over ten decades
+            low, high = min(low, max(floor.height, low / 100)), max(high, floor.height)
+        room = (high / low) ** 0.1 if high > low else 2.0
+        bottom = low / room
+        axes.set(yscale="log", ylim=(bottom, high * room))
+        if floor is not None and floor.height > bottom:
+            axes.axhspan(bottom, floor.height, color=SHADE, zorder=0)
+    notes, lines = [], []
+    for one, rows, line, spread in zip(series, kept, places, spreads, strict=True):
+        zero = line[:, 1] < bottom
+        line[:, 1] = np.maximum(line[:, 1], bottom)
+        below = np.minimum(spread, line[:, 1] - bottom)
+        axes.errorbar(line[:, 0], line[:, 1], [below, spread], capsize=2.5, clip_on=False, **one.style)
+        lines += [line] if one.style["linestyle"] else []
+        ends = np.stack([line[:, 1] - below, line[:, 1] + spread], 1)
+        lines += [np.column_stack([[x, x], end]) for x, end in zip(line[:, 0], ends, strict=True)]
+        for row, (x, y), nothing in zip(rows, line, zero, strict=True):
+            said = [f"{_value(row, 'value'):g}"] if row.get("knob") else []
+            said += ["error 0"] if nothing else []
+            notes += [(x, y, ": ".join(said), one.style["color"])] if said else []
+    for kind in dict.fromkeys(one.group for one in series):
+        own = np.concatenate([line for one, line in zip(series, places, strict=True) if one.group == kind])
+        best = front((own[:, 1] * (1 if lower else -1)).tolist(), own[:, 0].tolist())
+        axes.plot(*own[best].T, **PARETO, clip_on=False)
+    _plain_ticks(axes.xaxis)
+    if axes.get_yscale() == "log":
+        _plain_ticks(axes.yaxis)
+    axes.grid(which="major", alpha=0.35)
+    axes.spines[["top", "right"]].set_visible(False)
+    return notes, lines
+
+
+def _legends(
+    figure: Figure, series: Sequence[_Series], group: str | None, shaded: Sequence[str], note: str
+) -> None:
+    handles: list[Line2D | Patch] = []
+    for one in {one.method: one for one in reversed(series)}.values():
+        knobs = ", ".join(dict.fromkeys(str(row["knob"]) for row in one.rows if row.get("knob")))
+        marker = one.style["marker"] if group is None else "o"
+        label = f"{one.method} ({knobs})" if knobs else one.method
+        handles.insert(0, Line2D([], [], **{**one.style, "marker": marker}, label=label))
+    beaten = "not beaten by another point" if group is None else f"not beaten in its {group}"
+    handles.append(Line2D([], [], **PARETO, label=f"{beaten} (Pareto)"))
+    handles += [Patch(color=SHADE, label=meaning) for meaning in shaded]
+    columns = 2 if shaded else int(figure.get_figwidth() / 2.5)
+    style: Style = {"fontsize": 9, "frameon": False}
+    legend = figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, title=note or None, **style
+    )
+    legend.get_title().set(fontsize=7, color=GREY, parse_math=False)
+    if group is not None:
+        kinds = {one.group: one.style["marker"] for one in series}
+        handles = [
+            Line2D([], [], marker=marker, color=GREY, ls="", label=kind) for kind, marker in kinds.items()
+        ]
+        figure.legend(handles=handles, loc="outside right upper", title=group, **style)
+
+
+def _plain_ticks(axis: Axis) -> None:
+    """Numbers as people write them, and always some of them, on a logarithmic axis."""
+    low, high = axis.get_view_interval()
+    decades = math.log10(high / low)
+    steps = (1.0,) if decades > 3 else (1.0, 2.0, 5.0) if decades > 1.2 else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+    axis.set_major_locator(LogLocator(subs=steps) if decades > 0.5 else MaxNLocator(5))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.ndarray]) -> None:
+    """A word beside each point (x, y, text, colour), on the side where nothing is written or drawn yet."""
+    pen = axes.figure.dpi / 72  # pixels a point
+    edges = [np.zeros((0, 4))]  # left, bottom, right, top of what is drawn, pixels
+    for line in lines:
+        corners = axes.transData.transform(line)
+        between = np.linspace(0, 1, 200)[:, None, None]
+        dots = (corners[:-1] + between * (corners[1:] - corners[:-1])).reshape(-1, 2)
+        edges += [np.hstack([dots - pen, dots + pen]), np.hstack([corners - 6 * pen, corners + 6 * pen])]
+    taken, frame = np.concatenate(edges), axes.bbox
+    for x, y, text, colour in notes:
+        trials = []
+        for across, up in SIDES:
+            side = "left" if across > 0 else "right" if across < 0 else "center"
+            note = axes.annotate(text, (x, y), (across, up), textcoords="offset points", ha=side, va="center")
+            note.set(fontsize=8, color=colour, annotation_clip=False)
+            box = note.get_window_extent().extents
+            met = ((taken[:, :2] <= box[2:]) & (taken[:, 2:] >= box[:2])).all(1).sum()
+            outside = bool(np.any(box[:2] < frame.min) or np.any(box[2:] > frame.max))
+            trials.append((met + 10_000 * outside, note, box))
+        best = min(trials, key=lambda trial: trial[0])
+        taken = np.vstack([taken, best[2]])
+        for trial in trials:
+            if trial is not best:
+                trial[1].remove()
+
+
+def _drawable(row: Row, key: str, time: str) -> bool:
+    return math.isfinite(_value(row, key)) and 0 < _value(row, time) < math.inf
+
+
+def _value(row: Row, key: str) -> float:
+    value = row.get(key)
+    return math.nan if value is None else float(value)  # type: ignore[arg-type]
+
+
+def _spread(row: Row, key: str) -> float:
+    spreads = (_value(row, key + suffix) for suffix in SPREADS)
+    return next((spread for spread in spreads if math.isfinite(spread)), 0.0)

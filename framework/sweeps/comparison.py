@@ -80,7 +80,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
         csv(compared, columns, folder / "comparison.csv")
         files.append(folder / "comparison.csv")
-        files.extend(_picture(compared, by, folder))
+        files.extend(_picture(compared, rows[0]["columns"], better, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
     _close_parent(folder, files, compared)
 
@@ -237,21 +237,26 @@ def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
     return len({value for _, value in pairs}) > 1 and len({data for data, _ in pairs}) == len(pairs)
 
 
-def _picture(rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path) -> list[Path]:
-    from framework.reports.pictures import comparison
+def _picture(
+    rows: Sequence[Mapping[str, Any]],
+    headings: Mapping[str, str],
+    better: Better,
+    by: Sequence[str],
+    folder: Path,
+) -> list[Path]:
+    """Of the first column that says which way it is better, against run time; none where a row lacks it."""
+    from framework.reports.tradeoff_picture import error_against_run_time
 
-    if not all("log_likelihood" in row for row in rows):
+    key = next((key for key in headings if key in better), None)
+    if key is None or not all(key in row for row in rows):
         return []
-    figure = comparison(
+    figure = error_against_run_time(
         rows,
-        "log_likelihood",
-        "milliseconds_per_sample",
-        title="Log-likelihood against run time",
+        {key: headings[key]},
+        better,
+        title=f"{headings[key][:1].upper()}{headings[key][1:]} against run time",
         synthetic=any(row.get("synthetic") for row in rows),
-        x_label="run time (ms per sample)",
-        y_label="log-likelihood (nats)",
         group=by[1] if len(by) > 1 else None,
-        better="higher",
     )
     path = folder / "comparison.png"
     figure.savefig(path, dpi=110)

@@ -42,6 +42,7 @@ class Moons(Data):
     synthetic = True
     skipped = 0
     varies = False
+    plane = True
 
     def __init__(
         self,

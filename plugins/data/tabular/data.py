@@ -64,6 +64,7 @@ class Tabular(Data):
         table = self._table
         self.target = table.target
         self.input_shape = (len(table.columns),)
+        self.plane = len(table.columns) == 2
         self.groups = table.groups
         self.skipped = table.skipped
 

@@ -1,0 +1,103 @@
+"""The error of log-likelihoods against a reference: the same ones at a value of a knob that costs far more."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+COLUMNS = {
+    "error_nats": "error nats",
+    "bias_nats": "bias nats",
+    "sample_error_nats": "one sample's error nats",
+    "log_likelihood_nats": "log-likelihood nats",
+}
+"""What `errors` tells, with the headings."""
+BETTER: Mapping[str, Literal["higher", "lower"]] = {
+    "error_nats": "lower",
+    "bias_nats": "lower",
+    "sample_error_nats": "lower",
+}
+"""Which way those that are errors are better."""
+
+LogProbs = Callable[[int, int], Tensor]
+"""Log-likelihoods of all samples at a value of the knob and with a seed: (value, seed) → (samples,), nats."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What log-likelihoods are compared with.
+
+    Attributes:
+        value: where the knob stood.
+        log_probs: of each sample, nats: the logarithm of the density averaged over the repeats.
+        mean: of these.
+        standard_error: of that mean, over the repeats (jackknife), nats; errors below it mean nothing.
+        repeats: how many seeds.
+    """
+
+    value: int
+    log_probs: Float[Tensor, "samples"]
+    mean: float
+    standard_error: float
+    repeats: int
+
+
+def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Reference:
+    """The log-likelihood at a large value of the knob, averaged over seeds.
+
+    The densities are averaged, not their logarithms: where the knob counts Monte Carlo samples this equals
+    one estimate with len(seeds) times as many, and the bias of the logarithm (Jensen) shrinks as much. The
+    standard error is the jackknife's over the seeds, sqrt((R - 1)/R Σ_r (θ_(r) - θ_(·))²) (Efron &
+    Tibshirani 1993, eq. 11.5).
+
+    Args:
+        seeds: two at least.
+
+    Raises:
+        ValueError: a log-likelihood is not finite; there is nothing to compare with.
+    """
+    found = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
+    pooled = torch.logsumexp(found, 0) - math.log(len(seeds))
+    wrong = (~pooled.isfinite()).nonzero()
+    if len(wrong):
+        raise ValueError(
+            f"The reference log-likelihood of sample {int(wrong[0])} is {pooled[wrong[0]].item()} "
+            f"({len(wrong)} such); wanted finite numbers. Raise the reference's value, or mend the head."
+        )
+    left_out = torch.stack(
+        [torch.cat([found[:r], found[r + 1 :]]).logsumexp(0).mean() for r in range(len(seeds))]
+    )
+    spread = (left_out - left_out.mean()).square().sum() * (len(seeds) - 1) / len(seeds)
+    return Reference(value, pooled, float(pooled.mean()), float(spread.sqrt()), len(seeds))
+
+
+def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Reference) -> dict[str, float]:
+    """How far log-likelihoods at one value of the knob are from the reference, nats; infinite where one is.
+
+    "error_nats" is the root mean square, over the seeds, of the mean log-likelihood minus the reference;
+    "bias_nats" the absolute value of their mean difference; "sample_error_nats" the root mean square, over seeds and
+    samples, of one sample's log-likelihood minus its reference: what a user who asks about one sample sees;
+    "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the seeds, NaN
+    of one; that of a root mean square sqrt(m) is that of m divided by 2 sqrt(m) (delta method).
+    """
+    found = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
+    means = found.mean(1)
+    squares = (means - reference.mean).square()
+    error = float(squares.mean().sqrt())
+    return {
+        "error_nats": error,
+        "error_nats_sem": _standard_error(squares) / (2 * error) if error > 0 else 0.0,
+        "bias_nats": abs(float(means.mean()) - reference.mean),
+        "sample_error_nats": float((found - reference.log_probs).square().mean().sqrt()),
+        "log_likelihood_nats": float(means.mean()),
+        "log_likelihood_nats_sem": _standard_error(means),
+    }
+
+
+def _standard_error(values: Tensor) -> float:
+    """Of the mean of independent values; NaN for one."""
+    return float(values.std() / len(values) ** 0.5) if len(values) > 1 else math.nan

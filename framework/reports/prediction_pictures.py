@@ -1,0 +1,144 @@
+"""Pictures of what is predicted for samples of the test split, as the kind of data calls for."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from torch.utils.data import Subset
+
+from framework.data import Data
+from framework.distributions.circular import angular_distance
+from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.density import circular_entropy, circular_grid
+from framework.evaluation.splits import on_device
+from framework.model import Predictor
+from framework.prediction import Prediction
+from framework.reports.class_picture import choose_classified, classified
+from framework.reports.landscape_picture import Plane, half_width, landscapes, probabilities
+from framework.reports.viewing_circles import choose, viewing_circles
+from framework.training.batches import Batches
+
+PICTURED = 128
+"""How many test samples those that are shown are chosen from."""
+
+
+def prediction_pictures(
+    predictor: Predictor,
+    data: Data,
+    batches: Batches,
+    outliers: Data | None,
+    device: torch.device,
+    *,
+    samples: int,
+    caption: str,
+) -> Iterator[tuple[str, Figure]]:
+    """The pictures with their file names.
+
+    Args:
+        predictor: on `device`.
+        samples: as of `Prediction`.
+        caption: names the predictor.
+    """
+    if data.target.kind == "angle":
+        yield "predicted_densities.png", _densities(predictor, data, batches, device, samples)
+    if data.target.kind == "class" and data.plane:
+        yield "landscape.png", _landscape(predictor, data, outliers, caption)
+    elif data.target.kind == "class":
+        yield "classified.png", _classified(predictor, data, batches, device)
+
+
+@torch.no_grad()
+def _densities(
+    predictor: Predictor, data: Data, batches: Batches, device: torch.device, samples: int
+) -> Figure:
+    """Of the first angle, on the viewing circle over their images, chosen from the first samples of the test split."""
+    inputs: list[Tensor] = []
+    columns: list[tuple[Tensor, ...]] = []
+    angles = torch.zeros(0)
+    for batch in on_device(batches.test_dataloader(), device):
+        if len(inputs) >= PICTURED:
+            break
+        prediction = Prediction(predictor(batch["input"]), batch, samples)
+        first = prediction.marginal(0)
+        angles, log_density = circular_grid(first)
+        entropy, truth, point = circular_entropy(first), batch["target"][:, 0], prediction.point[:, 0]
+        symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
+        columns.append((log_density, entropy, angular_distance(truth, point), truth, point, symmetry))
+        inputs.extend(batch["input"].cpu())
+    joined = (torch.cat(some, -1).cpu().numpy() for some in zip(*columns, strict=True))
+    log_density, entropy, error, truth, point, symmetry = joined
+    chosen = choose(entropy, error, log_density)
+    order = [index for row in chosen.values() for index in row]
+    return viewing_circles(
+        [data.picture(inputs[index]) for index in order],
+        log_density[:, order],
+        angles.cpu().numpy(),
+        truth[order],
+        point[order],
+        [_caption(error[index], entropy[index], symmetry[index]) for index in order],
+        [_equally_true(truth[index], symmetry[index]) for index in order],
+        rows={name: len(row) for name, row in chosen.items()},
+        title=f"{', '.join(data.groups)}: predicted density of the {data.target.names[0]}",
+        synthetic=data.synthetic,
+    )
+
+
+@torch.no_grad()
+def _classified(predictor: Predictor, data: Data, batches: Batches, device: torch.device) -> Figure:
+    """Chosen from all over the test split."""
+    dataset = data.splits().test
+    length: int = len(dataset)  # pyright: ignore[reportArgumentType]
+    some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
+    inputs: list[Tensor] = []
+    shares, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
+    for batch in on_device(batches.of(some), device):
+        shares.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
+        labels.append(batch["target"].cpu().numpy())
+        inputs.extend(batch["input"].cpu())
+    probability, label = np.concatenate(shares), np.concatenate(labels)
+    chosen = choose_classified(probability, label)
+    order = [index for row in chosen.values() for index in row]
+    return classified(
+        [data.picture(inputs[index]) for index in order],
+        probability[order],
+        label[order],
+        data.target.names,
+        rows={name: len(row) for name, row in chosen.items()},
+        title=f"{', '.join(data.groups)}: samples of the test split",
+        synthetic=data.synthetic,
+    )
+
+
+def _landscape(predictor: Predictor, data: Data, outliers: Data | None, caption: str) -> Figure:
+    """Class probabilities over the plane of the inputs, with test samples and outliers."""
+    points, labels = _first(data)
+    others = _first(outliers)[0] if outliers is not None else points[:0]
+    plane = Plane(points, labels, others, data.target.names, half_width(points, others))
+    return landscapes(
+        {caption: probabilities(predictor.cpu(), plane.half_width)},
+        plane,
+        title=f"{', '.join(data.groups)}: probability landscape",
+        synthetic=data.synthetic,
+    )
+
+
+def _caption(error: float, entropy: float, symmetry: int) -> str:
+    note = {0: ", no true direction", 1: ""}.get(symmetry, f", {symmetry}-fold symmetric")
+    return f"error {math.degrees(error):.0f}°, entropy {entropy:.2f} nats{note}"
+
+
+def _equally_true(truth: float, symmetry: int) -> np.ndarray:
+    """Every angle that is as right as the annotated one; none marked where all angles are."""
+    return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
+
+
+def _first(data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and targets of the first PICTURED test samples."""
+    dataset = data.splits().test
+    count = min(PICTURED, len(dataset))  # type: ignore[arg-type]
+    items = [dataset[index] for index in range(count)]
+    inputs = torch.stack([item["input"] for item in items]).numpy()
+    return inputs, torch.stack([item["target"] for item in items]).numpy()

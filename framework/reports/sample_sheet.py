@@ -1,0 +1,44 @@
+"""An empty contact sheet of samples: a row for each kind of sample, which says so where there is none."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from framework.figures.style import GREY, titled_figure
+
+
+def sample_sheet(
+    rows: Mapping[str, int],
+    *,
+    least: int,
+    width: float,
+    heights: Sequence[float],
+    flat: Sequence[float],
+    margin: float,
+    title: str,
+    synthetic: bool,
+) -> tuple[Figure, list[np.ndarray]]:
+    """The figure and, for each sample in the order of the rows, its panels from top to bottom. Lengths are in inches.
+
+    Args:
+        rows: heading of each row, and how many samples stand in it; may be 0.
+        least: for how many samples a row has room at least.
+        width: of a panel.
+        heights: of the panels of a sample.
+        flat: the same in a row without samples.
+        margin: for title and legend.
+    """
+    across = max(least, *rows.values())
+    tall = [height for count in rows.values() for height in (heights if count else flat)]
+    figure = titled_figure((width * across + 0.4, sum(tall) + margin), title, synthetic)
+    panels = figure.subplots(len(tall), across, squeeze=False, height_ratios=tall)
+    for axes in panels.flat:
+        axes.set(xticks=[], yticks=[], frame_on=False)
+    found: list[np.ndarray] = []
+    for line, (heading, count) in zip(panels.reshape(len(rows), -1, across), rows.items(), strict=True):
+        line[0, 0].set_ylabel(heading, fontsize=11, weight="bold")
+        if count == 0:
+            line[0, 0].text(0.5, 0.5, "no such sample", ha="center", va="center", color=GREY)
+        found += list(line[:, :count].T)
+    return figure, found

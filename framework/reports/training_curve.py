@@ -1,0 +1,49 @@
+"""The training curve: both losses over epochs, and the epoch whose weights were kept."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from framework.figures.style import BLUE, GREEN, RED, titled_figure
+
+
+def training_curve(
+    epochs: Sequence[int | float],
+    train: Sequence[float],
+    validation: Sequence[tuple[int | float, float]],
+    *,
+    best_epoch: int | float | None,
+    title: str,
+    synthetic: bool,
+    y_label: str = "loss (nats per sample)",
+) -> Figure:
+    """Training and validation loss over epochs, the epoch of the kept weights marked.
+
+    Args:
+        epochs, train: where the training loss was recorded, and it.
+        validation: pairs (epoch, value).
+        best_epoch: whose weights were kept; None where none were.
+    """
+    figure = titled_figure((7.0, 4.3), title, synthetic)
+    axes = figure.subplots()
+    axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training")
+    seen = np.array(validation, dtype=np.float64).reshape(-1, 2)
+    axes.plot(*seen.T, color=RED, linewidth=1.5, marker="o", markersize=3.5, label="validation")
+    values = [value for value in (*train, *seen[:, 1]) if math.isfinite(value)]
+    if values:
+        low, middle, high = np.percentile(values, [5, 50, 95])
+        usual = max(abs(low), abs(high), 1e-12)
+        if (
+            max(abs(value - middle) for value in values) > 30 * usual
+        ):  # one wild epoch must not flatten all others
+            axes.set_yscale("symlog", linthresh=usual)
+    if best_epoch is not None:
+        axes.axvline(best_epoch, color=GREEN, linestyle="--", label=f"kept weights: epoch {best_epoch:g}")
+    axes.set(xlabel="epoch", ylabel=y_label)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    return figure

@@ -1,0 +1,154 @@
+"""Predicted densities on the viewing circle around their images: certain, ambiguous and failed ones."""
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
+
+from framework.figures.style import BLUE, GREEN, GREY, RED
+from framework.reports.sample_sheet import sample_sheet
+
+LARGE_ERROR = math.pi / 6  # radians; a viewpoint further off counts as wrong (Acc_{π/6} of thesis Table 3.3)
+RING = 0.5  # thickness of the ring that holds the densities, in radii of the viewing circle
+
+
+def choose(
+    entropy: Float[np.ndarray, "samples"],
+    error: Float[np.ndarray, "samples"],
+    log_density: Float[np.ndarray, "points samples"],
+    count: int = 4,
+) -> dict[str, list[int]]:
+    """Up to `count` samples for each row of Figure 3.6; the same arguments give the same samples.
+
+    "certain": one peak, entropy at most the median, error at most π/6; "ambiguous": several peaks; "failed":
+    as certain, but with a larger error, a confident mistake. Of each kind those of lowest entropy.
+
+    Args:
+        entropy: of each density, nats.
+        error: absolute angular deviation of each point prediction, radians.
+        log_density: on a regular grid over the whole circle.
+
+    Raises:
+        ValueError: a number is NaN.
+    """
+    if any(np.isnan(numbers).any() for numbers in (entropy, error, log_density)):
+        raise ValueError("wanted numbers to choose samples by, got NaN among entropies, errors or densities.")
+    if len(entropy) == 0:
+        return {"certain": [], "ambiguous": [], "failed": []}
+    several = peaks(log_density) > 1
+    confident = ~several & (entropy <= np.median(entropy))
+    right = error <= LARGE_ERROR
+    rows = {"certain": confident & right, "ambiguous": several, "failed": confident & ~right}
+    order = np.argsort(entropy, kind="stable")
+    return {name: order[chosen[order]][:count].tolist() for name, chosen in rows.items()}
+
+
+def peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
+    """How many separate arcs of the circle have more than a quarter of the highest density, (samples,)."""
+    high = log_density > log_density.max(0) - math.log(4)
+    starts = (high & ~np.roll(high, 1, axis=0)).sum(0)
+    return np.maximum(starts, 1)  # an arc that is the whole circle starts nowhere
+
+
+def viewing_circles(
+    images: Sequence[np.ndarray],
+    log_density: Float[np.ndarray, "points samples"],
+    angles: Float[np.ndarray, "points"],
+    truths: Float[np.ndarray, "samples"],
+    predictions: Float[np.ndarray, "samples"],
+    captions: Sequence[str],
+    modes: Sequence[np.ndarray] | None = None,
+    *,
+    rows: Mapping[str, int],
+    title: str,
+    synthetic: bool,
+    outer: float = 1.5,
+    directions: tuple[str, str, str, str] = ("front", "right", "back", "left"),
+) -> Figure:
+    """Predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6.
+
+    The circle is the object seen from above, its front (angle 0) at the bottom, angles counter-clockwise. A
+    density is a band outside the circle, as thick as the density is high and to one scale in all panels; an
+    outer circle cuts it, and is drawn thick where it does.
+
+    Args:
+        images: of the samples, as `Data.picture` gives them.
+        log_density: nats, at `angles`, a regular grid over the whole circle, radians.
+        truths, predictions: radians.
+        captions: below each panel.
+        modes: for each sample all angles that are as true as its truth (of a symmetric object), radians.
+        rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
+        outer: density at the outer circle, per radian; the uniform density is 0.16.
+        directions: words for 0°, 90°, 180° and 270°.
+    """
+    lengths = (log_density.shape[1], sum(rows.values()), len(images), len(captions))
+    if len(set(lengths)) != 1:
+        raise ValueError(f"wanted as many densities as samples in rows, images and captions, got {lengths}.")
+    density = np.exp(np.minimum(log_density.astype(np.float64), 700))  # beyond, float64 overflows
+    if np.isnan(density).any():
+        raise ValueError("wanted a log-density everywhere, got NaN.")
+    size = {"least": 3, "width": 2.5, "heights": (2.75,), "flat": (0.6875,), "margin": 1.3}
+    figure, panels = sample_sheet(rows, **size, title=title, synthetic=synthetic)
+    for sample, (axes,) in enumerate(panels):
+        _viewing_circle(axes, images[sample], density[:, sample], angles, outer, directions)
+        _marks(axes, truths[sample], predictions[sample], () if modes is None else modes[sample])
+        caption = "\n".join(textwrap.fill(part, 36) for part in captions[sample].splitlines())
+        axes.set_xlabel(caption, fontsize=8, labelpad=1, parse_math=False)
+    handles = [
+        Patch(color=BLUE, alpha=0.6, label="predicted density"),
+        Line2D([], [], color="black", linewidth=3, label=f"cut off: above {outer:g} per radian"),
+        Line2D([], [], color=GREY, linestyle=":", label="uniform density"),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="point prediction"),
+        Line2D([], [], color=GREEN, marker="^", linestyle="", label="truth"),
+    ]
+    if modes is not None:
+        handles.append(Line2D([], [], color=GREEN, marker="^", ls="", mfc="none", label="equally true"))
+    note = f"The object from above: {directions[0]} (0°) is at the bottom, angles turn counter-clockwise."
+    legend = figure.legend(handles=handles, title=note, loc="outside lower center", ncols=3, frameon=False)
+    legend.get_title().set_parse_math(False)
+    return figure
+
+
+def _viewing_circle(
+    axes: Axes, image: np.ndarray, density: np.ndarray, angles: np.ndarray, outer: float, words: Sequence[str]
+) -> None:
+    height, width = image.shape[:2]
+    # corners stay inside the circle, and the sides leave room for the words
+    half = min(0.96 / math.hypot(height, width), 0.72 / max(height, width))
+    axes.imshow(image, extent=(-half * width, half * width, -half * height, half * height))
+    limit = 1 + RING + 0.2
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit))
+    around, value = np.append(angles, angles[0]), np.append(density, density[0])
+    band = np.append(1 + RING * np.minimum(value / outer, 1), np.ones_like(value))
+    axes.fill(*_position(np.append(around, around[::-1]), band), color=BLUE, alpha=0.6, linewidth=0)
+    cut = density > outer
+    cut |= np.roll(cut, 1) | np.roll(cut, -1)  # so that a single angle is a visible arc
+    edge = np.where(np.append(cut, cut[0]), 1 + RING, np.nan)
+    axes.plot(*_position(around, edge), color="black", linewidth=3, zorder=4)
+    for radius, line in ((1.0, "-"), (1 + RING, "-"), (1 + RING / (2 * math.pi * outer), ":")):
+        axes.add_patch(Circle((0, 0), radius, fill=False, color=GREY, linestyle=line, zorder=3))
+    for quarter, word in enumerate(words):
+        x, y = _position(quarter * math.pi / 2, 0.86)
+        style = {"fontsize": 6.5, "color": GREY, "rotation": 90 * (quarter % 2), "parse_math": False}
+        axes.text(x, y, word, ha="center", va="center", **style)
+
+
+def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] | np.ndarray) -> None:
+    for angle, face in (*((mode, "none") for mode in modes), (truth, GREEN)):
+        inwards = (3, 0, math.degrees(angle))  # a triangle outside the outer circle
+        x, y = _position(angle, 1 + RING + 0.1)
+        axes.plot(x, y, color=GREEN, marker=inwards, markerfacecolor=face, markersize=8, zorder=5)
+    x, y = _position(prediction, np.array([1.0, 1 + RING]))
+    axes.plot(x, y, color=RED, linewidth=1.6, marker="o", markevery=[0], markersize=4, zorder=5)
+
+
+def _position(angle: Any, radius: Any) -> tuple[Any, Any]:
+    """Where an angle (radians) is drawn: 0 at the bottom, counter-clockwise."""
+    return radius * np.sin(angle), -radius * np.cos(angle)
