@@ -2,9 +2,11 @@
 
 import json
 import os
+import select
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,10 +104,48 @@ def listed(*arguments: str, folder: Path, site: Path | None = None) -> Listed:
     return Listed(done.returncode, done.stdout + done.stderr, set(lines[-1].split()[1:]) if lines else set())
 
 
+class Forks:
+    """Runs commands in forks of one process that has imported what most of them need (`fork_server.py`)."""
+
+    def __init__(self) -> None:
+        self.server = subprocess.Popen(
+            [sys.executable, Path(__file__).with_name("fork_server.py")],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+
+    def __call__(self, seconds: int = 300, **command: object) -> int:
+        """Exit code of a command, below 0 the signal that killed it; `command` is what the server reads."""
+        assert self.server.stdin is not None
+        assert self.server.stdout is not None
+        self.server.stdin.write(json.dumps(command, default=str).encode() + b"\n")
+        self.server.stdin.flush()
+        ready, _, _ = select.select([self.server.stdout], [], [], seconds)
+        if not ready:
+            self.close()
+            raise TimeoutError(f"{command['arguments']} did not end within {seconds} s")
+        return int(self.server.stdout.readline())
+
+    def close(self) -> None:
+        """End the server and whatever runs in it."""
+        os.killpg(self.server.pid, signal.SIGKILL)
+        self.server.communicate()
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """A server of forks for all tests of this process."""
+    forks = Forks()
+    yield forks
+    forks.close()
+
+
 Framework = Callable[..., Done]
 
 
-def command(site: Path, base: Path) -> Framework:
+def command(forks: Forks, site: Path, base: Path) -> Framework:
     """Call `python -m framework` in `base`; `folder` names the run folder, `more` extra environment."""
 
     def call(
@@ -114,33 +154,33 @@ def command(site: Path, base: Path) -> Framework:
         more: Mapping[str, str] | None = None,
         paths: tuple[Path, ...] = (),
     ) -> Done:
-        python_path = os.pathsep.join(str(path) for path in (site, *paths))
-        environment = {**os.environ, "PYTHONPATH": python_path, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
-        environment |= {"FRAMEWORK_CACHE": str(base / "cache"), **(more or {})}
-        run = base / folder
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (site, *paths))), "COLUMNS": "100"}
+        environment |= {"OMP_NUM_THREADS": "1", "FRAMEWORK_CACHE": str(base / "cache"), **(more or {})}
+        run, output = base / folder, base / "output.txt"
         own = any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
-        done = subprocess.run(
-            [sys.executable, "-m", "framework", *arguments, *([] if own else [f"hydra.run.dir={run}"])],
-            cwd=base,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
+        code = forks(
+            arguments=[*arguments, *([] if own else [f"hydra.run.dir={run}"])],
+            environment=environment,
+            folder=base,
+            packages=(site, *paths),
+            output=output,
         )
-        return Done(done.returncode, done.stdout + done.stderr, run)
+        return Done(code, output.read_text(encoding="utf-8"), run)
 
     return call
 
 
 @pytest.fixture
-def framework(stranger_site: Path, tmp_path: Path) -> Framework:
+def framework(forks: Forks, stranger_site: Path, tmp_path: Path) -> Framework:
     """The command line, in a folder of this test's own."""
-    return command(stranger_site, tmp_path)
+    return command(forks, stranger_site, tmp_path)
 
 
 @pytest.fixture(scope="session")
 def whole(stranger_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """The tiny run without interruption, which interrupted ones must equal; read it, change nothing."""
-    done = command(stranger_site, tmp_path_factory.mktemp("whole"))(*TINY, "logger=none")
+    """The tiny run without interruption, in a process of its own, which interrupted ones must equal; change nothing."""
+    base = tmp_path_factory.mktemp("whole")
+    run = f"hydra.run.dir={base / 'run'}"
+    done = listed(*TINY, "logger=none", run, folder=base, site=stranger_site)
     assert done.code == 0, done.out
-    return done
+    return Done(done.code, done.out, base / "run")
