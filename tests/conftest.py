@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
+Once = Callable[[str, Callable[[Path], None]], Path]
 STRANGER = Path(__file__).parent / "stranger"
 TINY = [
     "data=dial",
@@ -50,23 +52,35 @@ class Done:
 
 
 @pytest.fixture(scope="session")
-def stranger_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
+    """Makes the folder of a name by a function that gets its path; of several workers only the first one does."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                folder.mkdir(exist_ok=True)
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def stranger_site(once: Once) -> Path:
     """The stranger's package, built and installed by pip into a folder of its own."""
-    site = tmp_path_factory.mktemp("site")
-    arguments = [
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "--target",
-        str(site),
-        str(STRANGER),
-    ]
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    return site
+
+    def install(site: Path) -> None:
+        arguments = ["install", "--quiet", "--no-deps", "--no-build-isolation", "--target", site, STRANGER]
+        done = subprocess.run(
+            [sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+
+    return once("site", install)
 
 
 LISTING = """
@@ -146,18 +160,22 @@ Framework = Callable[..., Done]
 
 
 def command(forks: Forks, site: Path, base: Path) -> Framework:
-    """Call `python -m framework` in `base`; `folder` names the run folder, `more` extra environment."""
+    """Call `python -m framework` in `base`; `folder` names the run folder if there is one, `more` extra environment."""
 
     def call(
         *arguments: str,
-        folder: str = "run",
+        folder: str | None = "run",
         more: Mapping[str, str] | None = None,
         paths: tuple[Path, ...] = (),
     ) -> Done:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (site, *paths))), "COLUMNS": "100"}
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(str, (site, *paths))),
+            "COLUMNS": "100",
+        }
         environment |= {"OMP_NUM_THREADS": "1", "FRAMEWORK_CACHE": str(base / "cache"), **(more or {})}
-        run, output = base / folder, base / "output.txt"
-        own = any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
+        run, output = base / (folder or ""), base / "output.txt"
+        own = folder is None or any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
         code = forks(
             arguments=[*arguments, *([] if own else [f"hydra.run.dir={run}"])],
             environment=environment,
@@ -177,10 +195,12 @@ def framework(forks: Forks, stranger_site: Path, tmp_path: Path) -> Framework:
 
 
 @pytest.fixture(scope="session")
-def whole(stranger_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Done:
+def whole(stranger_site: Path, once: Once) -> Done:
     """The tiny run without interruption, in a process of its own, which interrupted ones must equal; change nothing."""
-    base = tmp_path_factory.mktemp("whole")
-    run = f"hydra.run.dir={base / 'run'}"
-    done = listed(*TINY, "logger=none", run, folder=base, site=stranger_site)
-    assert done.code == 0, done.out
-    return Done(done.code, done.out, base / "run")
+
+    def train(base: Path) -> None:
+        run = f"hydra.run.dir={base / 'run'}"
+        done = listed(*TINY, "logger=none", run, folder=base, site=stranger_site)
+        assert done.code == 0, done.out
+
+    return Done(0, "", once("whole", train) / "run")

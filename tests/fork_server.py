@@ -17,7 +17,9 @@ import hydra  # noqa: F401
 import pytorch_lightning  # noqa: F401
 
 
-def run(arguments: list[str], environment: dict[str, str], folder: str, packages: list[str], output: str) -> None:
+def run(
+    arguments: list[str], environment: dict[str, str], folder: str, packages: list[str], output: str
+) -> None:
     """The command; this process ends with it."""
     os.dup2(os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
     os.dup2(1, 2)

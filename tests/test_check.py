@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from framework.testing import contract as contracts
 from framework.testing.finding import Finding, Worst, examined, require
 from tests.conftest import Framework
 
@@ -50,6 +51,14 @@ def test_parameters_from_the_command_line_are_a_row(framework: Framework) -> Non
     done = framework("mode=check", "density_head=wrapped_cauchy", "density_head.largest=0.5")
     assert done.code == 0, done.out
     assert "as configured" in (done.folder / "check.csv").read_text(encoding="utf-8")
+
+
+def test_a_plugin_without_rows_is_tried_with_every_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contracts, "_shipped", lambda group, name: ())
+    for config, label in ((None, "defaults"), ({"concentration": "fixed"}, "as configured")):
+        rows = contracts.contract("density_head", "von_mises", config).rows
+        assert [row.name for row in rows] == [f"{label}, {angles} of kind angle" for angles in (1, 3)]
+        assert [row.config.get("concentration") for row in rows] == [config and config["concentration"]] * 2
 
 
 def test_nothing_chosen_is_refused(framework: Framework) -> None:
