@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from framework.storage.cache import folder as cache_folder
+
 Once = Callable[[str, Callable[[Path], None]], Path]
 STRANGER = Path(__file__).parent / "stranger"
 TINY = [
@@ -122,6 +124,9 @@ class Forks:
     """Runs commands in forks of one process that has imported what most of them need (`fork_server.py`)."""
 
     def __init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
         self.server = subprocess.Popen(
             [sys.executable, Path(__file__).with_name("fork_server.py")],
             env={**os.environ, "OMP_NUM_THREADS": "1"},
@@ -139,6 +144,7 @@ class Forks:
         ready, _, _ = select.select([self.server.stdout], [], [], seconds)
         if not ready:
             self.close()
+            self.start()
             raise TimeoutError(f"{command['arguments']} did not end within {seconds} s")
         return int(self.server.stdout.readline())
 
@@ -171,9 +177,12 @@ def command(forks: Forks, site: Path, base: Path) -> Framework:
         environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join(map(str, (site, *paths))),
-            "COLUMNS": "100",
+            "COLUMNS": "250",  # so that no line is folded, however long a path in it
+            "OMP_NUM_THREADS": "1",
+            "FRAMEWORK_CACHE": str(base / "cache"),
+            "NUMBA_CACHE_DIR": str(cache_folder("numba")),  # so that kernels are compiled once for all tests
+            **(more or {}),
         }
-        environment |= {"OMP_NUM_THREADS": "1", "FRAMEWORK_CACHE": str(base / "cache"), **(more or {})}
         run, output = base / (folder or ""), base / "output.txt"
         own = folder is None or any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
         code = forks(
