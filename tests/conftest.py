@@ -2,15 +2,21 @@
 
 import json
 import os
+import select
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
+from framework.storage.cache import folder as cache_folder
+
+Once = Callable[[str, Callable[[Path], None]], Path]
 STRANGER = Path(__file__).parent / "stranger"
 TINY = [
     "data=dial",
@@ -48,23 +54,35 @@ class Done:
 
 
 @pytest.fixture(scope="session")
-def stranger_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
+    """Makes the folder of a name by a function that gets its path; of several workers only the first one does."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                folder.mkdir(exist_ok=True)
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def stranger_site(once: Once) -> Path:
     """The stranger's package, built and installed by pip into a folder of its own."""
-    site = tmp_path_factory.mktemp("site")
-    arguments = [
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "--target",
-        str(site),
-        str(STRANGER),
-    ]
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    return site
+
+    def install(site: Path) -> None:
+        arguments = ["install", "--quiet", "--no-deps", "--no-build-isolation", "--target", site, STRANGER]
+        done = subprocess.run(
+            [sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+
+    return once("site", install)
 
 
 LISTING = """
@@ -102,45 +120,96 @@ def listed(*arguments: str, folder: Path, site: Path | None = None) -> Listed:
     return Listed(done.returncode, done.stdout + done.stderr, set(lines[-1].split()[1:]) if lines else set())
 
 
+class Forks:
+    """Runs commands in forks of one process that has imported what most of them need (`fork_server.py`)."""
+
+    def __init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        self.server = subprocess.Popen(
+            [sys.executable, Path(__file__).with_name("fork_server.py")],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+
+    def __call__(self, seconds: int = 300, **command: object) -> int:
+        """Exit code of a command, below 0 the signal that killed it; `command` is what the server reads."""
+        assert self.server.stdin is not None
+        assert self.server.stdout is not None
+        self.server.stdin.write(json.dumps(command, default=str).encode() + b"\n")
+        self.server.stdin.flush()
+        ready, _, _ = select.select([self.server.stdout], [], [], seconds)
+        if not ready:
+            self.close()
+            self.start()
+            raise TimeoutError(f"{command['arguments']} did not end within {seconds} s")
+        return int(self.server.stdout.readline())
+
+    def close(self) -> None:
+        """End the server and whatever runs in it."""
+        os.killpg(self.server.pid, signal.SIGKILL)
+        self.server.communicate()
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """A server of forks for all tests of this process."""
+    forks = Forks()
+    yield forks
+    forks.close()
+
+
 Framework = Callable[..., Done]
 
 
-def command(site: Path, base: Path) -> Framework:
-    """Call `python -m framework` in `base`; `folder` names the run folder, `more` extra environment."""
+def command(forks: Forks, site: Path, base: Path) -> Framework:
+    """Call `python -m framework` in `base`; `folder` names the run folder if there is one, `more` extra environment."""
 
     def call(
         *arguments: str,
-        folder: str = "run",
+        folder: str | None = "run",
         more: Mapping[str, str] | None = None,
         paths: tuple[Path, ...] = (),
     ) -> Done:
-        python_path = os.pathsep.join(str(path) for path in (site, *paths))
-        environment = {**os.environ, "PYTHONPATH": python_path, "OMP_NUM_THREADS": "1", "COLUMNS": "100"}
-        environment |= {"FRAMEWORK_CACHE": str(base / "cache"), **(more or {})}
-        run = base / folder
-        own = any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
-        done = subprocess.run(
-            [sys.executable, "-m", "framework", *arguments, *([] if own else [f"hydra.run.dir={run}"])],
-            cwd=base,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(str, (site, *paths))),
+            "COLUMNS": "250",  # so that no line is folded, however long a path in it
+            "OMP_NUM_THREADS": "1",
+            "FRAMEWORK_CACHE": str(base / "cache"),
+            "NUMBA_CACHE_DIR": str(cache_folder("numba")),  # so that kernels are compiled once for all tests
+            **(more or {}),
+        }
+        run, output = base / (folder or ""), base / "output.txt"
+        own = folder is None or any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
+        code = forks(
+            arguments=[*arguments, *([] if own else [f"hydra.run.dir={run}"])],
+            environment=environment,
+            folder=base,
+            packages=(site, *paths),
+            output=output,
         )
-        return Done(done.returncode, done.stdout + done.stderr, run)
+        return Done(code, output.read_text(encoding="utf-8"), run)
 
     return call
 
 
 @pytest.fixture
-def framework(stranger_site: Path, tmp_path: Path) -> Framework:
+def framework(forks: Forks, stranger_site: Path, tmp_path: Path) -> Framework:
     """The command line, in a folder of this test's own."""
-    return command(stranger_site, tmp_path)
+    return command(forks, stranger_site, tmp_path)
 
 
 @pytest.fixture(scope="session")
-def whole(stranger_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """The tiny run without interruption, which interrupted ones must equal; read it, change nothing."""
-    done = command(stranger_site, tmp_path_factory.mktemp("whole"))(*TINY, "logger=none")
-    assert done.code == 0, done.out
-    return done
+def whole(stranger_site: Path, once: Once) -> Done:
+    """The tiny run without interruption, in a process of its own, which interrupted ones must equal; change nothing."""
+
+    def train(base: Path) -> None:
+        run = f"hydra.run.dir={base / 'run'}"
+        done = listed(*TINY, "logger=none", run, folder=base, site=stranger_site)
+        assert done.code == 0, done.out
+
+    return Done(0, "", once("whole", train) / "run")

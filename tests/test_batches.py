@@ -3,6 +3,7 @@
 Run as a script, this file trains: the tests that need a process to be killed start it so.
 """
 
+import gc
 import json
 import os
 import random
@@ -396,6 +397,7 @@ CASES: dict[str, dict[str, Any]] = {
 def main(folder: Path) -> None:
     """Every case in forks of one process, so that Lightning is imported once."""
     torch.set_num_threads(1)
+    gc.freeze()  # so that collecting a fork's garbage copies none of these pages
     wholes: dict[str, Path] = {}
     for name, case in CASES.items():
         here = folder / name

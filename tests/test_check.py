@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.testing import contract as contracts
 from framework.testing.finding import Finding, Worst, examined, require
 from tests.conftest import Framework
 
@@ -32,7 +33,9 @@ def test_torchs_von_mises_fails_and_the_table_says_where(framework: Framework) -
         "entropy",
     }
     assert expected <= failed
-    assert "did not end within" in done.out  # its sampler hangs at large concentrations
+    findings = (done.folder / "check.csv").read_text(encoding="utf-8")
+    # its sampler hangs at large concentrations
+    assert "finite for any raw numbers,TooSlow: did not end within 20 s" in findings
     assert "Traceback" not in done.out
 
 
@@ -77,6 +80,14 @@ def test_parameters_from_the_command_line_are_a_row(framework: Framework) -> Non
     done = framework("mode=check", "density_head=wrapped_cauchy", "density_head.largest=0.5")
     assert done.code == 0, done.out
     assert "as configured" in (done.folder / "check.csv").read_text(encoding="utf-8")
+
+
+def test_a_plugin_without_rows_is_tried_with_every_target(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contracts, "_shipped", lambda group, name: ())
+    for config, label in ((None, "defaults"), ({"concentration": "fixed"}, "as configured")):
+        rows = contracts.contract("density_head", "von_mises", config).rows
+        assert [row.name for row in rows] == [f"{label}, {angles} of kind angle" for angles in (1, 3)]
+        assert [row.config.get("concentration") for row in rows] == [config and config["concentration"]] * 2
 
 
 def test_nothing_chosen_is_refused(framework: Framework) -> None:

@@ -1,8 +1,6 @@
 """mode=encode: parts are whole, each file is encoded once whatever stops or shares the work, nothing is mixed up."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ from framework.configuration.schema import build, resolve
 from framework.configuration.settings import Settings
 from framework.errors import ConfigError, DataError
 from framework.modes.encode import collected, describe, encode, share
+from tests.conftest import Done, Framework
 
 CONFIG = {
     "data": resolve("data", {"name": "point_cloud_folder", "points": 50}),
@@ -104,22 +103,18 @@ def test_what_cannot_be_encoded_is_refused(root, tmp_path):
     assert collection.missing() == [0, 1, 2]
 
 
-def test_from_the_command_line(root, tmp_path):
-    def call(*arguments: str) -> tuple[int, str]:
-        command = [sys.executable, "-m", "framework", "mode=encode", "data=point_cloud_folder", "logger=none"]
-        done = subprocess.run(
-            [*command, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=300
-        )
-        return done.returncode, done.stdout + done.stderr
+def test_from_the_command_line(framework: Framework, root: Path, tmp_path: Path) -> None:
+    def call(*arguments: str) -> Done:
+        return framework("mode=encode", "data=point_cloud_folder", "logger=none", *arguments, folder=None)
 
     places = [f"mode.files={root}", "mode.into=features", "mode.part=4"]
-    code, told = call("encoder=[bps]", "encoder.bps.points=20", *places, "mode.share=2/2")
-    assert code == 0, told
-    assert "1 parts written, 0 of this job's 1 were there; 2 of all 3 are missing: features" in told
+    done = call("encoder=[bps]", "encoder.bps.points=20", *places, "mode.share=2/2")
+    assert done.code == 0, done.out
+    assert "1 parts written, 0 of this job's 1 were there; 2 of all 3 are missing: features" in done.out
     assert np.load(tmp_path / "features" / "part-000001.npy").shape == (4, 20)
     described = json.loads((tmp_path / "features" / "encoding.json").read_text())
     assert described["encoder"][0]["points"] == 20 and described["files"] == 11
     (run,) = Path(tmp_path, "outputs").glob("**/run.json")
     assert json.loads(run.read_text())["status"] == "FINISHED"
-    code, told = call("encoder=[bps]", *places, "mode.share=0/2")
-    assert code != 0 and "mode.share" in told and "Traceback" not in told
+    done = call("encoder=[bps]", *places, "mode.share=0/2")
+    assert done.code != 0 and "mode.share" in done.out and "Traceback" not in done.out

@@ -372,10 +372,13 @@ def test_free_number() -> None:
 
 def test_what_a_job_leaves_for_an_optimising_sweeper(tmp_path: Path) -> None:
     job = sweep.Job(0, [], [], tmp_path, "key", "config")
-    assert job.value() is None
+    leave_value(tmp_path, 0.25)
+    assert job.value() is None, "a run of no sweep leaves nothing"
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "job.json").touch()
     leave_value(tmp_path, 0.25)
     assert job.value() == 0.25
-    assert [path.name for path in tmp_path.iterdir()] == ["value.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {"job.json", "value.json"}
 
 
 def test_the_launcher_costs_other_commands_nothing() -> None:

@@ -209,7 +209,7 @@ def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> 
     assert first.code == 0, first.out
     store = sqlite3.connect(store_of(first), check_same_thread=False, isolation_level=None)
     store.execute("begin exclusive")
-    released = threading.Timer(40, lambda: store.execute("rollback"))
+    released = threading.Timer(30, lambda: store.execute("rollback"))
     released.start()
     try:
         second = framework(*TINY, folder="second")

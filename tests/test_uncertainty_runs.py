@@ -12,7 +12,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.modes.combine import common, found, wrapping
-from tests.conftest import Done, Framework, listed
+from tests.conftest import Done, Framework
 
 SMALL = [
     "experiment=moons/vanilla_128",
@@ -35,12 +35,11 @@ def results(done: Done) -> dict[str, object]:
     return json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
 
 
-def test_pictures_not_asked_for_are_not_drawn(tmp_path: Path) -> None:
+def test_pictures_not_asked_for_are_not_drawn(framework: Framework) -> None:
     for name, wanted in (("drawn", "true"), ("spared", "false")):
-        run = tmp_path / name
-        done = listed(*SMALL, f"pictures={wanted}", f"hydra.run.dir={run}", folder=tmp_path)
+        done = framework(*SMALL, f"pictures={wanted}", folder=name)
         assert done.code == 0, done.out
-        pictures = {path.name for path in run.glob("figures/*")}
+        pictures = {path.name for path in done.folder.glob("figures/*")}
         assert (
             pictures == {"training_curve.png", "landscape.png", "reliability.png"}
             if name == "drawn"
