@@ -6,6 +6,7 @@ together by a plain loop, or is an explicit refusal. What is sampled is found ou
 
 import math
 from collections.abc import Iterator
+from importlib import import_module
 
 import pytest
 import torch
@@ -468,6 +469,31 @@ def test_what_draws_nothing_says_so() -> None:
     assert torch.equal(found.debiased, found.log_mean)
     assert found.standard_error.tolist() == found.samples.tolist() == [0] * 4
     assert not found.unresolved.any()
+
+
+OLD_NAMES = {
+    "density": "CHUNK Circular Mixture circular circular_entropy circular_grid marginal median pick take",
+    "rearranged": "Reshaped Stacked",
+    "circular": "angular_distance circular_mean circular_median grid wrap",
+    "temper": "CircularPower divided log_probabilities temper tempered tempered_classes",
+    "monte_carlo": "Effort Estimate NormalPoints SampledMixture estimate estimate_log_mean estimated estimated_error "
+    "lattice normal_quantile rows_of",
+    "cdf": "arc cdf turn",
+    "normals": "Normals mahalanobis normals one_normal",
+    "circular_moments": "CircularMoments circular_moments",
+    "class_probabilities": "class_probabilities require_labels",
+    "prediction_set": "PredictionSet Score",
+}
+
+
+def test_old_import_paths_give_what_they_gave() -> None:
+    for module, names in OLD_NAMES.items():
+        found = import_module(f"framework.{module}")
+        assert not [name for name in names.split() if not hasattr(found, name)], module
+    assert (
+        import_module("framework.density").marginal
+        is import_module("framework.distributions.protocol").marginal
+    )
 
 
 ANGLE, CLASSES = Target("angle", ("azimuth",)), Target("class", ("a", "b", "c"))
