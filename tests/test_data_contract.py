@@ -294,13 +294,12 @@ def test_the_users_cache_is_left_alone(tmp_path, monkeypatch) -> None:
 
 
 def test_a_users_own_root_is_read_and_never_damaged() -> None:
-    row = configured(ROW, {"data_seed": 0}, {"root": "/own"})
-    assert row.config == {"data_seed": 0, "root": "/own"}
-    assert (row.fragile, row.skip, row.changes, row.synthetic) == ({}, {}, {}, None)
-    assert row.files is files
-    assert configured(ROW, {}, {"data_seed": 1}).changes == {}  # which would change nothing
-    row = configured(DataRow("real", write=written, fragile={"*.txt": DAMAGES}), {}, {"data_seed": 3})
-    assert (row.write, row.fragile) == (written, {"*.txt": DAMAGES})
+    row = configured(ROW, {"root": "/own", "data_seed": 0})
+    assert row.config == {"root": "/own", "data_seed": 0}
+    assert (row.fragile, row.skip, row.changes, row.synthetic, row.files) == ({}, {}, {}, None, None)
+    assert configured(ROW, {"data_seed": 1}).changes == {}  # which would change nothing
+    row = configured(REAL, {"data_seed": 3})
+    assert (row.write, row.fragile) == (written, {"03.txt": DAMAGES})
 
 
 def test_rows_stand_beside_the_class_or_in_its_familys_folder(tmp_path, monkeypatch) -> None:

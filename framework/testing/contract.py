@@ -81,16 +81,15 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
     known = [{}, *(row.config for row in shipped)]
     if chosen in [resolve(group, {"name": name, **row}) for row in known]:
         return Contract(group, name, shipped)
-    further = replace(shipped[0], name="as configured", config=plain)
-    if isinstance(further, HeadRow):
-        further = replace(further, cases=None)
-    if isinstance(further, DataRow):
+    if isinstance(shipped[0], DataRow):
         from framework.testing.data_folders import configured
 
         usual = resolve(group, {"name": name})
-        further = configured(
-            further, shipped[0].config, {key: plain[key] for key in plain if plain[key] != usual[key]}
-        )
+        further = configured(shipped[0], {key: plain[key] for key in plain if plain[key] != usual[key]})
+        return Contract(group, name, (further, *shipped))
+    further = replace(shipped[0], name="as configured", config=plain)
+    if isinstance(further, HeadRow):
+        further = replace(further, cases=None)
     return Contract(group, name, (further, *shipped))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from framework.data import Data
 from framework.storage.generated import MARK
 from framework.testing.finding import SEED
-from framework.testing.rows import Damage, DataRow
+from framework.testing.rows import SAID_BY_ROWS, Damage, DataRow
 
 Build = Callable[[Mapping[str, Any]], Data]
 
@@ -147,12 +147,15 @@ def first_match(folder: Path, pattern: str) -> Path:
     return found[0]
 
 
-def configured(row: DataRow, usual: Mapping[str, Any], own: Mapping[str, Any]) -> DataRow:
-    """The row with a user's own parameters beside its `usual` ones; a user's own data are read, never damaged."""
-    changes = {key: value for key, value in row.changes.items() if key not in own}
-    row = replace(row, config={**usual, **own}, changes=changes)
+def configured(row: DataRow, own: Mapping[str, Any]) -> DataRow:
+    """The row with a user's own parameters beside its own.
+
+    Where they say where the data are, nothing of the row is left: a user's data are read and never damaged, and the row
+    cannot know which columns they have, or which files are like them.
+    """
     with TemporaryDirectory() as folder:
         says_where = {"root", *(row.write(Path(folder)) if row.write else ())}
     if says_where & set(own):
-        row = replace(row, write=None, synthetic=None, fragile={}, skip={}, changes={})
-    return row
+        return DataRow("as configured", own, leave_out={**SAID_BY_ROWS, **row.leave_out}, limits=row.limits)
+    changes = {key: value for key, value in row.changes.items() if key not in own}
+    return replace(row, name="as configured", config={**row.config, **own}, changes=changes)
