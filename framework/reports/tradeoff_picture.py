@@ -110,7 +110,7 @@ def _series(rows: Sequence[Row], group: str | None) -> list[_Series]:
             "color": colour,
             "marker": MARKERS[(place if group is None else kinds.index(kind)) % len(MARKERS)],
             "markerfacecolor": "none" if place // len(COLOURS) % 2 else colour,  # first filled, then hollow
-            "linestyle": "-" if "knob" in members[0] else "",
+            "linestyle": "-" if members[0].get("knob") else "",
         }
         series.append(_Series(method, kind, members, style))
     return series
