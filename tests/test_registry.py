@@ -7,8 +7,8 @@ import pytest
 
 import framework.configuration.registry as registry
 from framework.configuration.registry import GROUPS, config_folders, find, installed, load
-from framework.modes.plugins import describe
 from framework.errors import ConfigError
+from framework.modes.plugins import describe
 
 
 class Distribution:

@@ -103,7 +103,7 @@ class WholeBatch(TorchFunctionMode):
             bounds = [part for part in args if isinstance(part, int)]
             bounds += [kwargs.pop(key) for key in ("low", "high") if key in kwargs]
             size = kwargs.pop("size") if "size" in kwargs else args[-1]
-            return self._kept(size, lambda shape: torch.randint(*bounds, shape, **kwargs))
+            return self._kept(size, lambda shape: func(*bounds, shape, **kwargs))
         if func in LIKE:
             like = {"dtype": args[0].dtype, "device": args[0].device, **kwargs}
             return self._kept(args[0].shape, lambda shape: LIKE[func](shape, **like))
