@@ -30,8 +30,8 @@ from framework.distributions.protocol import (
     normals,
     peaks,
     pick,
-    prediction_set,
     tempered,
+    value_set,
 )
 from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
@@ -297,7 +297,7 @@ def errors(kind: str, made: Made, found) -> None:
 
 
 def draws(kind: str, made: Made, density: Distribution) -> None:
-    """median, pick, peaks, prediction_set."""
+    """median, pick, peaks, value_set."""
     torch.manual_seed(3)
     found = median(density, 20)
     assert found.shape == density.batch_shape + density.event_shape
@@ -336,7 +336,7 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
             assert all(torch.equal(humps[: len(w), :, k], w) for k, w in enumerate(wanted))
         elif kind in ("floored", "with a set", "mixture of one"):
             assert torch.equal(humps, wanted[0])
-    assert (prediction_set(density) is density) if kind == "with a set" else prediction_set(density) is None
+    assert (value_set(density) is density) if kind == "with a set" else value_set(density) is None
 
 
 def features(drawn: Tensor, made: Made) -> Tensor:
@@ -454,7 +454,7 @@ def test_defaults_do_not_claim_to_be_exact() -> None:
         lambda: normals(density),
     ):
         assert question() is None
-    assert mahalanobis(density, value) is prediction_set(density) is None
+    assert mahalanobis(density, value) is value_set(density) is None
     with pytest.raises(UserError, match=r"protocol\.marginal\.register"):
         marginal(Dirichlet(torch.ones(3)), 0)
     with pytest.raises(UserError, match=r"protocol\.tempered\.register"):
