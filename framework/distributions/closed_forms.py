@@ -23,10 +23,9 @@ from framework.distributions.protocol import (
 from framework.errors import UserError
 
 for _kind in (
-    *(torchs.Bernoulli, torchs.Beta, torchs.Categorical, torchs.Cauchy, torchs.Dirichlet, torchs.Exponential),
-    *(torchs.Gamma, torchs.Gumbel, torchs.HalfNormal, torchs.Laplace, torchs.LowRankMultivariateNormal),
-    *(torchs.MultivariateNormal, torchs.Normal, torchs.OneHotCategorical, torchs.Poisson, torchs.StudentT),
-    *(torchs.Uniform, torchs.VonMises, torchs.Weibull),
+    *(torchs.ExponentialFamily, torchs.Categorical, torchs.OneHotCategorical, torchs.MultivariateNormal),
+    *(torchs.LowRankMultivariateNormal, torchs.Cauchy, torchs.Gumbel, torchs.HalfNormal, torchs.Laplace),
+    *(torchs.StudentT, torchs.Uniform, torchs.VonMises, torchs.Weibull),
 ):
     estimate.register(_kind, exactly)
 

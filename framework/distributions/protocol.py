@@ -250,7 +250,7 @@ class ValueSet(ABC):
 
 
 @singledispatch
-def prediction_set(density: Distribution) -> ValueSet | None:
+def value_set(density: Distribution) -> ValueSet | None:
     """The set that comes with the density.
 
     Default: None, it has none. Structures answer None too: what was promised of a density is not so of a mixture, a

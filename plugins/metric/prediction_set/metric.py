@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework.distributions.protocol import prediction_set
+from framework.distributions.protocol import value_set
 from framework.errors import UserError
 from framework.metric import Metric
 from framework.prediction import Prediction
@@ -56,7 +56,7 @@ class PredictionSetMetric(Metric):
     def update(self, prediction: Prediction) -> None:
         if len(prediction.target) == 0:
             return
-        sets = prediction_set(prediction.density)
+        sets = value_set(prediction.density)
         if sets is None:
             raise UserError(
                 f"prediction_set judges sets, but the model predicts a {type(prediction.density).__name__}, which has "

@@ -12,7 +12,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import ValueSet, marginal, prediction_set
+from framework.distributions.protocol import ValueSet, marginal, value_set
 from framework.errors import UserError
 from plugins.uncertainty.conformal.highest_density import Ends, Line
 
@@ -226,7 +226,7 @@ def _among(log_prob: Tensor, drawn: Float[Tensor, "draw *batch"]) -> Tensor:
     return found.movedim(-1, 0).reshape(log_prob.shape)
 
 
-@prediction_set.register
+@value_set.register
 def _(density: PredictionSet) -> PredictionSet:
     return density
 
