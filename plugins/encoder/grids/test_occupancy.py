@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError
 from framework.geometry.clouds import normalised, pad, sizes
 from plugins.encoder.grids.occupancy import decode, occupancy
 
@@ -91,29 +91,7 @@ def test_cells_lead_back_to_within_half_their_diagonal(dtype):
         assert distance.min(1).max() <= limit  # every point a cell
 
 
-def test_a_cloud_outside_the_cube_does_not_lead_back():
-    far = torch.full((1, 4, 3), 5.0)
-    flags = occupancy(far, 4)
-    assert flags.sum() == 0
-    with pytest.raises(DataError, match="No cell of cloud 0 is occupied"):
-        decode(flags, 4, normalised(far, "none"))
-
-
-def test_the_features_are_fixed_and_nothing_is_learned():
-    made = encoder(side=8)
-    assert made.fixed
-    assert not made.state_dict()
-    assert made(torch.zeros(0, 40, 3)).shape == made(torch.zeros(0, 0, 3)).shape == (0, 1, 8, 8, 8)
-
-
 @pytest.mark.parametrize("config", [{"side": 0}, {"side": 1000}, {"normalise": "ball"}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
         encoder(**config)
-
-
-def test_clouds_that_were_not_normalised_are_refused_by_none():
-    with pytest.raises(
-        DataError, match=r"Cloud 0 of the batch reaches .* encoder occupancy with normalise=none"
-    ):
-        encoder(normalise="none")(batch_of([5, 3]) * 1e8)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError
 from framework.geometry.clouds import normalised, pad, sizes
 from plugins.encoder.grids.tdf import decode, truncated_distance
 
@@ -100,21 +100,6 @@ def test_cells_lead_back_to_within_the_truncation():
         assert distance.min(1).max() <= edge * math.sqrt(3) / 2 * (1 + 1e-9)  # its own cell is among them
 
 
-def test_a_cloud_outside_the_cube_does_not_lead_back():
-    far = torch.full((1, 4, 3), 5.0)
-    field = truncated_distance(far, 4, 1.0)
-    assert (field == 1).all()
-    with pytest.raises(DataError, match="No cell of cloud 0 is near a point"):
-        decode(field, 4, normalised(far, "none"))
-
-
-def test_the_features_are_fixed_and_nothing_is_learned():
-    made = encoder(side=8)
-    assert made.fixed
-    assert not made.state_dict()
-    assert made(torch.zeros(0, 40, 3)).shape == made(torch.zeros(0, 0, 3)).shape == (0, 1, 8, 8, 8)
-
-
 @pytest.mark.parametrize(
     "config",
     [{"side": 0}, {"truncation": 0}, {"truncation": 5}, {"truncation": math.nan}, {"normalise": "ball"}],
@@ -122,8 +107,3 @@ def test_the_features_are_fixed_and_nothing_is_learned():
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
         encoder(**config)
-
-
-def test_clouds_that_were_not_normalised_are_refused_by_none():
-    with pytest.raises(DataError, match=r"Cloud 0 of the batch reaches .* encoder tdf with normalise=none"):
-        encoder(normalise="none")(batch_of([5, 3]) * 1e8)

@@ -1,0 +1,63 @@
+"""Checkpoints of heads without gradient, and of encoders whose first weights came from a file."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework.configuration.registry import installed, load
+from framework.configuration.schema import build, resolve
+from framework.density_head import Fitted
+from framework.model import Model
+from framework.runs import loading
+from framework.target import Target
+from framework.training.checkpoint import WholeCheckpoints, read
+
+WITHOUT_GRADIENT = [
+    name for name in installed("density_head") if issubclass(load("density_head", name), Fitted)
+]
+TARGETS = (Target("class", ("a", "b", "c")), Target("real", ("x", "y")))
+
+
+@pytest.mark.parametrize("name", WITHOUT_GRADIENT)
+@pytest.mark.parametrize("target", TARGETS, ids=["classes", "reals"])
+def test_a_checkpoint_holds_what_was_fitted(name: str, target: Target, tmp_path: Path) -> None:
+    def model() -> Model:
+        return Model([], build("density_head", resolve("density_head", name), target=target), (5,))
+
+    made, features = model(), torch.randn(60, 5)
+    wanted = torch.arange(60) % 3 if target.kind == "class" else features[:, :2]
+    made.head.fit(features, wanted, 5)  # type: ignore[operator]
+    made.head.calibrate(features, wanted)
+    WholeCheckpoints().save_checkpoint({"state_dict": made.state_dict()}, tmp_path / "model.ckpt")
+    other = model()
+    loading.fill(other, read(tmp_path / "model.ckpt")["state_dict"], "model.ckpt")
+    assert other.head.size == 5
+    inputs = torch.randn(60, 5)
+    assert torch.equal(other(inputs).log_prob(wanted), made(inputs).log_prob(wanted))
+
+
+class Built(Exception):
+    """Ends the loading where the model would be built."""
+
+
+def test_a_loaded_model_does_not_ask_for_what_its_training_started_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = resolve("encoder", {"name": "inception_resnet_v2", "weights": "gone.pth", "dropout": 0.3})
+    described = {
+        "format": 1,
+        "config": {"encoder": [given, resolve("encoder", "mlp")]},
+        "target": {"kind": "class", "names": ["a", "b"]},
+        "input_shape": [3, 75, 75],
+    }
+    WholeCheckpoints().save_checkpoint({"framework": described, "state_dict": {}}, tmp_path / "model.ckpt")
+
+    def built(resolved: dict[str, Any], *_: Any) -> None:
+        assert resolved["encoder"] == [{**given, "weights": None}, resolve("encoder", "mlp")]
+        raise Built
+
+    monkeypatch.setattr(loading, "build_predictor", built)
+    with pytest.raises(Built):
+        loading.load(tmp_path / "model.ckpt")
