@@ -10,7 +10,7 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -422,11 +422,12 @@ def forked(folder: Path, case: dict[str, Any], resume: Path | None) -> None:
 
 
 @pytest.fixture(scope="module")
-def trainings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("trainings")
-    command = [sys.executable, "-W", "ignore", __file__, str(folder)]
-    subprocess.run(command, check=True, capture_output=True, timeout=300)
-    return folder
+def trainings(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    def trained(folder: Path) -> None:
+        command = [sys.executable, "-W", "ignore", __file__, str(folder)]
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+
+    return once("trainings", trained)
 
 
 def history(folder: Path, stage: str) -> list[Any]:
