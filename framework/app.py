@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -57,11 +58,14 @@ def _run() -> None:
         from framework import modes
 
         hydra_config = HydraConfig.get()
+        run_folder = Path(hydra_config.runtime.output_dir)
         try:
-            return modes.run(
-                plain(config), Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
-            )
+            return modes.run(plain(config), run_folder, list(hydra_config.overrides.task))
         except UserError as error:
+            with suppress(
+                OSError
+            ):  # it holds something: a mistake that was made before the run began leaves nothing
+                run_folder.rmdir()
             # Hydra would print a stack trace's worth of its own around a sentence.
             failures.append(error)
             return None

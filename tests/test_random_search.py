@@ -319,7 +319,8 @@ def test_a_launcher_that_runs_jobs_in_this_process_will_do(tmp_path: Path) -> No
     search = Search(tmp_path)
     modes = (
         "import types\n"
-        "sys.modules['framework.modes'] = types.SimpleNamespace(run=lambda config: float(config.seed))\n"
+        "run = lambda values, folder, overrides: float(values['seed'])\n"
+        "sys.modules['framework.modes'] = types.SimpleNamespace(run=run)\n"
     )
     (tmp_path / "app.py").write_text(APP.replace("from framework.app", modes + "from framework.app"))
     code, output = search("hydra/launcher=basic", "seed=range(3,9)", "hydra.sweeper.trials=6")

@@ -90,6 +90,15 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
                 if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
                     targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
                     if any(isinstance(target, ast.Name) and target.id == "bibtex" for target in targets):
-                        return summary, str(ast.literal_eval(statement.value))
+                        return summary, _text(statement.value, tree)
             return summary, ""
     return "(class not found)", ""
+
+
+def _text(value: ast.expr, module: ast.Module) -> str:
+    """A text as it stands in the source, or under a name of the same module; "" where it is computed."""
+    if isinstance(value, ast.Name):
+        named = (item for item in module.body if isinstance(item, ast.Assign))
+        found = (item.value for item in named if value.id in (getattr(one, "id", "") for one in item.targets))
+        value = next(found, value)
+    return str(value.value) if isinstance(value, ast.Constant) else ""

@@ -1,6 +1,5 @@
 """Fits the session's predictor: by gradient with Lightning, or at once where its head has no gradient."""
 
-import inspect
 import os
 import time
 from pathlib import Path
@@ -10,7 +9,7 @@ from pytorch_lightning.callbacks import EarlyStopping, RichProgressBar
 from rich.console import Console
 from torch import distributed as dist
 
-from framework.configuration.settings import TRAINER_OURS, check_trainer_keys
+from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models
 from framework.runs.loading import fill, weights
@@ -122,7 +121,6 @@ def _cached(session: Session) -> Data:
 
 def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
     chosen = dict(run.settings.trainer)
-    check_trainer_keys(chosen, set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"})
     patience = chosen.get("patience")
     callbacks: list[pl.Callback] = [
         Report(run.tracker, chosen.get("log_every_steps") or 10),

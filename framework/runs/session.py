@@ -1,6 +1,7 @@
 """A session: threads, device, and all parts of a command, built and matched before a step is trained."""
 
 import ctypes
+import inspect
 import logging
 import platform
 import warnings
@@ -8,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import pytorch_lightning as pl
 import torch
 from rich.console import Console
 
@@ -23,7 +25,7 @@ from framework.configuration.assembly import (
 )
 from framework.configuration.config import Config
 from framework.configuration.schema import resolve
-from framework.configuration.settings import Settings
+from framework.configuration.settings import Settings, check_trainer_keys
 from framework.data import Batch, Data
 from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.splits import on_device
@@ -123,6 +125,8 @@ def for_training(config: Config) -> Session:
         DataError: as `Data.prepare`.
     """
     console = begin(config.settings)
+    known = set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"}
+    check_trainer_keys(config.settings.trainer, known)
     parts = config.parts
     data = build_data(parts)
     data.prepare()

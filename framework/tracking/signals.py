@@ -7,6 +7,9 @@ from types import FrameType
 from typing import NoReturn
 
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
 class Stopped(SystemExit):
     """The run was told to stop; exits with 128 + the signal's number, as shells do."""
 
@@ -28,15 +31,18 @@ class Stopper:
     @contextmanager
     def installed(self) -> Iterator[None]:
         """Handle both signals inside the block; the handlers before are restored after it."""
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        before = {number: signal.getsignal(number) for number in numbers}
-        for number in numbers:
-            signal.signal(number, self._handle)
+        before = {number: signal.getsignal(number) for number in SIGNALS}
+        self.install()
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    def install(self) -> None:
+        """Handle both signals, whoever has handled them since."""
+        for number in SIGNALS:
+            signal.signal(number, self._handle)
 
     def stop(self) -> NoReturn:
         """Stop now for the signal received, by this process or by another rank of it."""

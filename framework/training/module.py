@@ -245,6 +245,8 @@ class StopAtBatch(pl.Callback):
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.stopper.wait = True
+        # Lightning has put its own handler before ours, whose broadcast from inside of a signal hangs several ranks
+        self.stopper.install()
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.stopper.wait = False

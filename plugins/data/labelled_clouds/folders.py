@@ -111,7 +111,9 @@ def _collected(
     """The files of folders, given with their class and split; those of other suffixes are ignored, hidden ones too."""
     files, labels, splits, ignored = [], [], [], 0
     for name, split, folder in places:
-        held = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        shown_files = (path for path in folder.iterdir() if not path.name.startswith("."))
+        # also a folder of such a name: reading it says that it is no file
+        held = sorted(path for path in shown_files if path.is_file() or path.suffix.lower() in suffixes)
         own = [path for path in held if path.suffix.lower() in suffixes]
         ignored += len(held) - len(own)
         if not own:
