@@ -48,6 +48,7 @@ class _Moved(MetaPathFinder, Loader):
             "images": "datasets.images",
             "meshes": "geometry.meshes",
             "module_flags": "calibration.module_flags",
+            "monte_carlo": "distributions.protocol",
             "nan": "distributions.checks",
             "nearest": "geometry.nearest",
             "normals": "distributions.protocol",
@@ -57,10 +58,6 @@ class _Moved(MetaPathFinder, Loader):
             "temper": "distributions.tempering",
             "validation": "calibration.validation",
         }.items()
-    } | {
-        # went home to the one family that uses them
-        "framework.monte_carlo": "plugins.density_head.latent.monte_carlo",
-        "framework.prediction_set": "plugins.uncertainty.conformal.prediction_set",
     }
 
     def find_spec(

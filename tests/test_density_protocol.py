@@ -480,13 +480,11 @@ OLD_NAMES = {
     "rearranged": "Reshaped Stacked",
     "circular": "angular_distance circular_mean circular_median grid wrap",
     "temper": "CircularPower divided log_probabilities temper tempered tempered_classes",
-    "monte_carlo": "Effort Estimate NormalPoints SampledMixture estimate estimate_log_mean estimated estimated_error "
-    "lattice normal_quantile rows_of",
+    "monte_carlo": "Estimate estimate",
     "cdf": "arc cdf turn",
     "normals": "Normals mahalanobis normals one_normal",
     "circular_moments": "CircularMoments circular_moments",
     "class_probabilities": "class_probabilities require_labels",
-    "prediction_set": "PredictionSet Score",
 }
 
 

@@ -68,10 +68,7 @@ def test_the_core_names_no_method() -> None:
             if word.lower() in methods:
                 yield f"line {getattr(node, 'lineno', '?')}: {word}"
 
-    core = [
-        path for path in CORE if path != ROOT / "framework" / "__init__.py"
-    ]  # which knows old modules' names
-    assert not faults(core, named)
+    assert not faults(CORE, named)
 
 
 def test_imports_are_written_in_full() -> None:
