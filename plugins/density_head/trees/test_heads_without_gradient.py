@@ -5,11 +5,11 @@ import copy
 import numpy as np
 import pytest
 import torch
-from framework.distributions.normals import mahalanobis, normals
 from scipy import stats
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.density import Mixture, marginal, median, pick
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import mahalanobis, marginal, median, normals, pick
 from framework.distributions.tempering import temper
 from framework.errors import ConfigError, UserError
 from framework.model import Model
