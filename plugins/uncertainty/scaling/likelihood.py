@@ -13,6 +13,10 @@ Term = Callable[[Tensor], Tensor]
 """Part of the mean negative log-likelihood: parameters (n,), float64 → a scalar, differentiable."""
 
 
+NEAREST = 1e-9
+"""Steps, in slopes, to a region that is not numbers."""
+
+
 class Minimum(NamedTuple):
     """Where `minimise` ended.
 
@@ -44,18 +48,32 @@ def minimise(
     first, _ = value_and_slope(terms, start)
     # a point where the sum is not finite is a step that failed: no trial may be better, and it points nowhere
     worse = first + 1 + abs(first)
+    walled: list[np.ndarray] = []
 
     def trial(numbers: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = value_and_slope(terms, torch.tensor(numbers).to(start))
-        return (value, slope) if np.isfinite([value, *slope]).all() else (worse, np.zeros_like(slope))
+        if np.isfinite([value, *slope]).all():
+            return value, slope
+        walled.append(numbers)
+        return worse, np.zeros_like(slope)
 
     options = {"ftol": rounding, "gtol": 1e-12, "maxiter": 200}
+    bounds = np.stack([low, high], 1)
     found = optimize.minimize(
-        trial, start.tolist(), jac=True, method="L-BFGS-B", bounds=np.stack([low, high], 1), options=options
+        trial, start.tolist(), jac=True, method="L-BFGS-B", bounds=bounds, options=options
     )
-    point = torch.tensor(found.x).to(start)
+    x = found.x if found.fun <= first else start.cpu().numpy()
+    step = 1.0 if walled else 0.0
+    while (
+        step > NEAREST
+    ):  # SciPy's line search stops short of a region that is not numbers: halve the steps to it
+        value, slope = trial(x)
+        ahead = np.clip(x - step * slope, low, high)
+        further = trial(ahead)[0]
+        x, step = (ahead, step) if further < value else (x, step / 2)
+    point = torch.tensor(x).to(start)
     value, slope = value_and_slope(terms, point)
-    down, up = (found.x <= low) & (slope > 0), (found.x >= high) & (slope < 0)
+    down, up = (x <= low) & (slope > 0), (x >= high) & (slope < 0)
     return Minimum(point, value, torch.from_numpy(up.astype(int) - down.astype(int)))
 
 
