@@ -1,4 +1,4 @@
-"""The model of the density road: encoders, one linear layer, a density head."""
+"""The model of the density pipeline: encoders, one linear layer, a density head."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Builds the parts of the density road from a config: data, predictor, objectives, metrics."""
+"""Builds the parts of the density pipeline from a config: data, predictor, objectives, metrics."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -24,7 +24,7 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     """Check every plugin of a composed config before any data is read.
 
     Raises:
-        ConfigError: a part of the road is missing, or a plugin's name, key or value is wrong.
+        ConfigError: a part of the pipeline is missing, or a plugin's name, key or value is wrong.
     """
     for group in ("data", "density_head", "encoder"):
         if not config.get(group):

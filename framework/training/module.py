@@ -1,4 +1,4 @@
-"""The one LightningModule of the density road, and the callbacks that keep a run whole."""
+"""The one LightningModule of the density pipeline, and the callbacks that keep a run whole."""
 
 import math
 from collections.abc import Callable, Sequence
