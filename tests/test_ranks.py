@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -102,18 +105,37 @@ def test_two_ranks_give_the_numbers_of_one_process(name: str, framework: Framewo
     assert two.out.count("run folder:") == 2, "the first rank alone speaks: at the start and at the end"
 
 
-@pytest.mark.parametrize("number", [15, 9], ids=["SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize(
+    ("number", "launcher"),
+    [(15, "ours"), (9, "ours"), (9, "torchrun")],
+    ids=["SIGTERM", "SIGKILL", "resumed by torchrun"],
+)
 def test_ranks_that_were_stopped_go_on_to_the_same_bits(
-    number: int, whole_of_two: Done, framework: Framework, tmp_path: Path
+    number: int, launcher: str, whole_of_two: Done, framework: Framework, stranger_site: Path, tmp_path: Path
 ) -> None:
     marker = tmp_path / "marker"
     stop = ("+data.signal_at=14", f"+data.signal_number={number}", f"+data.signal_marker={marker}")
     broken = framework(*STEPS, *stop, folder="broken")
     assert broken.code != 0
     assert marker.exists()
-    resumed = framework(f"resume={broken.folder}")
-    assert resumed.code == 0, resumed.out
-    assert "resuming from" in resumed.out
+    if launcher == "ours":
+        resumed = framework(f"resume={broken.folder}")
+        assert resumed.code == 0, resumed.out
+        assert resumed.out.count("resuming from") == 1
+    else:
+        launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+        environment = {**os.environ, "PYTHONPATH": str(stranger_site), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [*launch, "-m", "framework", f"resume={broken.folder}"],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=200,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert (done.stdout + done.stderr).count("resuming from") == 1
     wanted, found = (numbers(done, "") for done in (whole_of_two, broken))
     exact = [key for key in wanted if not key.startswith("cost/")]
     assert len(exact) > 30

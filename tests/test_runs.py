@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -48,6 +49,42 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(
     assert again.losses() != other.losses()
     results = [json.loads((done.folder / "results.json").read_text()) for done in (again, whole)]
     assert results[0]["log_likelihood"] == results[1]["log_likelihood"]
+
+
+def test_another_run_in_a_used_folder_takes_nothing_of_the_earlier_one(
+    framework: Framework, whole: Done, tmp_path: Path
+) -> None:
+    shutil.copytree(whole.folder, tmp_path / "used")
+    other = [
+        *QUIET,
+        "encoder.mlp.widths=[8]",
+        "+data.signal_at=2",
+        f"+data.signal_marker={tmp_path / 'marker'}",
+    ]
+    killed = framework(*other, f"+data.signal_number={signal.SIGKILL.value}", folder="used")
+    assert killed.code == -signal.SIGKILL
+    assert not list(killed.folder.glob("checkpoints/*.ckpt"))
+    assert not (killed.folder / "results.json").exists(), "it would be read as this run's"
+    for name in ("checkpoints/model.ckpt", "results.json", "config.yaml"):
+        assert (killed.folder / "earlier.1" / name).read_bytes() == (whole.folder / name).read_bytes()
+    refused = framework("mode=predict", f"checkpoint={killed.folder}", "logger=none", folder="predicted")
+    assert refused.code == 1, refused.out
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert "nothing to resume from yet" in resumed.out
+    assert (killed.folder / "results.json").exists()
+    again = framework(*QUIET, "resume=never", f"hydra.run.dir={killed.folder}", folder="used")
+    assert again.code == 0, again.out
+    assert again.losses() == whole.losses()
+    assert (killed.folder / "earlier.2" / "results.json").exists()
+
+
+@pytest.mark.parametrize("stray", ["RANK", "SLURM_PROCID"])
+def test_a_stray_variable_makes_no_run_a_second_rank(framework: Framework, whole: Done, stray: str) -> None:
+    done = framework(*QUIET, more={stray: "1"})
+    assert done.code == 0, done.out
+    assert done.losses() == whole.losses()
+    assert (done.folder / "results.json").exists()
 
 
 @pytest.mark.parametrize("workers", [0, 2])

@@ -16,7 +16,7 @@ from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
 from framework.runs.loading import load_with_description
 from framework.runs.run import opened
-from framework.runs.session import around, begin, calibrate
+from framework.runs.session import around, begin, calibrate, tested
 from framework.uncertainty import Joining
 
 
@@ -43,23 +43,14 @@ def run(config: Config) -> None:
     ]
     parts = {**described["config"], "uncertainty": [*described["config"]["uncertainty"], *wrappers]}
     session = around(config, members[0][0], {**described, "config": parts}, str(sources[0]), console)
+    session = tested(session)
     session.predictor = joined(parts, session.data, [member for member, _ in members])
     with opened(config) as run:
         session.record(run)
         calibrate(session)
         session.save_model(run)
         console.print(f"{len(members)} members: {', '.join(map(str, sources))}", soft_wrap=True)
-        report_test(
-            run,
-            session.predictor,
-            session.parts,
-            session.data,
-            session.batches(),
-            session.metrics,
-            session.device,
-            session.console,
-            session.outliers,
-        )
+        report_test(run, session)
 
 
 def found(members: str | Sequence[str]) -> list[str | Path]:

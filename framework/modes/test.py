@@ -3,22 +3,12 @@
 from framework.configuration.config import Config
 from framework.reports.report import report_test
 from framework.runs.run import opened
-from framework.runs.session import for_trained
+from framework.runs.session import for_trained, tested
 
 
 def run(config: Config) -> None:
     """Print the table row of `checkpoint`."""
-    session = for_trained(config)
+    session = tested(for_trained(config))
     with opened(config) as run:
         session.record(run)
-        report_test(
-            run,
-            session.predictor,
-            session.parts,
-            session.data,
-            session.batches(),
-            session.metrics,
-            session.device,
-            session.console,
-            session.outliers,
-        )
+        report_test(run, session)

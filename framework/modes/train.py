@@ -21,16 +21,6 @@ def run(config: Config) -> float:
             report_training(run, kept_epoch=epoch, synthetic=session.data.synthetic)
         calibrate(session)
         session.save_model(run)
-        report_test(
-            run,
-            session.predictor,
-            session.parts,
-            session.data,
-            session.batches(),
-            session.metrics,
-            session.device,
-            session.console,
-            session.outliers,
-        )
+        report_test(run, session)
     leave_value(config.folder, loss)
     return loss

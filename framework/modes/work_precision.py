@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from framework.configuration.assembly import build_metrics
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Positive
 from framework.data import Batch
@@ -46,7 +47,7 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     from framework.reports.tradeoff_picture import Floor, error_against_run_time
 
     predictor, data, parts, settings = session.predictor, session.data, session.parts, session.settings
-    metrics = [metric for metric in session.metrics if "outliers" not in metric.splits]
+    metrics = [metric for metric in build_metrics(parts, session.target) if "outliers" not in metric.splits]
     knob = options.knob or first_knob(predictor)
     owner = owners(predictor, knob)[0]
     better = _chosen(options.metrics, metrics, own=isinstance(owner, DensityHead))

@@ -14,54 +14,38 @@ from framework.distributions.circular import angular_distance
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import circular_entropy, circular_grid
 from framework.evaluation.splits import on_device
-from framework.model import Predictor
 from framework.prediction import Prediction
 from framework.reports.class_picture import choose_classified, classified
 from framework.reports.landscape_picture import Plane, half_width, landscapes, probabilities
 from framework.reports.viewing_circles import choose, viewing_circles
-from framework.training.batches import Batches
+from framework.runs.session import Session
 
 PICTURED = 128
 """How many test samples those that are shown are chosen from."""
 
 
-def prediction_pictures(
-    predictor: Predictor,
-    data: Data,
-    batches: Batches,
-    outliers: Data | None,
-    device: torch.device,
-    *,
-    samples: int,
-    caption: str,
-) -> Iterator[tuple[str, Figure]]:
-    """The pictures with their file names.
-
-    Args:
-        predictor: on `device`.
-        samples: as of `Prediction`.
-        caption: names the predictor.
-    """
-    if data.target.kind == "angle":
-        yield "predicted_densities.png", _densities(predictor, data, batches, device, samples)
-    if data.target.kind == "class" and data.plane:
-        yield "landscape.png", _landscape(predictor, data, outliers, caption)
-    elif data.target.kind == "class":
-        yield "classified.png", _classified(predictor, data, batches, device)
+def prediction_pictures(session: Session, caption: str) -> Iterator[tuple[str, Figure]]:
+    """The pictures with their file names; `caption` names the predictor."""
+    kind = session.target.kind
+    if kind == "angle":
+        yield "predicted_densities.png", _densities(session)
+    if kind == "class" and session.data.plane:
+        yield "landscape.png", _landscape(session, caption)
+    elif kind == "class":
+        yield "classified.png", _classified(session)
 
 
 @torch.no_grad()
-def _densities(
-    predictor: Predictor, data: Data, batches: Batches, device: torch.device, samples: int
-) -> Figure:
+def _densities(session: Session) -> Figure:
     """Of the first angle, on the viewing circle over their images, chosen from the first samples of the test split."""
+    predictor, data = session.predictor, session.data
     inputs: list[Tensor] = []
     columns: list[tuple[Tensor, ...]] = []
     angles = torch.zeros(0)
-    for batch in on_device(batches.test_dataloader(), device):
+    for batch in on_device(session.batches().test_dataloader(), session.device):
         if len(inputs) >= PICTURED:
             break
-        prediction = Prediction(predictor(batch["input"]), batch, samples)
+        prediction = Prediction(predictor(batch["input"]), batch, session.settings.samples)
         first = prediction.marginal(0)
         angles, log_density = circular_grid(first)
         entropy, truth, point = circular_entropy(first), batch["target"][:, 0], prediction.point[:, 0]
@@ -87,14 +71,15 @@ def _densities(
 
 
 @torch.no_grad()
-def _classified(predictor: Predictor, data: Data, batches: Batches, device: torch.device) -> Figure:
+def _classified(session: Session) -> Figure:
     """Chosen from all over the test split."""
+    predictor, data = session.predictor, session.data
     dataset = data.splits().test
     length: int = len(dataset)  # pyright: ignore[reportArgumentType]
     some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
     inputs: list[Tensor] = []
     shares, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
-    for batch in on_device(batches.of(some), device):
+    for batch in on_device(session.batches().of(some), session.device):
         shares.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
         labels.append(batch["target"].cpu().numpy())
         inputs.extend(batch["input"].cpu())
@@ -112,8 +97,9 @@ def _classified(predictor: Predictor, data: Data, batches: Batches, device: torc
     )
 
 
-def _landscape(predictor: Predictor, data: Data, outliers: Data | None, caption: str) -> Figure:
+def _landscape(session: Session, caption: str) -> Figure:
     """Class probabilities over the plane of the inputs, with test samples and outliers."""
+    predictor, data, outliers = session.predictor, session.data, session.outliers
     points, labels = _first(data)
     others = _first(outliers)[0] if outliers is not None else points[:0]
     plane = Plane(points, labels, others, data.target.names, half_width(points, others))

@@ -2,61 +2,47 @@
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
 from rich.console import Console
 
-from framework.configuration.assembly import Resolved
-from framework.data import Data
 from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
-from framework.metric import Metric, Pictured
-from framework.model import Predictor
+from framework.metric import Pictured
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table
 from framework.runs.run import Run, stored_overrides
-from framework.training.batches import Batches
+from framework.runs.session import Session
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def report_test(
-    run: Run,
-    predictor: Predictor,
-    resolved: Resolved,
-    data: Data,
-    batches: Batches,
-    metrics: Sequence[Metric],
-    device: torch.device,
-    console: Console,
-    outliers: Data | None = None,
-) -> None:
+def report_test(run: Run, session: Session) -> None:
     """Test, measure the cost, print the table, write results.json and the pictures, tell the tracker.
 
     Args:
-        outliers: prepared, where a metric reads them.
+        session: after `tested`.
     """
+    settings, data, outliers, metrics = session.settings, session.data, session.outliers, session.metrics
+    batches = session.batches()
     loader = batches.test_dataloader()
-    settings = run.settings
     found = evaluate(
-        predictor,
+        session.predictor,
         loader,
         metrics,
         groups=data.groups,
         samples=settings.samples,
         seed=settings.seed,
-        device=device,
+        device=session.device,
         outliers=() if outliers is None else batches.of(outliers.splits().test),
     )
-    spent = cost(predictor, next(iter(loader)), samples=settings.samples, device=device)
+    spent = cost(session.predictor, next(iter(loader)), samples=settings.samples, device=session.device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
-    results = _results(run, resolved, data, found, spent, columns, better)
+    results = _results(run, session, found, spent, columns, better)
     results["synthetic"] = synthetic
     path = run.folder / "results.json"
     path.write_text(json.dumps(results, indent=1), encoding="utf-8")
@@ -68,8 +54,7 @@ def report_test(
     if settings.pictures:
         from framework.reports.prediction_pictures import prediction_pictures
 
-        options = {"samples": settings.samples, "caption": results["method"]}
-        for name, figure in prediction_pictures(predictor, data, batches, outliers, device, **options):
+        for name, figure in prediction_pictures(session, results["method"]):
             picture(run, figure, name)
         for metric in found.metrics:
             if isinstance(metric, Pictured):
@@ -80,33 +65,27 @@ def report_test(
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
     ]
     title = f"{results['experiment']} on {results['data']}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
-    console.print(
+    session.console.print(
         results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
     )
-    _next_steps(run, spent, console)
+    _next_steps(run, spent, session.console)
 
 
 def _results(
-    run: Run,
-    resolved: Resolved,
-    data: Data,
-    found: Evaluation,
-    spent: Cost,
-    columns: dict[str, str],
-    better: Better,
+    run: Run, session: Session, found: Evaluation, spent: Cost, columns: dict[str, str], better: Better
 ) -> dict[str, Any]:
     name = run.settings.experiment_name
-    wrappers = [part["name"] for part in resolved["uncertainty"]]
+    wrappers = [part["name"] for part in session.parts["uncertainty"]]
     if name:  # an experiment's name stands for its own wrappers
         method = name.rpartition("/")[2]
         changed = any(item.lstrip("+~").startswith("uncertainty") for item in stored_overrides(run.folder))
         wrappers = wrappers if changed else []
     else:
-        method = str(resolved["density_head"]["name"])
+        method = str(session.parts["density_head"]["name"])
     return {
         "method": " + ".join([method, *wrappers]),
         "experiment": name or "no experiment",
-        "data": ", ".join(data.groups),
+        "data": ", ".join(session.data.groups),
         "seed": run.settings.seed,
         **{key: _plain(value) for key, value in found.total.items()},
         "groups": {

@@ -1,6 +1,5 @@
 """Fits the session's predictor: by gradient with Lightning, or at once where its head has no gradient."""
 
-import os
 import time
 from pathlib import Path
 
@@ -22,8 +21,6 @@ from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Trai
 
 TRAINED = {"last.ckpt", "previous.ckpt", "best.ckpt"}
 """Checkpoints that training can go on from; model.ckpt holds weights alone."""
-RESUMED_FROM = "FRAMEWORK_RESUMED_FROM"
-"""Environment variable by which the first rank tells those it starts which checkpoint they go on from."""
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
@@ -80,12 +77,9 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
 
 
 def _resumed_from(session: Session, run: Run) -> Path | None:
-    """The checkpoint that training goes on from, the same for all ranks."""
-    if not first_rank():
-        told = os.environ.get(RESUMED_FROM)
-        return Path(told) if told else None
+    """The checkpoint that training goes on from: every rank looks before the first writes another."""
     resume = latest_good(run.checkpoints, names=TRAINED) if run.resumed else None
-    if run.resumed:
+    if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
         run.tracker.drop_after(step)
         session.console.print(
@@ -93,7 +87,6 @@ def _resumed_from(session: Session, run: Run) -> Path | None:
             if resume is None
             else f"resuming from {resume} (step {step})."
         )
-    os.environ[RESUMED_FROM] = str(resume or "")
     return resume
 
 

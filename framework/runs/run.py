@@ -1,5 +1,6 @@
 """One run: its folder, its tracking, its signals; closed FINISHED, FAILED or KILLED whatever happens."""
 
+import itertools
 import os
 import sys
 import traceback
@@ -21,6 +22,20 @@ from framework.tracking.run_info import read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
+
+LEFT_BY_RUNS = (
+    "config.yaml",
+    "overrides.yaml",
+    "checkpoints",
+    "figures",
+    "results.json",
+    "citations.bib",
+    "params.json",
+    "predictions.csv",
+    "work_precision.csv",
+    "traceback.txt",
+)
+"""What modes write into a run folder, but for the journal, which the tracker keeps."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +61,14 @@ class Run:
 
 
 def first_rank() -> bool:
-    """Whether this process keeps the run's record: the only one, or the first of several that train together."""
-    rank = next((os.environ[key] for key in ("RANK", "SLURM_PROCID") if key in os.environ), None)
-    if rank is not None:
-        return rank == "0"
+    """Whether this process keeps the run's record: the only one, or the first of several that train together.
+
+    A launcher (Lightning, torchrun, srun) says which rank this is and of how many. A rank without a number of ranks is
+    somebody else's variable.
+    """
+    for rank, ranks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS")):
+        if rank in os.environ and os.environ.get(ranks, "1") != "1":
+            return os.environ[rank] == "0"
     return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
 
 
@@ -69,14 +88,10 @@ def stored_overrides(folder: Path) -> list[str]:
 def opened(config: Config) -> Iterator[Run]:
     """Open the run; on the way out close it with the right status.
 
-    Continues the run in its folder when that has the same config, did not finish and `resume` allows it. A rank other
-    than the first writes nothing: its run is a silent one.
+    Continues the run in its folder when that has the same config, did not finish and `resume` allows it; otherwise
+    what that run left is set aside. A rank other than the first writes nothing: its run is a silent one.
     """
     stopper = Stopper()
-    if not first_rank():
-        with stopper.installed():
-            yield Run(config, SilentTracker(config.folder), stopper, resumed=False)
-        return
     earlier = read_run_info(config.folder)
     resumed = (
         earlier is not None
@@ -84,17 +99,18 @@ def opened(config: Config) -> Iterator[Run]:
         and config.settings.resume != "never"
         and _same(stored_config(config.folder), config.values)
     )
-    (config.folder / "checkpoints").mkdir(parents=True, exist_ok=True)
-    if not resumed:
-        write_whole(
-            config.folder / "config.yaml", yaml.safe_dump(dict(config.values), sort_keys=False).encode()
-        )
-        write_whole(config.folder / "overrides.yaml", yaml.safe_dump(list(config.overrides)).encode())
+    if not first_rank():
+        with stopper.installed():
+            yield Run(config, SilentTracker(config.folder), stopper, resumed)
+        return
+    config.folder.mkdir(parents=True, exist_ok=True)
     tracker = _tracker(config, earlier.run_id if resumed and earlier else None, resumed)
     with stopper.installed():
-        tracker.open()
+        tracker.open()  # from here on the folder is this process's
         run = Run(config, tracker, stopper, resumed)
         try:
+            if not resumed:
+                _begin_folder(config)
             _describe(run)
             yield run
         except BaseException as error:
@@ -105,6 +121,21 @@ def opened(config: Config) -> Iterator[Run]:
                 sys.stderr.write(f"stopped; go on with: python -m framework resume={run.folder}\n")
             raise
         tracker.close("FINISHED")
+
+
+def _begin_folder(config: Config) -> None:
+    """Leave the config in the folder, and what an earlier run left there in `earlier.<n>`: nothing of it may be
+    resumed from, loaded or compared as this one's."""
+    folder = config.folder
+    left = [folder / name for name in LEFT_BY_RUNS if (folder / name).exists()]
+    if left:
+        aside = next(path for n in itertools.count(1) if not (path := folder / f"earlier.{n}").exists())
+        aside.mkdir()
+        for path in left:
+            path.replace(aside / path.name)
+    (folder / "checkpoints").mkdir()
+    write_whole(folder / "overrides.yaml", yaml.safe_dump(list(config.overrides)).encode())
+    write_whole(folder / "config.yaml", yaml.safe_dump(dict(config.values), sort_keys=False).encode())
 
 
 def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:

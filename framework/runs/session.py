@@ -6,7 +6,7 @@ import logging
 import platform
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytorch_lightning as pl
@@ -26,7 +26,8 @@ from framework.configuration.assembly import (
 from framework.configuration.config import Config
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings, check_trainer_keys
-from framework.data import Batch, Data
+from framework.data import Data
+from framework.datasets.fields import as_batch
 from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.splits import on_device
 from framework.metric import Metric
@@ -50,24 +51,24 @@ class Session:
         parts: every plugin with every parameter, as they were built.
         target: what is predicted.
         data: prepared, unless only a user's own files are read.
-        outliers: prepared, where a metric reads them.
         predictor: untrained, or as loaded.
-        objectives: of the training loss.
-        metrics: fresh, in the order asked for.
         device: where the predictor is evaluated.
         console: for people; says nothing in ranks other than the first.
+        objectives: of the training loss.
+        metrics: fresh, in the order asked for; none before `tested`.
+        outliers: prepared, where a metric reads them; None before `tested`.
     """
 
     settings: Settings
     parts: Resolved
     target: Target
     data: Data
-    outliers: Data | None
     predictor: Predictor
-    objectives: Sequence[Objective]
-    metrics: Sequence[Metric]
     device: torch.device
     console: Console
+    objectives: Sequence[Objective] = ()
+    metrics: Sequence[Metric] = ()
+    outliers: Data | None = None
 
     def batches(self, data: Data | None = None) -> Batches:
         """Of the session's data, or of what stands in for them."""
@@ -130,8 +131,6 @@ def for_training(config: Config) -> Session:
     parts = config.parts
     data = build_data(parts)
     data.prepare()
-    outliers = build_outliers(parts, data)
-    metrics = build_metrics(parts, data.target)
     objectives = build_objectives(parts)
     predictor = build_predictor(
         parts, data.target, data.input_shape, config.settings.seed, columns=data.columns
@@ -141,20 +140,24 @@ def for_training(config: Config) -> Session:
             f"density_head={parts['density_head']['name']} is fitted at once and has no gradient, which objectives "
             "work by. Leave objective out."
         )
-    found = Session(
-        config.settings,
-        parts,
-        data.target,
-        data,
-        outliers,
-        predictor,
-        objectives,
-        metrics,
-        torch.device("cpu"),
-        console,
-    )
-    rehearse(found)
-    return found
+    device = torch.device("cpu")
+    session = Session(config.settings, parts, data.target, data, predictor, device, console, objectives)
+    session = tested(session)
+    if first_rank():
+        rehearse(session)
+    return session
+
+
+def tested(session: Session) -> Session:
+    """The session with what a test reads: fresh metrics, and the outliers of those that want some.
+
+    Raises:
+        ConfigError: a metric does not fit the target, or wants outliers and there are none.
+        DataError: as `Data.prepare`.
+    """
+    require_outliers(session.parts)
+    outliers = build_outliers(session.parts, session.data)
+    return replace(session, metrics=build_metrics(session.parts, session.target), outliers=outliers)
 
 
 @torch.no_grad()
@@ -166,8 +169,8 @@ def rehearse(session: Session) -> None:
     """
     if fitted_models(session.predictor):
         return  # predicts nothing before it is fitted
-    batch = next(iter(session.batches().val_dataloader()))
-    some: Batch = {name: tensor[:2] for name, tensor in batch.items()}
+    validation = session.data.splits().validation
+    some = as_batch([validation[index] for index in range(min(2, len(validation)))])  # type: ignore[arg-type]
     seed_step(session.settings.seed, 0, "rehearsal")
     training = session.predictor.training
     density = session.predictor.eval()(some["input"])
@@ -183,7 +186,7 @@ def for_trained(config: Config, *, prepare: bool = True) -> Session:
     Without `prepare` the data can only read a user's own files: nothing is generated or loaded for that.
 
     Raises:
-        ConfigError: no checkpoint is named, or a metric wants outliers and there are none.
+        ConfigError: no checkpoint is named.
         CheckpointError: there is none, or the data does not fit the model.
     """
     console = begin(config.settings)
@@ -212,18 +215,14 @@ def around(
     if config.values.get("metric"):
         chosen = config.values["metric"]
         parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
-    require_outliers(parts)
     parts["data"] = resolve("data", parts["data"])
     data = build_data(parts)
-    outliers = None
     if prepare:
         data.prepare()
         require_fit(data, described, source)
-        outliers = build_outliers(parts, data)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-    metrics = build_metrics(parts, target) if prepare else []
-    return Session(config.settings, parts, target, data, outliers, predictor, [], metrics, device, console)
+    return Session(config.settings, parts, target, data, predictor, device, console)
 
 
 def require_fit(data: Data, described: Mapping[str, Any], source: str) -> None:
