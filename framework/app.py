@@ -42,11 +42,14 @@ def _run() -> None:
 
         show()
         return
+    from framework.configuration.composition import command_line, folder, help_text, plain, register
+
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        sys.stdout.write(help_text() + "\n")
+        return
     import hydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import DictConfig
-
-    from framework.configuration.composition import command_line, folder, plain, register
 
     sys.argv[1:] = command_line(sys.argv[1:])
     register()

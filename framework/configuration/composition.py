@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
@@ -126,10 +127,24 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
+def help_text() -> str:
+    """What `--help` prints: how to call, and every group with its options.
+
+    Hydra's own lists the groups in 0.7 s, since it copies its store for each.
+    """
+    words = yaml.safe_load((folder() / "config.yaml").read_text(encoding="utf-8"))["hydra"]["help"]
+    groups = sorted({path.name for root in _roots() for path in root.iterdir() if path.is_dir()})
+    lines = [f"{group}: {', '.join(_options(group))}" for group in groups]
+    return "\n".join([words["header"], *lines, "", words["footer"].rstrip()])
+
+
+def _roots() -> list[Path]:
+    return [folder(), *config_folders().values()]
+
+
 def _options(group: str) -> list[str]:
     """Every config of a group, sub-folders included, ours and the plugins'."""
-    roots = [folder(), *config_folders().values()]
-    found = {path.relative_to(root / group) for root in roots for path in (root / group).rglob("*.yaml")}
+    found = {path.relative_to(root / group) for root in _roots() for path in (root / group).rglob("*.yaml")}
     return sorted(str(path.with_suffix("")) for path in found)
 
 
