@@ -98,10 +98,10 @@ def main() -> None:
     fields: dict[str, torch.Tensor] = {}
     for result in sorted(Path(sys.argv[1]).glob("*/results.json")):
         row = json.loads(result.read_text(encoding="utf-8"))
-        model, described = load_with_description(result.parent)
+        model, description = load_with_description(result.parent)
         if not fields:
             root = {"root": sys.argv[2]} if len(sys.argv) > 2 else {}
-            data = build("data", described["config"]["data"] | root)
+            data = build("data", description.config["data"] | root)
             data.prepare()
             batch = data.splits().test.__getitems__(range(min(IMAGES, len(data.splits().test))))
             fields = {"input": batch["input"], "target": batch["target"]}

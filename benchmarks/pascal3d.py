@@ -42,10 +42,10 @@ COLUMNS = {
 
 def milliseconds(run: Path, loaders: dict[str, Batches]) -> float:
     """Run time of one prediction of a trained model, one thread."""
-    model, described = load_with_description(run)
-    category = str(described["config"]["data"]["category"])
+    model, description = load_with_description(run)
+    category = str(description.config["data"]["category"])
     if category not in loaders:
-        data = build_data(described["config"])
+        data = build_data(description.config)
         data.prepare()
         loaders[category] = Batches(data, batch_size=16, workers=0, seed=0)
     batch = next(iter(loaders[category].test_dataloader()))

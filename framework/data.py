@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.errors import DataError
 from framework.target import Target
 
 Batch = dict[str, Tensor]
@@ -94,6 +96,40 @@ class Data(ABC):
             DataError: a file cannot be read; names it.
         """
 
+    def inputs(self, given: Any) -> Tensor:
+        """What a user gives a trained model, as a batch of inputs; needs no `prepare`.
+
+        By default files are `read`, and an array of inputs, or of one input, is taken as it is. A data set that scales
+        its inputs, or whose users have something else at hand (a table, an image), says so here.
+
+        Raises:
+            DataError: it is none of these, or of another shape.
+        """
+        files = [given] if isinstance(given, str | Path) else given
+        if isinstance(files, Sequence) and files and all(isinstance(item, str | Path) for item in files):
+            dataset = self.read([Path(item) for item in files])
+            items = [dataset[index]["input"] for index in range(len(dataset))]  # type: ignore[arg-type]
+            if len({item.shape for item in items}) > 1:
+                raise DataError("These files give inputs of different sizes. Give them one by one.")
+            return torch.stack(items)
+        return as_inputs(given, self.input_shape)
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """What `inputs` and `read` need beside the config, as plain values and tensors: it travels with the model."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take that of a model's training data; `prepare` after it makes inputs as that model reads them.
+
+        Raises:
+            DataError: it belongs to another kind of data.
+        """
+        if state:
+            raise DataError(
+                f"{type(self).__name__} keeps nothing beside its config, but was given {', '.join(state)}. Give the "
+                "data that the model was trained on."
+            )
+
     @abstractmethod
     def augment(self, batch: Batch) -> Batch:
         """A training batch, randomly varied, on whatever device it is; or the batch itself.
@@ -109,6 +145,36 @@ class Data(ABC):
     @abstractmethod
     def picture(self, inputs: Tensor) -> np.ndarray:
         """One input as a person would see it: (height, width, 3) uint8."""
+
+
+def as_inputs(given: Any, shape: tuple[int, ...]) -> Tensor:
+    """An array, or whatever NumPy makes one of, as a batch of inputs of `shape`; one input becomes a batch of one.
+
+    Clouds, of shape (points, columns), may have any number of points.
+
+    Raises:
+        DataError: it is no array of numbers, or of another shape.
+    """
+    wanted = "×".join(["any number", str(shape[-1])] if len(shape) == 2 else map(str, shape)) or "one number"
+    try:
+        found = (
+            given
+            if isinstance(given, Tensor)
+            else torch.from_numpy(np.require(given, requirements=["C", "W"]))
+        )
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"{type(given).__name__} is no input of this model; wanted an array of inputs of shape {wanted}, or files."
+        ) from error
+    if found.dim() == len(shape):
+        found = found[None]
+    fixed = shape[1:] if len(shape) == 2 else shape
+    if found.dim() != len(shape) + 1 or tuple(found.shape[found.dim() - len(fixed) :]) != tuple(fixed):
+        raise DataError(
+            f"an array of shape {'×'.join(map(str, found.shape))} is no batch of inputs of shape {wanted}; give "
+            f"(batch, {', '.join(map(str, shape))}), or one input."
+        )
+    return found
 
 
 def _from_three_methods(data: Any) -> Splits:

@@ -1,5 +1,6 @@
 """What a model predicted for one batch; whatever is derived from it is computed on first use, once."""
 
+from contextlib import nullcontext
 from functools import cached_property
 from typing import Literal
 
@@ -8,6 +9,7 @@ from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.noise import Draw
 from framework.distributions.protocol import Estimate, estimate, marginal, median
 
 Split = Literal["test", "outliers"]
@@ -22,15 +24,22 @@ class Prediction:
         batch: the fields of the batch, on the density's device.
         samples: draws for a point prediction that has no closed form (S of eq. 3.24).
         split: where the batch comes from; the targets of outliers mean nothing.
+        draw: where noise comes from; None: torch's generators as they stand.
     """
 
     def __init__(
-        self, density: Distribution, batch: Batch, samples: int = 1000, split: Split = "test"
+        self,
+        density: Distribution,
+        batch: Batch,
+        samples: int = 1000,
+        split: Split = "test",
+        draw: Draw | None = None,
     ) -> None:
         self.density = density
         self.batch = batch
         self.samples = samples
         self.split: Split = split
+        self._draw = draw or (lambda purpose: nullcontext())
 
     @property
     def target(self) -> Tensor:
@@ -44,22 +53,26 @@ class Prediction:
     @cached_property
     def estimate(self) -> Estimate:
         """The same with its Monte Carlo error and the samples it took: 0 where nothing is drawn, NaN if not known."""
-        return estimate(self.density, self.target)
+        with self._draw("estimate"):
+            return estimate(self.density, self.target)
 
     @cached_property
     def class_probabilities(self) -> Tensor:
         """Of each class, (batch, class), float64; of a density over anything else a UserError."""
-        return class_probabilities(self.density)
+        with self._draw("class probabilities"):
+            return class_probabilities(self.density)
 
     @cached_property
     def entropy(self) -> Tensor:
         """Of each density, (batch,), nats."""
-        return self.density.entropy()
+        with self._draw("entropy"):
+            return self.density.entropy()
 
     @cached_property
     def point(self) -> Tensor:
         """The prediction of least expected absolute deviation (eq. 3.23-3.24), shaped like the target."""
-        return median(self.density, self.samples)
+        with self._draw("point"):
+            return median(self.density, self.samples)
 
     def marginal(self, index: int) -> Distribution:
         """The density of one number of the target."""

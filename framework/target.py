@@ -19,10 +19,15 @@ class Target:
         names: for angles and reals the name of each number, e.g. ("azimuth", "elevation", "tilt"), and a batch
             of targets is a float tensor of shape (batch, len(names)); for classes the label names, and a batch
             of targets is an int64 tensor of shape (batch,).
+        location, scale: of reals, the mean and standard deviation of each number over the training split: a head
+            is scaled by them, so that its raw numbers are of the order of 1 in whatever unit. () where the numbers
+            are of that order already; the head then takes 0 and 1.
     """
 
     kind: Kind
     names: tuple[str, ...]
+    location: tuple[float, ...] = ()
+    scale: tuple[float, ...] = ()
 
     @property
     def told(self) -> str:

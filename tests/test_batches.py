@@ -26,9 +26,10 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data
 from framework.datasets.fields import Fields, as_batch
+from framework.distributions.noise import seed_step
 from framework.errors import ConfigError, DataError
 from framework.target import Target
-from framework.training.batches import Batches, SeededBatches, epoch_order, seed_step
+from framework.training.batches import Batches, SeededBatches, epoch_order
 from framework.training.checkpoint import WholeCheckpoints
 
 SAMPLES = 165  # ten batches of 16, and a rest

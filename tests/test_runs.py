@@ -184,16 +184,48 @@ def test_a_stored_config_cannot_run_code(framework: Framework, whole: Done, tmp_
     assert "must not be able to run code" in tested.out
 
 
-def test_test_and_predict_repeat_what_training_reported(framework: Framework, whole: Done) -> None:
-    wanted = json.loads((whole.folder / "results.json").read_text())["log_likelihood"]
-    tested = framework(
-        "mode=test", f"checkpoint={whole.folder}", "logger=none", "batch_size=16", folder="tested"
+def test_test_and_predict_repeat_what_training_reported(framework: Framework) -> None:
+    """Also where everything is drawn: latent numbers, dropout in the test, medians, scores."""
+    drawn = [
+        "density_head=scvae",
+        "density_head.samples=4",
+        "encoder=[mlp]",
+        "encoder.mlp.dropout=0.2",
+        "seed=3",
+    ]
+    wrapped = ["uncertainty=[mc_dropout]", "uncertainty.mc_dropout.samples=2", "samples=20"]
+    metrics = "metric=[log_likelihood,angular_deviation,crps]"
+    trained = framework(
+        "data=dial", *drawn, *wrapped, metrics, "batch_size=16", "trainer.max_epochs=1", "logger=none"
     )
-    assert tested.code == 0, tested.out
-    assert json.loads((tested.folder / "results.json").read_text())["log_likelihood"] == wanted
-    predicted = framework("mode=predict", f"checkpoint={whole.folder}", "logger=none", folder="predicted")
-    assert predicted.code == 0, predicted.out
-    rows = (predicted.folder / "predictions.csv").read_text().splitlines()
+    assert trained.code == 0, trained.out
+
+    def numbers(done: Done) -> dict[str, object]:
+        assert done.code == 0, done.out
+        found = json.loads((done.folder / "results.json").read_text())
+        others = {"milliseconds", "memory", "folder", "columns", "better", "seconds"}
+        return {key: value for key, value in found.items() if not any(word in key for word in others)}
+
+    test = ("mode=test", f"checkpoint={trained.folder}", "logger=none")
+    wanted = numbers(trained)
+    assert wanted["method"] == "scvae + mc_dropout"
+    assert numbers(framework(*test, folder="tested")) == wanted
+    smaller = numbers(framework(*test, "batch_size=7", folder="smaller"))
+    assert smaller == wanted | {"batch_size": 7}
+    alone = numbers(framework(*test, "metric=[crps]", folder="alone"))
+    assert {key for key in alone if "crps" in key}
+    assert {key: wanted[key] for key in alone} == alone, "what one metric draws depends on the others"
+    other = numbers(framework(*test, "seed=4", folder="other"))
+    assert other["crps"] != wanted["crps"]
+
+    points = []
+    for folder in ("predicted", "again"):
+        predict = ("mode=predict", f"checkpoint={trained.folder}", "logger=none")
+        done = framework(*predict, f"batch_size={len(folder)}", folder=folder)
+        assert done.code == 0, done.out
+        points.append((done.folder / "predictions.csv").read_text())
+    assert points[0] == points[1]
+    rows = points[0].splitlines()
     assert rows[0] == "sample,needle_deg,entropy_nats"
     assert len(rows) == 49
 

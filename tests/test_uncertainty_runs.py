@@ -1,7 +1,9 @@
 """Uncertainty from the command line: ensembles trained in one pass or joined from a sweep, and metrics of outliers."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +14,8 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.modes.combine import common, found, wrapping
+from framework.runs.description import Description
+from framework.target import Target
 from tests.conftest import Done, Framework
 
 SMALL = [
@@ -59,7 +63,7 @@ def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_on
     folder = tmp_path / "sweep"
     done = framework("mode=combine", f"mode.members={folder}", "logger=none", "threads=1", folder="joined")
     numbers = results(done)
-    assert numbers["method"] == "bernoulli + ensemble"
+    assert numbers["method"] == "vanilla_128 + ensemble"
     assert numbers["synthetic"] is True
     assert "3 members" in done.out
     members = [package.load(folder / str(number)) for number in range(3)]
@@ -78,7 +82,7 @@ def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_on
         "threads=1",
         folder="scaled",
     )
-    assert results(scaled)["method"] == "bernoulli + ensemble + temperature"
+    assert results(scaled)["method"] == "vanilla_128 + ensemble + temperature"
 
     # trained in one pass, with the seed of the first: its first member saw the same batches from the same start
     once = framework(*SMALL, "uncertainty=[ensemble]", "uncertainty.ensemble.members=3", folder="once")
@@ -119,24 +123,26 @@ def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_on
     assert "'nll'" in wrong.out
 
 
-def described(**changes: object) -> dict[str, object]:
+def described(**changes: Any) -> Description:
     config = {
         "density_head": {"name": "a"},
         "encoder": [],
         "uncertainty": [],
         "data": {"name": "d", "seed": 0},
     }
-    found = {"config": config, "target": {"kind": "class"}, "input_shape": [2], "path": "here"}
     config |= {key: value for key, value in changes.items() if key in config}
-    return found | {key: value for key, value in changes.items() if key in found}
+    found = Description(config, Target("class", ("a", "b")), (2,), (), synthetic=True, path="here")
+    return replace(found, **{key: value for key, value in changes.items() if key not in config})
 
 
 def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
-    assert common([described(), described(path="there")])["path"] == "here"
+    assert common([described(), described(path="there")]).path == "here"
     with pytest.raises(CheckpointError, match="differ in encoder"):
         common([described(), described(encoder=[{"name": "mlp"}])])
     with pytest.raises(CheckpointError, match="differ in input_shape"):
-        common([described(), described(input_shape=[3])])
+        common([described(), described(input_shape=(3,))])
+    with pytest.raises(CheckpointError, match="differ in data_state"):
+        common([described(), described(data_state={"mean": [1.0]})])
     for name in ("10", "9"):
         (tmp_path / name / "checkpoints").mkdir(parents=True)
         (tmp_path / name / "checkpoints" / "model.ckpt").touch()

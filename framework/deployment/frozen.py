@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
+from framework.data import Data
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.protocol import median
 from framework.model import FrozenFrontEnd, Model, Predictor
-from framework.runs.loading import load_with_description
+from framework.runs.loading import load_with_description, reader
 
 
 def freeze(run_or_checkpoint: str | Path, *, uri: str | None = None) -> "Frozen":
@@ -32,8 +33,8 @@ def freeze(run_or_checkpoint: str | Path, *, uri: str | None = None) -> "Frozen"
     Raises:
         CheckpointError: as `framework.load`.
     """
-    predictor, described = load_with_description(run_or_checkpoint, uri=uri)
-    return frozen(predictor, tuple(described["input_shape"]))
+    predictor, description = load_with_description(run_or_checkpoint, uri=uri)
+    return Frozen(predictor, description.input_shape, reader(description))
 
 
 def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "Frozen":
@@ -54,7 +55,10 @@ class Frozen:
         form: what computes them, in words.
     """
 
-    def __init__(self, predictor: Predictor, input_shape: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, predictor: Predictor, input_shape: Sequence[int] | None = None, data: Data | None = None
+    ) -> None:
+        self.data = data
         self.predictor = copy.deepcopy(predictor).cpu().eval().requires_grad_(False)
         self.preceded = self.predictor if isinstance(self.predictor, FrozenFrontEnd) else None
         self.inner = self.predictor if self.preceded is None else self.preceded.predictor
@@ -68,13 +72,15 @@ class Frozen:
         if self.shape is not None:
             self._read(self.shape)
 
-    def __call__(self, inputs: np.ndarray | Tensor) -> np.ndarray:
+    def __call__(self, inputs: Any) -> np.ndarray:
         """Of a model of classes their probabilities, (batch, class); else the point prediction, (batch, number).
 
         Args:
-            inputs: as the predictor's, with the batch dimension first, in NumPy or on the CPU in torch.
+            inputs: what `framework.load`'s model takes; of a predictor that was frozen by itself its inputs, with the
+                batch dimension first, in NumPy or on the CPU in torch.
 
         Raises:
+            DataError: it is no input of this model.
             ValueError: what is computed is not finite; names the first such batch row.
         """
         features, network = self._features(inputs)
@@ -92,12 +98,14 @@ class Frozen:
             return median(density, 1000).numpy()
 
     @torch.inference_mode()
-    def density(self, inputs: np.ndarray | Tensor) -> Distribution:
+    def density(self, inputs: Any) -> Distribution:
         """The density over the target, with batch_shape (batch,); inputs as above."""
         return self._density(*self._features(inputs))
 
-    def _features(self, inputs: np.ndarray | Tensor) -> tuple[Any, Network | None]:
+    def _features(self, inputs: Any) -> tuple[Any, Network | None]:
         """What the inner predictor reads, in the form that the network reads, if there is one for it."""
+        if self.data is not None:
+            inputs = self.data.inputs(inputs)
         if self.preceded is not None:
             with torch.inference_mode():
                 inputs = self.preceded.features(_tensor(inputs))

@@ -8,11 +8,15 @@ import torch
 
 from framework.data import Batch
 from framework.density_head import Fitted
+from framework.distributions.noise import Draw
 from framework.evaluation.cost import Cost, measure
 from framework.metric import Metric
 from framework.model import Predictor
 from framework.prediction import Prediction, Split
-from framework.training.batches import seed_step
+
+BLOCK = 64
+"""Samples that are evaluated at once. Draws are a function of (seed, sample) only where it is one number for all: a
+density may draw for a whole batch at once. Without gradients 64 samples fit wherever a training batch of 8 does."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,12 @@ def evaluate(
     device: torch.device,
     outliers: Iterable[Batch] = (),
 ) -> Evaluation:
-    """Every metric over every batch; noise is a function of (seed, batch), so a second call gives the same bits.
+    """Every metric over every batch; noise is a function of (seed, batch, metric).
+
+    So a second call gives the same bits, also with other metrics beside.
 
     Args:
+        batches: of BLOCK samples, so that the numbers do not depend on the batch size of training.
         outliers: of another data set; seen by the metrics that read them, in every group.
     """
     predictor.eval().to(device)
@@ -53,18 +60,15 @@ def evaluate(
     apart = {name: _fresh(metrics, device) for name in groups} if several else {}
     together = _fresh(metrics, device)
     for number, batch in enumerate(on_device(batches, device)):
-        seed_step(seed, number, "test")
-        _update(together, predictor, batch, samples)
+        _update(together, predictor, batch, samples, Draw(seed, number))
         for index, name in enumerate(groups if several else ()):
             rows = (batch["group"] == index).nonzero().flatten()
             if len(rows):
-                seed_step(seed, number, "test")
                 some = {key: value[rows] for key, value in batch.items()}
-                _update(apart[name], predictor, some, samples)
+                _update(apart[name], predictor, some, samples, Draw(seed, number))
     everyone = [metric for group in (together, *apart.values()) for metric in group]
     for number, batch in enumerate(on_device(outliers, device)):
-        seed_step(seed, number, "outliers")
-        _update(everyone, predictor, batch, samples, "outliers")
+        _update(everyone, predictor, batch, samples, Draw(seed, number), "outliers")
     return Evaluation(_numbers(together), {name: _numbers(group) for name, group in apart.items()}, together)
 
 
@@ -72,13 +76,28 @@ def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
     return [cast(Metric, metric.clone().to(device)) for metric in metrics]
 
 
+def predicted(
+    predictor: Predictor, batch: Batch, samples: int, draw: Draw, split: Split = "test"
+) -> Prediction:
+    """What is predicted for a batch, whatever mode asks: what is drawn for it is a function of `draw`."""
+    with draw(split):
+        density = predictor(batch["input"])
+    return Prediction(density, batch, samples, split, draw)
+
+
 def _update(
-    metrics: Sequence[Metric], predictor: Predictor, batch: Batch, samples: int, split: Split = "test"
+    metrics: Sequence[Metric],
+    predictor: Predictor,
+    batch: Batch,
+    samples: int,
+    draw: Draw,
+    split: Split = "test",
 ) -> None:
-    reading = [metric for metric in metrics if split in metric.splits]
-    prediction = Prediction(predictor(batch["input"]), batch, samples, split)
-    for metric in reading:
-        metric.update(prediction)
+    prediction = predicted(predictor, batch, samples, draw, split)
+    for metric in metrics:
+        if split in metric.splits:
+            with draw(f"{split} {type(metric).__name__}"):
+                metric.update(prediction)
 
 
 def _numbers(metrics: Sequence[Metric]) -> dict[str, float]:

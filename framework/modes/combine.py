@@ -1,6 +1,7 @@
 """mode=combine: models that were trained apart become the members of one wrapper, which is calibrated and tested."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
+from framework.runs.description import Description
 from framework.runs.loading import load_with_description
 from framework.runs.run import opened
 from framework.runs.session import around, begin, calibrate, tested
@@ -33,7 +35,7 @@ def run(config: Config) -> None:
     console = begin(config.settings)
     sources = found(options.members)
     members = [load_with_description(source, uri=config.settings.logger.uri) for source in sources]
-    described = common([described for _, described in members])
+    described = common([description for _, description in members])
     wrappers = [
         wrapping(options.wrapper, len(members)),
         *(
@@ -41,11 +43,11 @@ def run(config: Config) -> None:
             for key, part in (config.values.get("uncertainty") or {}).items()
         ),
     ]
-    parts = {**described["config"], "uncertainty": [*described["config"]["uncertainty"], *wrappers]}
-    session = around(config, members[0][0], {**described, "config": parts}, str(sources[0]), console)
-    session = tested(session)
+    parts = {**described.config, "uncertainty": [*described.config["uncertainty"], *wrappers]}
+    method = " + ".join([described.method, *(part["name"] for part in wrappers)]) if described.method else ""
+    session = tested(around(config, members[0][0], replace(described, config=parts, method=method), console))
     session.predictor = joined(parts, session.data, [member for member, _ in members])
-    with opened(config) as run:
+    with opened(session.config) as run:
         session.record(run)
         calibrate(session)
         session.save_model(run)
@@ -79,7 +81,7 @@ def _by_number(path: Path) -> tuple[int, str]:
     return len(name), name
 
 
-def common(members: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def common(members: Sequence[Description]) -> Description:
     """What all members say of themselves.
 
     Raises:
@@ -88,16 +90,17 @@ def common(members: Sequence[dict[str, Any]]) -> dict[str, Any]:
     first = members[0]
     for other in members[1:]:
         for key in ("density_head", "encoder", "uncertainty", "data"):
-            if other["config"][key] != first["config"][key]:
+            if other.config[key] != first.config[key]:
                 raise CheckpointError(
-                    f"{other['path']} and {first['path']} differ in {key}: {other['config'][key]} and "
-                    f"{first['config'][key]}. Members must be alike but for their seed; "
+                    f"{other.path} and {first.path} differ in {key}: {other.config[key]} and "
+                    f"{first.config[key]}. Members must be alike but for their seed; "
                     "name those that are one by one in mode.members."
                 )
-        for key in ("target", "input_shape"):
-            if other[key] != first[key]:
+        for key in ("target", "input_shape", "data_state"):
+            one, two = getattr(other, key), getattr(first, key)
+            if one != two:
                 raise CheckpointError(
-                    f"{other['path']} and {first['path']} differ in {key}: {other[key]} and {first[key]}. "
+                    f"{other.path} and {first.path} differ in {key}: {str(one)[:200]} and {str(two)[:200]}. "
                     "Members must have been trained on the same data."
                 )
     return first

@@ -14,13 +14,14 @@ from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
 from framework.distributions.circular import wrap
+from framework.distributions.noise import Draw
 from framework.errors import DataError
+from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
 from framework.prediction import Prediction
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.target import Target
-from framework.training.batches import seed_step
 
 
 class PredictOptions(Options):
@@ -34,8 +35,8 @@ def run(config: Config) -> None:
     wanted = config.options(PredictOptions).files
     files = _files(Path(wanted).expanduser()) if wanted else []
     session = for_trained(config, prepare=not files)
-    with opened(config) as run:
-        rows = predictions(session.predictor, session.data, session.target, files, config.settings)
+    with opened(session.config) as run:
+        rows = predictions(session.predictor, session.data, session.target, files, session.settings)
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, list(rows[0]))
@@ -62,13 +63,11 @@ def predictions(
 ) -> list[dict[str, str]]:
     """One row a sample: its name, the point prediction, and the entropy of the density in nats."""
     dataset = data.read(files) if files else data.splits().test
-    loader = DataLoader(dataset, batch_size=settings.batch_size, collate_fn=as_batch)
+    loader = DataLoader(dataset, batch_size=BLOCK, collate_fn=as_batch)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
     for number, batch in enumerate(loader):
-        seed_step(settings.seed, number, "predict")
-        density = predictor(batch["input"])
-        prediction = Prediction(density, batch, settings.samples)
+        prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
         columns = _columns(target, prediction) | {"entropy_nats": prediction.entropy}
         for row in range(len(batch["index"])):
             values = {key: _text(column[row]) for key, column in columns.items()}

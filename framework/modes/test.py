@@ -9,6 +9,6 @@ from framework.runs.session import for_trained, tested
 def run(config: Config) -> None:
     """Print the table row of `checkpoint`."""
     session = tested(for_trained(config))
-    with opened(config) as run:
+    with opened(session.config) as run:
         session.record(run)
         report_test(run, session)

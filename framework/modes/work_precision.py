@@ -38,7 +38,7 @@ def run(config: Config) -> None:
     """Write work_precision.csv and .png; print the table with Pareto points marked."""
     options = config.options(WorkPrecisionOptions)
     session = for_trained(config)
-    with opened(config) as run:
+    with opened(session.config) as run:
         session.record(run)
         _run(run, session, options)
 

@@ -13,8 +13,8 @@ from framework.data import Data
 from framework.distributions.circular import angular_distance
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import circular_entropy, circular_grid
-from framework.evaluation.splits import on_device
-from framework.prediction import Prediction
+from framework.distributions.noise import Draw
+from framework.evaluation.splits import on_device, predicted
 from framework.reports.class_picture import choose_classified, classified
 from framework.reports.landscape_picture import Plane, half_width, landscapes, probabilities
 from framework.reports.viewing_circles import choose, viewing_circles
@@ -42,10 +42,11 @@ def _densities(session: Session) -> Figure:
     inputs: list[Tensor] = []
     columns: list[tuple[Tensor, ...]] = []
     angles = torch.zeros(0)
-    for batch in on_device(session.batches().test_dataloader(), session.device):
+    settings = session.settings
+    for number, batch in enumerate(on_device(session.blocks().test_dataloader(), session.device)):
         if len(inputs) >= PICTURED:
             break
-        prediction = Prediction(predictor(batch["input"]), batch, session.settings.samples)
+        prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
         first = prediction.marginal(0)
         angles, log_density = circular_grid(first)
         entropy, truth, point = circular_entropy(first), batch["target"][:, 0], prediction.point[:, 0]
@@ -79,7 +80,7 @@ def _classified(session: Session) -> Figure:
     some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
     inputs: list[Tensor] = []
     shares, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
-    for batch in on_device(session.batches().of(some), session.device):
+    for batch in on_device(session.blocks().of(some), session.device):
         shares.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
         labels.append(batch["target"].cpu().numpy())
         inputs.extend(batch["input"].cpu())

@@ -12,7 +12,7 @@ from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.metric import Pictured
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table
-from framework.runs.run import Run, stored_overrides
+from framework.runs.run import Run
 from framework.runs.session import Session
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ def report_test(run: Run, session: Session) -> None:
         session: after `tested`.
     """
     settings, data, outliers, metrics = session.settings, session.data, session.outliers, session.metrics
-    batches = session.batches()
-    loader = batches.test_dataloader()
+    blocks = session.blocks()
+    loader = blocks.test_dataloader()
     found = evaluate(
         session.predictor,
         loader,
@@ -36,9 +36,10 @@ def report_test(run: Run, session: Session) -> None:
         samples=settings.samples,
         seed=settings.seed,
         device=session.device,
-        outliers=() if outliers is None else batches.of(outliers.splits().test),
+        outliers=() if outliers is None else blocks.of(outliers.splits().test),
     )
-    spent = cost(session.predictor, next(iter(loader)), samples=settings.samples, device=session.device)
+    batch = next(iter(session.batches().test_dataloader()))
+    spent = cost(session.predictor, batch, samples=settings.samples, device=session.device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
@@ -74,17 +75,9 @@ def report_test(run: Run, session: Session) -> None:
 def _results(
     run: Run, session: Session, found: Evaluation, spent: Cost, columns: dict[str, str], better: Better
 ) -> dict[str, Any]:
-    name = run.settings.experiment_name
-    wrappers = [part["name"] for part in session.parts["uncertainty"]]
-    if name:  # an experiment's name stands for its own wrappers
-        method = name.rpartition("/")[2]
-        changed = any(item.lstrip("+~").startswith("uncertainty") for item in stored_overrides(run.folder))
-        wrappers = wrappers if changed else []
-    else:
-        method = str(session.parts["density_head"]["name"])
     return {
-        "method": " + ".join([method, *wrappers]),
-        "experiment": name or "no experiment",
+        "method": session.method,
+        "experiment": run.settings.experiment_name or "no experiment",
         "data": ", ".join(session.data.groups),
         "seed": run.settings.seed,
         **{key: _plain(value) for key, value in found.total.items()},

@@ -1,20 +1,21 @@
 """Gives a trained model back, from a run folder, a checkpoint file or an MLflow run id; no Hydra needed."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import torch
+from torch import nn
+from torch.distributions import Distribution
 
 from framework.configuration import registry
-from framework.configuration.assembly import Resolved, build_predictor
+from framework.configuration.assembly import build_data, build_predictor
 from framework.configuration.schema import resolve
 from framework.data import Data
 from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
+from framework.runs.description import Description
 from framework.target import Target
 from framework.training.checkpoint import latest_good, read
 
@@ -22,21 +23,66 @@ PREFIX = "predictor."
 """What Lightning's checkpoints put before the predictor's own parameter names."""
 
 
-def description(resolved: Resolved, data: Data) -> dict[str, Any]:
-    """What a checkpoint must hold beside the weights so that the model can be built again: plain values only."""
-    return {
-        "format": 1,
-        "version": version("robust-visual-learning"),
-        "config": resolved,
-        "target": {**asdict(data.target), "names": list(data.target.names)},
-        "input_shape": list(data.input_shape),
-        "columns": list(data.columns),
-        "synthetic": data.synthetic,
-    }
+@final
+class Loaded(nn.Module):
+    """A trained model that takes what its user has, and answers in the user's unit.
+
+    Attributes:
+        predictor: the model itself, from inputs as its data set makes them to a density.
+        description: what its checkpoint says of it: parts, target, method, data.
+        data: the data set it was trained on, which nothing was read of: it knows how raw input is made ready.
+    """
+
+    def __init__(self, predictor: Predictor, description: Description, data: Data) -> None:
+        super().__init__()
+        self.predictor = predictor
+        self.description = description
+        self.data = data
+
+    @property
+    def target(self) -> Target:
+        """What is predicted: its kind, and the names of its numbers or classes."""
+        return self.description.target
+
+    def forward(self, given: Any) -> Distribution:
+        """The density over the target, with batch_shape (batch,): angles in radians, reals in their own unit.
+
+        Args:
+            given: files, arrays, or what else the data set takes (`Data.inputs`).
+
+        Raises:
+            DataError: it is no input of this model.
+        """
+        inputs = self.data.inputs(given)
+        own = next(self.predictor.parameters(), inputs)
+        # bytes are pixels, which encoders scale; any other number is one of the model's own type
+        return self.predictor(
+            inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
+        )
+
+    def __repr__(self) -> str:
+        about, parts = self.description, self.description.config
+        names = " + ".join(
+            part["name"] for part in [*parts["encoder"], parts["density_head"], *parts["uncertainty"]]
+        )
+        count = sum(parameter.numel() for parameter in self.predictor.parameters())
+        unit = {"angle": "angles in radians", "real": "reals in their own unit", "class": "classes"}[
+            about.target.kind
+        ]
+        data = f"{parts['data']['name']}{' (synthetic)' if about.synthetic else ''}"
+        return "\n".join(
+            [
+                f"{about.method or names}, trained on {data}",
+                f"  reads    {'×'.join(map(str, about.input_shape))} {', '.join(about.columns)}".rstrip(),
+                f"  predicts {unit}: {about.target.told}",
+                f"  made of  {names}, {count:,} parameters",
+                f"  from     {about.path}",
+            ]
+        )
 
 
-def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
-    """The trained predictor in evaluation mode, on the CPU.
+def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Loaded:
+    """The trained model in evaluation mode, on the CPU.
 
     Args:
         run_or_checkpoint: a run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
@@ -45,43 +91,33 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     Raises:
         CheckpointError: nothing is there, it is damaged, or it does not fit the model it describes.
     """
-    return load_with_description(run_or_checkpoint, uri=uri)[0]
+    predictor, description = load_with_description(run_or_checkpoint, uri=uri)
+    return Loaded(predictor, description, reader(description)).eval()
+
+
+def reader(description: Description) -> Data:
+    """The data set of a model, not prepared: it makes inputs of what a user gives."""
+    data = build_data({"data": resolve("data", description.config["data"])})
+    data.target, data.input_shape = description.target, description.input_shape
+    data.columns, data.synthetic = description.columns, description.synthetic
+    data.load_state_dict(description.data_state)
+    return data
 
 
 def load_with_description(
     run_or_checkpoint: str | Path, *, uri: str | None = None
-) -> tuple[Predictor, dict[str, Any]]:
-    """As `load`, with what the checkpoint says of itself (`description`)."""
+) -> tuple[Predictor, Description]:
+    """The trained predictor, as `load`, with what the checkpoint says of itself."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
-    described = content.get("framework")
-    if not isinstance(described, Mapping) or described.get("format") != 1:
-        raise CheckpointError(
-            f"{path} was not written by this framework (it holds no model description of format 1). "
-            "Give a run folder, or a checkpoint from its checkpoints/."
-        )
-    resolved = checked(described["config"])
-    for part in resolved["encoder"]:
+    description = Description.read(content, str(path))
+    parts = description.config
+    for part in parts["encoder"]:
         # the checkpoint holds the weights now; the file they were started from may be gone
         part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
-    target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-    columns = tuple(described.get("columns", ()))
-    predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)
+    predictor = build_predictor(parts, description.target, description.input_shape, 0, description.columns)
     fill(predictor, weights(content), str(path))
-    return predictor.eval(), {**described, "config": resolved, "path": str(path)}
-
-
-def checked(config: Mapping[str, Any]) -> Resolved:
-    """A stored config, checked again: a checkpoint can only choose among installed plugins and valid values."""
-    resolved: Resolved = {}
-    for group, part in config.items():
-        if isinstance(part, list):
-            resolved[group] = [resolve(group, item, f"{group}[{i}]") for i, item in enumerate(part)]
-        elif group in ("encoder", "density_head", "uncertainty"):
-            resolved[group] = resolve(group, part)
-        else:
-            resolved[group] = None if part is None else dict(part)
-    return resolved
+    return predictor.eval(), description
 
 
 def weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:

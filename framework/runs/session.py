@@ -5,7 +5,7 @@ import inspect
 import logging
 import platform
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,16 +28,18 @@ from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings, check_trainer_keys
 from framework.data import Data
 from framework.datasets.fields import as_batch
+from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError
-from framework.evaluation.splits import on_device
+from framework.evaluation.splits import BLOCK, on_device
 from framework.metric import Metric
 from framework.model import Predictor, fitted_models
 from framework.objective import Objective
 from framework.prediction import Prediction
-from framework.runs.loading import PREFIX, description, load_with_description
+from framework.runs.description import Description
+from framework.runs.loading import PREFIX, load_with_description, reader
 from framework.runs.run import Run, first_rank
 from framework.target import Target
-from framework.training.batches import Batches, seed_step
+from framework.training.batches import Batches
 from framework.training.checkpoint import WholeCheckpoints
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -48,7 +50,9 @@ class Session:
     """What a mode works with.
 
     Attributes:
+        config: of the command; of a test the settings that make its numbers are those of the model's own run.
         parts: every plugin with every parameter, as they were built.
+        method: what tables call the model.
         target: what is predicted.
         data: prepared, unless only a user's own files are read.
         predictor: untrained, or as loaded.
@@ -59,8 +63,9 @@ class Session:
         outliers: prepared, where a metric reads them; None before `tested`.
     """
 
-    settings: Settings
+    config: Config
     parts: Resolved
+    method: str
     target: Target
     data: Data
     predictor: Predictor
@@ -70,16 +75,24 @@ class Session:
     metrics: Sequence[Metric] = ()
     outliers: Data | None = None
 
+    @property
+    def settings(self) -> Settings:
+        return self.config.settings
+
     def batches(self, data: Data | None = None) -> Batches:
-        """Of the session's data, or of what stands in for them."""
+        """Of the session's data, or of what stands in for them, as they are trained on."""
         chosen = self.settings
         return Batches(
             data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed
         )
 
+    def blocks(self) -> Batches:
+        """The session's data as they are evaluated: in blocks of one size, whatever the batch size is."""
+        return Batches(self.data, batch_size=BLOCK, workers=self.settings.workers, seed=self.settings.seed)
+
     def description(self) -> dict[str, Any]:
         """What a checkpoint holds beside the weights."""
-        return description(self.parts, self.data)
+        return Description.of(self.parts, self.data, self.method, self.settings).stored()
 
     def record(self, run: Run) -> None:
         """Tell the run what it is fed, and leave what to cite with it."""
@@ -141,11 +154,21 @@ def for_training(config: Config) -> Session:
             "work by. Leave objective out."
         )
     device = torch.device("cpu")
-    session = Session(config.settings, parts, data.target, data, predictor, device, console, objectives)
+    method = method_of(config, parts)
+    session = Session(config, parts, method, data.target, data, predictor, device, console, objectives)
     session = tested(session)
     if first_rank():
         rehearse(session)
     return session
+
+
+def method_of(config: Config, parts: Resolved) -> str:
+    """What tables call a model: its experiment, which stands for its own wrappers, or its head; then other wrappers."""
+    name = config.settings.experiment_name
+    method = name.rpartition("/")[2] if name else str(parts["density_head"]["name"])
+    changed = any(item.lstrip("+~").startswith("uncertainty") for item in config.overrides)
+    wrappers = [part["name"] for part in parts["uncertainty"]] if changed or not name else []
+    return " + ".join([method, *wrappers])
 
 
 def tested(session: Session) -> Session:
@@ -194,50 +217,54 @@ def for_trained(config: Config, *, prepare: bool = True) -> Session:
         raise ConfigError(
             f"mode={config.mode} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
         )
-    predictor, described = load_with_description(config.settings.checkpoint, uri=config.settings.logger.uri)
-    return around(config, predictor, described, config.settings.checkpoint, console, prepare=prepare)
+    predictor, description = load_with_description(config.settings.checkpoint, uri=config.settings.logger.uri)
+    return around(config, predictor, description, console, prepare=prepare)
 
 
 def around(
-    config: Config,
-    predictor: Predictor,
-    described: Mapping[str, Any],
-    source: str,
-    console: Console,
-    *,
-    prepare: bool = True,
+    config: Config, predictor: Predictor, description: Description, console: Console, *, prepare: bool = True
 ) -> Session:
-    """The session of a predictor that is there already, described by the checkpoint `source`; see `for_trained`."""
-    parts: Resolved = {**described["config"]}
+    """The session of a predictor that is there already and described by a checkpoint; see `for_trained`."""
+    parts: Resolved = {**description.config}
+    config = inherited(config, description)
     for group in ("data", "outliers"):
         if config.values.get(group):
             parts[group] = resolve("data", config.values[group], group)
     if config.values.get("metric"):
         chosen = config.values["metric"]
         parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
-    parts["data"] = resolve("data", parts["data"])
-    data = build_data(parts)
+    data = reader(replace(description, config=parts))
     if prepare:
         data.prepare()
-        require_fit(data, described, source)
+        require_fit(data, description)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-    return Session(config.settings, parts, target, data, predictor, device, console)
+    method = description.method or method_of(config, parts)
+    return Session(config, parts, method, description.target, data, predictor, device, console)
 
 
-def require_fit(data: Data, described: Mapping[str, Any], source: str) -> None:
-    """Refuse data that the model of `source` was not made for.
+def inherited(config: Config, description: Description) -> Config:
+    """The config with the settings of the model's own run, but for those that the command line gives."""
+    given = {item.lstrip("+~").partition("=")[0] for item in config.overrides}
+    kept = {
+        key: value for key, value in description.settings.items() if key.removesuffix("_name") not in given
+    }
+    return replace(config, values={**config.values, **kept}, settings=config.settings.model_copy(update=kept))
+
+
+def require_fit(data: Data, description: Description) -> None:
+    """Refuse data that the model was not made for.
 
     Raises:
         CheckpointError: inputs of another shape, or other targets.
     """
-    target = described["target"]
-    wanted = tuple(described["input_shape"]), target["kind"], tuple(target["names"])
+    target = description.target
+    wanted = description.input_shape, target.kind, target.names
     found = data.input_shape, data.target.kind, data.target.names
     if wanted != found:
         raise CheckpointError(
-            f"{source} reads inputs of shape {wanted[0]} and predicts {wanted[1]} {wanted[2]}, but the "
-            f"data has inputs of shape {found[0]} and targets {found[1]} {found[2]}. Give the data it was trained on."
+            f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.told}), but the "
+            f"data has inputs of shape {found[0]} and targets {found[1]} ({data.target.told}). Give the data it was "
+            "trained on."
         )
 
 
@@ -245,7 +272,7 @@ def calibrate(session: Session) -> None:
     """Fit what is not trained by gradient, on the validation set."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
-    session.predictor.calibrate(on_device(session.batches().val_dataloader(), session.device))
+    session.predictor.calibrate(on_device(session.blocks().val_dataloader(), session.device))
 
 
 def keep_memory() -> None:

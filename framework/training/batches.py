@@ -1,18 +1,16 @@
-"""The order of batches, a function of (seed, epoch); the noise of a step, a function of (seed, step)."""
+"""The order of batches, a function of (seed, epoch)."""
 
-import hashlib
-import random
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
 import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
+from framework.distributions.noise import hashed
 from framework.errors import ConfigError, DataError
 
 Position = tuple[int, int]
@@ -88,7 +86,7 @@ def epoch_order(length: int, seed: int | None, epoch: int) -> list[int]:
     """The permutation of `length` samples that (seed, epoch) gives; None gives 0, 1, 2, …"""
     if seed is None:
         return list(range(length))
-    generator = torch.Generator().manual_seed(_hashed(seed, "order", epoch))
+    generator = torch.Generator().manual_seed(hashed(seed, "order", epoch))
     return torch.randperm(length, generator=generator).tolist()
 
 
@@ -188,25 +186,3 @@ class Batches(pl.LightningDataModule):
             epoch, first = epoch.started - 1, processed
         # Overfitting wants the same few batches every time.
         return (0 if trainer.overfit_batches else epoch), first
-
-
-def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
-    """Make what follows draw noise that depends on (seed, step, stage, rank) alone.
-
-    Seeds torch's CPU and CUDA generators, NumPy's legacy one and Python's; 7 µs in all, of which Python's 3.
-    `step` numbers the batches of a stage, not the optimiser's steps: batches whose gradients are accumulated
-    would share their noise.
-    """
-    value = _hashed(seed, stage, step, rank)
-    # Not torch.manual_seed: where CUDA is not in use it formats the stack for a later report, 100 µs.
-    torch.default_generator.manual_seed(value)
-    if torch.cuda.is_initialized():
-        torch.cuda.manual_seed(value)
-    np.random.seed(value % 2**32)  # noqa: NPY002  (the global generator is the point)
-    random.seed(value)
-
-
-def _hashed(*parts: int | str) -> int:
-    """64 bits that depend on every part, the same on every machine."""
-    digest = hashlib.blake2b("|".join(map(str, parts)).encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "little")

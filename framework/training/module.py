@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
+from framework.distributions.noise import seed_step
 from framework.errors import NonFiniteLoss
 from framework.model import FrozenFrontEnd, Predictor
 from framework.objective import Objective
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
-from framework.training.batches import seed_step
 from framework.training.ranks import Share, WholeBatch, gathered, share, summed
 
 # fused: one pass over the memory of each parameter instead of several, half the time of a small network's step

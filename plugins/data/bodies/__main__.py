@@ -38,8 +38,8 @@ def main(arguments: list[str]) -> None:
 @torch.no_grad()
 def register(checkpoint: str, scans: list[Path], folder: Path) -> list[Path]:
     """The files written, two a scan."""
-    predictor, described = load_with_description(checkpoint)
-    part = described["config"]["data"]
+    predictor, description = load_with_description(checkpoint)
+    part = description.config["data"]
     if part["name"] != "registration":
         raise ConfigError(
             f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration`, which says "

@@ -236,7 +236,13 @@ def _encode(
 ) -> tuple[Target, Tensor]:
     """What the target is, and its values as a batch holds them."""
     if question.kind == "real":
-        return Target("real", question.target), as_float32(cells, question.target, rows, values[rows])
+        as_float32(cells, question.target, rows, values[rows])  # refuses what has no place in it
+        seen = values[training]
+        constant = seen.max(0) == seen.min(0)
+        deviation = np.where(constant, 1.0, seen.std(0))
+        target = Target("real", question.target, tuple(seen.mean(0).tolist()), tuple(deviation.tolist()))
+        # in double precision: what varies little about a large value would be rounded
+        return target, torch.from_numpy(values[rows])
     if question.kind == "degrees":
         # whole turns are taken off before the unit is changed: their multiple of 2π would be rounded
         angle = wrap(torch.from_numpy(np.deg2rad(np.fmod(values[rows], 360.0))))

@@ -12,6 +12,7 @@ from torch.nn.functional import hardtanh, mse_loss
 
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
+from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
 
@@ -27,13 +28,14 @@ class GaussianHead(DensityHead):
 
     With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With
     "fixed" it trains by squared error, which is likelihood with σ = 1, and `calibrate` fits one covariance to the
-    validation residuals by maximum likelihood. Targets should be of the order of 1.
+    validation residuals by maximum likelihood. Raw numbers are in standard deviations from the mean of the training
+    targets, where `Target` has these; the density is in the target's own unit, and then in double precision.
 
     Args:
         scale: where the spread comes from.
         covariance: "diagonal": numbers independent of one another; "full": with regression coefficients of each
             number on those before it.
-        floor: the least σ: no density can collapse onto a training value beyond it.
+        floor: the least σ, in the same deviations: no density can collapse onto a training value beyond it.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -63,6 +65,7 @@ class GaussianHead(DensityHead):
         self.full = covariance == "full" and self.numbers > 1
         pairs = self.numbers * (self.numbers - 1) // 2 if self.full else 0
         self.size = 2 * self.numbers + pairs if self.predicted else self.numbers
+        self.unit = Unit.of(target)
         if not self.predicted:
             self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
             side = self.numbers if self.full else 0  # of a diagonal covariance none: numbers may be very many
@@ -74,16 +77,19 @@ class GaussianHead(DensityHead):
         if not self.predicted:
             scale = self.scale.to(raw).expand_as(mean)
             coefficients = self.coefficients.to(raw).expand(*mean.shape, self.numbers) if self.full else None
-            return Gaussian(mean, scale, coefficients)
-        scale = self.floor + scale_of_raw(raw[..., self.numbers : 2 * self.numbers])
-        return Gaussian(mean, scale, self._coefficients(raw[..., 2 * self.numbers :]) if self.full else None)
+        else:
+            scale = self.floor + scale_of_raw(raw[..., self.numbers : 2 * self.numbers])
+            coefficients = self._coefficients(raw[..., 2 * self.numbers :]) if self.full else None
+        return Gaussian(*self.unit.given_back(mean, scale, coefficients))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         if self.predicted:
             return -self(raw).log_prob(target)
         # σ = 1, whatever was calibrated; in few passes over the numbers, which may be very many
-        mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target.to(raw))
-        return mse_loss(mean, target, reduction="none").sum(-1) / 2 + self.numbers * math.log(2 * math.pi) / 2
+        target = self.unit.standardised(target).to(raw)
+        mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target)
+        constant = self.numbers * math.log(2 * math.pi) / 2 + self.unit.log_volume
+        return mse_loss(mean, target, reduction="none").sum(-1) / 2 + constant
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
@@ -91,7 +97,9 @@ class GaussianHead(DensityHead):
             return
         if len(raw) == 0:
             raise ValueError("a fixed covariance is calibrated on validation data, but got none of it.")
-        residual = target.double() - self(raw).location.double()
+        residual = (
+            self.unit.standardised(target).double() - self._mean(require_finite(raw, self.size)).double()
+        )
         if not self.full:  # each σ by itself
             self.scale.copy_(residual.square().mean(0).sqrt().clamp(min=self.floor))
             return

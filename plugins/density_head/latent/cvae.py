@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead
 from framework.distributions.protocol import tempered
 from framework.heads.parameters import require_finite, require_trained
+from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.latent.decoder import LARGEST_FEATURE, LatentDecoder
 from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity
@@ -165,6 +166,7 @@ class CVAEHead(DensityHead):
     ) -> None:
         super().__init__()
         self.target = target
+        self.unit = Unit.of(target)
         self.hidden = hidden
         self.training_samples = training_samples
         self.samples = samples
@@ -212,12 +214,12 @@ class CVAEHead(DensityHead):
         )
 
     def encode(self, value: Tensor) -> Tensor:
-        """What the encoder sees of a target: angles as biternions, labels one-hot, reals as they are."""
+        """What the encoder sees of a target: angles as biternions, labels one-hot, reals in standard deviations."""
         if self.target.kind == "angle":
             return torch.cat([value.cos(), value.sin()], -1)
         if self.target.kind == "class":
             return nn.functional.one_hot(value, len(self.target.names))
-        return value
+        return self.unit.standardised(value)
 
 
 def _rest(hidden: int, numbers: int) -> nn.Sequential:

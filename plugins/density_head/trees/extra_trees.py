@@ -12,6 +12,7 @@ from torch.distributions import Categorical, Distribution
 
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
+from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.trees.forest import frequencies, leaves
 from plugins.density_head.trees.heads_without_gradient import (
@@ -92,6 +93,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         self.trees = trees
         self.share, self.leaf, self.depth = features, leaf, depth
         self.smoothing = smoothing
+        self.unit = Unit.of(target)
         numbers = 0 if self.classes else len(target.names)
         for name in INTEGERS:
             self.register_buffer(name, torch.zeros(0, dtype=torch.int32))
@@ -107,7 +109,8 @@ class ExtraTreesHead(DensityHead, Fitted):
             grown,
         )  # scikit-learn, which a stored forest does not need
 
-        wanted = target.cpu().numpy() if self.classes else target.cpu().double().numpy()
+        target = target if self.classes else self.unit.standardised(target.double())
+        wanted = target.cpu().numpy()
         arrays = grown(
             single(features).numpy(),
             wanted,
@@ -121,7 +124,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         for name, array in arrays.items():
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(array)).to(target.device))
         if not self.classes:
-            self.width.copy_(target.double().std(0, correction=0).clamp(min=FLOOR))
+            self.width.copy_(target.std(0, correction=0).clamp(min=FLOOR))
         self.read.fill_(features.shape[1])
         self._open()
 
@@ -140,7 +143,8 @@ class ExtraTreesHead(DensityHead, Fitted):
         means = self.mean[torch.from_numpy(leaf).long().to(self.mean.device)]  # (tree, sample, number)
         means = means.movedim(0, 1).to(raw).reshape(*batch, len(root), self.mean.shape[1])
         means = with_gradient_of_0(means, raw)
-        components = IndependentNormals(means, self.width.to(raw).expand_as(means))
+        mean, scale, _ = self.unit.given_back(means, self.width.to(raw).expand_as(means))
+        components = IndependentNormals(mean, scale)
         return Mixture(means.new_zeros(means.shape[:-1]), components)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
@@ -154,8 +158,8 @@ class ExtraTreesHead(DensityHead, Fitted):
             raise ValueError("widths are calibrated on validation data, but got none of it.")
         density = self(raw.double())
         assert isinstance(density, Mixture)
-        means = density.components.mean  # (sample, tree, number)
-        self.width.copy_(fitted_width(target.double().unsqueeze(1) - means))
+        means, target = map(self.unit.standardised, (density.components.mean, target.double()))
+        self.width.copy_(fitted_width(target.unsqueeze(1) - means))  # (sample, tree, number)
 
     def _open(self, *_: Any) -> None:
         """Read how many features the stored forest asks for."""

@@ -12,6 +12,7 @@ from torch.distributions import Categorical, Distribution
 
 from framework.density_head import DensityHead, Fitted
 from framework.errors import ConfigError
+from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.trees.heads_without_gradient import (
     FLOOR,
@@ -88,6 +89,7 @@ class XGBoostHead(DensityHead, Fitted):
                 "Choose other data."
             )
         self.numbers = self.classes or len(target.names)
+        self.unit = Unit.of(target)
         self.rounds = rounds
         self.options = {
             "max_depth": depth,
@@ -113,7 +115,8 @@ class XGBoostHead(DensityHead, Fitted):
         }
         if self.classes:
             options["num_class"] = self.classes
-        matrix = xgboost.DMatrix(single(features).numpy(), target.cpu().numpy())
+        wanted = target if self.classes else self.unit.standardised(target)
+        matrix = xgboost.DMatrix(single(features).numpy(), wanted.cpu().numpy())
         fitted = xgboost.train(options, matrix, self.rounds, verbose_eval=False)
         stored = torch.frombuffer(fitted.save_raw("ubj"), dtype=torch.uint8)
         self.model = stored.clone().to(target.device)
@@ -128,7 +131,8 @@ class XGBoostHead(DensityHead, Fitted):
         sums = with_gradient_of_0(sums, raw)
         if self.classes:
             return Categorical(logits=sums.log_softmax(-1), validate_args=False)
-        return IndependentNormals(sums, self.width.to(raw).expand_as(sums))
+        mean, scale, _ = self.unit.given_back(sums, self.width.to(raw).expand_as(sums))
+        return IndependentNormals(mean, scale)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         return -self(raw).log_prob(target)
@@ -142,7 +146,7 @@ class XGBoostHead(DensityHead, Fitted):
         self._measure_width(raw, target)
 
     def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        residual = target.double() - self._sums(raw).to(target.device)
+        residual = self.unit.standardised(target.double()) - self._sums(raw).to(target.device)
         self.width.copy_(residual.square().mean(0).sqrt().clamp(min=FLOOR))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:

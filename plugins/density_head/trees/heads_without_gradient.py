@@ -14,7 +14,7 @@ from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FLOOR = 1e-4
-"""The least standard deviation of a density over reals, which should be of the order of 1."""
+"""The least standard deviation of a density over reals, in those of the training targets where `Target` has them."""
 
 
 class IndependentNormals(Independent):

@@ -1,0 +1,53 @@
+"""Noise as a function of what it is for: of (seed, step) in training, of (seed, batch, question) in evaluation."""
+
+import hashlib
+import random
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The noise of one evaluated batch: what a question draws does not depend on what else is asked.
+
+    Attributes:
+        seed: of the run.
+        number: of the batch.
+    """
+
+    seed: int
+    number: int
+
+    @contextmanager
+    def __call__(self, question: str) -> Iterator[None]:
+        """Within, `seed_step` of this question; afterwards torch's generators go on where they were."""
+        devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
+        with torch.random.fork_rng(devices):
+            seed_step(self.seed, self.number, question)
+            yield
+
+
+def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
+    """Make what follows draw noise that depends on (seed, step, stage, rank) alone.
+
+    Seeds torch's CPU and CUDA generators, NumPy's legacy one and Python's; 7 µs in all, of which Python's 3.
+    `step` numbers the batches of a stage, not the optimiser's steps: batches whose gradients are accumulated
+    would share their noise.
+    """
+    value = hashed(seed, stage, step, rank)
+    # Not torch.manual_seed: where CUDA is not in use it formats the stack for a later report, 100 µs.
+    torch.default_generator.manual_seed(value)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed(value)
+    np.random.seed(value % 2**32)  # noqa: NPY002  (the global generator is the point)
+    random.seed(value)
+
+
+def hashed(*parts: int | str) -> int:
+    """64 bits that depend on every part, the same on every machine."""
+    digest = hashlib.blake2b("|".join(map(str, parts)).encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little")

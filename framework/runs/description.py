@@ -1,0 +1,106 @@
+"""What a checkpoint says of its model beside the weights: enough to build it again, to feed it and to name it."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+from framework.configuration.assembly import Resolved
+from framework.configuration.schema import resolve
+from framework.configuration.settings import Settings
+from framework.data import Data
+from framework.errors import CheckpointError
+from framework.target import Target
+
+INHERITED = ("seed", "batch_size", "samples", "experiment_name")
+"""Settings that a later test of the model repeats, so that it gives the numbers of the model's own run."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """Plain values, written into every checkpoint.
+
+    Attributes:
+        config: every part with every parameter.
+        target: what is predicted.
+        input_shape, columns: of what the model reads, as of `Data`.
+        synthetic: whether it was trained on generated data.
+        method: what tables call it; "" in checkpoints of version 0.1.
+        settings: of its run, those `INHERITED`; none in checkpoints of version 0.1.
+        data_state: `Data.state_dict` of the data it was trained on.
+        path: of the checkpoint it was read from.
+    """
+
+    config: Resolved
+    target: Target
+    input_shape: tuple[int, ...]
+    columns: tuple[str, ...]
+    synthetic: bool
+    method: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    data_state: Mapping[str, Any] = field(default_factory=dict)
+    path: str = ""
+
+    @classmethod
+    def of(cls, parts: Resolved, data: Data, method: str, settings: Settings) -> "Description":
+        """Of a model made of `parts` for `data`, which is prepared."""
+        kept = {key: getattr(settings, key) for key in INHERITED}
+        state = dict(data.state_dict())
+        return cls(parts, data.target, data.input_shape, data.columns, data.synthetic, method, kept, state)
+
+    def stored(self) -> dict[str, Any]:
+        """As a checkpoint holds it."""
+        return {
+            "format": 1,
+            "version": version("robust-visual-learning"),
+            **{key: value for key, value in asdict(self).items() if key != "path"},
+        }
+
+    @classmethod
+    def read(cls, content: Mapping[str, Any], path: str) -> "Description":
+        """Out of a checkpoint's contents; the config is checked again: it can only choose among installed plugins.
+
+        Raises:
+            CheckpointError: it is missing or lacks something.
+            ConfigError: a part of the config is unknown here.
+        """
+        stored = content.get("framework")
+        if not isinstance(stored, Mapping) or stored.get("format") != 1:
+            raise CheckpointError(
+                f"{path} was not written by this framework (it holds no model description of format 1). "
+                "Give a run folder, or a checkpoint from its checkpoints/."
+            )
+        try:
+            target = {
+                key: tuple(value) if isinstance(value, list | tuple) else value
+                for key, value in stored["target"].items()
+            }
+            return cls(
+                checked(stored["config"]),
+                Target(**target),  # pyright: ignore[reportArgumentType]  # checked by Target's readers
+                tuple(map(int, stored["input_shape"])),
+                tuple(map(str, stored.get("columns", ()))),
+                bool(stored.get("synthetic", False)),
+                str(stored.get("method", "")),
+                {key: value for key, value in dict(stored.get("settings", {})).items() if key in INHERITED},
+                dict(stored.get("data_state", {})),
+                path,
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise CheckpointError(
+                f"The description of the model in {path} is not whole ({type(error).__name__}: {str(error)[:200]}). "
+                "Restore the file, or train anew."
+            ) from error
+
+
+def checked(config: Mapping[str, Any]) -> Resolved:
+    """A stored config, checked again: a checkpoint can only choose among installed plugins and valid values."""
+    resolved: Resolved = {}
+    for group, part in config.items():
+        if isinstance(part, list):
+            resolved[group] = [resolve(group, item, f"{group}[{i}]") for i, item in enumerate(part)]
+        elif group in ("encoder", "density_head", "uncertainty"):
+            resolved[group] = resolve(group, part)
+        else:
+            resolved[group] = None if part is None else dict(part)
+    return resolved
