@@ -3,6 +3,7 @@ import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,52 +19,13 @@ from framework.geometry.meshes import Mesh, read
 from plugins.data.bodies import body_files, poses
 from plugins.data.bodies.body import Body, BodyModel
 from plugins.data.bodies.result import SCAN, SKIN, picture, write_ply
+from plugins.data.bodies.rows import JOINTS, body_file, doll
 from plugins.data.bodies.scanner import KINDS, Scanner, scan, strangers
-
-# the SMPL family's first 22 joints: pelvis, hips, spine, knees, spine, ankles, spine, toes, neck, collars, head,
-# shoulders, elbows, wrists; a T-pose of a person of 1.7 m
-PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
-JOINTS = np.array(
-    [
-        *[(0, 0.95, 0), (0.1, 0.9, 0), (-0.1, 0.9, 0), (0, 1.05, 0), (0.1, 0.5, 0), (-0.1, 0.5, 0)],
-        *[
-            (0, 1.18, 0),
-            (0.1, 0.1, -0.02),
-            (-0.1, 0.1, -0.02),
-            (0, 1.25, 0),
-            (0.1, 0.02, 0.1),
-            (-0.1, 0.02, 0.1),
-        ],
-        *[(0, 1.45, 0), (0.08, 1.38, 0), (-0.08, 1.38, 0), (0, 1.55, 0.02), (0.2, 1.4, 0), (-0.2, 1.4, 0)],
-        *[(0.45, 1.4, 0), (-0.45, 1.4, 0), (0.7, 1.4, 0), (-0.7, 1.4, 0)],
-    ]
-)
-
-
-def doll():
-    """A small octahedron around the middle of every bone, which follows it alone."""
-    around = 0.04 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
-    faces = np.array([(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)])
-    template = np.concatenate([joint + around for joint in JOINTS])
-    vertices = len(template)
-    random = np.random.default_rng(0)
-    return {
-        "v_template": template,
-        "shapedirs": np.concatenate(
-            [0.05 * template[..., None], random.normal(0, 1e-3, (vertices, 3, 3))], 2
-        ),
-        "J_regressor": np.kron(np.eye(22), np.full((1, 6), 1 / 6)),
-        "weights": np.kron(np.eye(22), np.ones((6, 1))),
-        "kintree_table": np.array([PARENTS, range(22)]),
-        "f": np.concatenate([faces + 6 * joint for joint in range(22)]),
-    }
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("body") / "doll.npz"
-    np.savez(path, **doll())
-    return path
+    return Path(body_file(tmp_path_factory.mktemp("body"))["body"])
 
 
 def data(file, **config):
@@ -261,7 +223,7 @@ def test_a_users_scan_is_read_in_metres_without_preparing(file, tmp_path):
         data(file).read([tmp_path / "c.npy"])
 
 
-def test_bodies_that_poses_cannot_move_are_refused(tmp_path):
+def test_bodies_that_poses_cannot_move_are_refused(file, tmp_path):
     content = doll()
     few = {
         **content,
@@ -272,16 +234,11 @@ def test_bodies_that_poses_cannot_move_are_refused(tmp_path):
     np.savez(tmp_path / "few.npz", **few)
     with pytest.raises(DataError, match="has 3 joints; wanted 22 at least"):
         prepared(tmp_path / "few.npz")
-    named = Body(**{**body_files.read(written(tmp_path)).__dict__, "names": tuple(map(str, range(22)))})
+    named = Body(**{**body_files.read(file).__dict__, "names": tuple(map(str, range(22)))})
     with pytest.raises(DataError, match="has no joint 'root'"):
         poses.skeleton(named)
     with pytest.raises(DataError, match="no such file"):
         prepared(tmp_path / "none.npz")
-
-
-def written(folder):
-    np.savez(folder / "doll.npz", **doll())
-    return folder / "doll.npz"
 
 
 @pytest.mark.parametrize(
