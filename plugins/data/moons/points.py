@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.data import Splits
-from framework.datasets.csv_columns import numbers, read_columns, require
+from framework.datasets.csv_columns import tables
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.target import Target
@@ -56,22 +56,20 @@ def read_points(files: Sequence[Path]) -> Fields:
     """The columns `x` and `y` of CSV files, in standard units, one sample a row.
 
     Raises:
-        DataError: a file cannot be read, lacks a column, or holds a cell that is no finite number; names it.
+        DataError: there is no file, or one cannot be read, lacks a column, or holds a cell that is no finite
+            number; names it.
     """
-    tables = []
-    for file in files:
-        columns = read_columns(Path(file))
-        require(columns, ("x", "y"), "A file of points")
-        points = np.stack([numbers(columns, name, missing="") for name in ("x", "y")], -1)
+    found = []
+    for columns, points in tables(files, ("x", "y"), "A file of points"):
         wide = np.flatnonzero(np.abs(points).max(-1) > np.finfo(np.float32).max)
         if len(wide):
             x, y = points[wide[0]]
             raise DataError(
-                f"{file} line {columns.lines[wide[0]]}: ({x:g}, {y:g}) lies beyond single precision (3.4e38); wanted "
-                "points in the units of the training data, some units from 0. Mend it."
+                f"{columns.file} line {columns.lines[wide[0]]}: ({x:g}, {y:g}) lies beyond single precision "
+                "(3.4e38); wanted points in the units of the training data, some units from 0. Mend it."
             )
-        tables.append(points)
-    points = np.concatenate(tables)
+        found.append(points)
+    points = np.concatenate(found)
     return Fields(input=torch.from_numpy(points).float(), index=torch.arange(len(points)))
 
 
