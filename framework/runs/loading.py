@@ -35,6 +35,11 @@ def description(resolved: Resolved, data: Data) -> dict[str, Any]:
     }
 
 
+def described_target(described: Mapping[str, Any]) -> Target:
+    """What the model of a `description` predicts."""
+    return Target(described["target"]["kind"], tuple(described["target"]["names"]))
+
+
 def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     """The trained predictor in evaluation mode, on the CPU.
 
@@ -64,8 +69,7 @@ def load_with_description(
     for part in resolved["encoder"]:
         # the checkpoint holds the weights now; the file they were started from may be gone
         part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
-    target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-    columns = tuple(described.get("columns", ()))
+    target, columns = described_target(described), tuple(described.get("columns", ()))
     predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)
     fill(predictor, weights(content), str(path))
     return predictor.eval(), {**described, "config": resolved, "path": str(path)}

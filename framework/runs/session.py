@@ -33,7 +33,7 @@ from framework.metric import Metric
 from framework.model import Predictor, fitted_models
 from framework.objective import Objective
 from framework.prediction import Prediction
-from framework.runs.loading import PREFIX, description, load_with_description
+from framework.runs.loading import PREFIX, described_target, description, load_with_description
 from framework.runs.run import Run, first_rank
 from framework.target import Target
 from framework.training.batches import Batches, seed_step
@@ -221,7 +221,7 @@ def around(
         require_fit(data, described, source)
         outliers = build_outliers(parts, data)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
+    target = described_target(described)
     metrics = build_metrics(parts, target) if prepare else []
     return Session(config.settings, parts, target, data, outliers, predictor, [], metrics, device, console)
 
@@ -232,13 +232,12 @@ def require_fit(data: Data, described: Mapping[str, Any], source: str) -> None:
     Raises:
         CheckpointError: inputs of another shape, or other targets.
     """
-    target = described["target"]
-    wanted = tuple(described["input_shape"]), target["kind"], tuple(target["names"])
-    found = data.input_shape, data.target.kind, data.target.names
-    if wanted != found:
+    shape, target = tuple(described["input_shape"]), described_target(described)
+    if (shape, target) != (data.input_shape, data.target):
         raise CheckpointError(
-            f"{source} reads inputs of shape {wanted[0]} and predicts {wanted[1]} {wanted[2]}, but the "
-            f"data has inputs of shape {found[0]} and targets {found[1]} {found[2]}. Give the data it was trained on."
+            f"{source} reads inputs of shape {shape} and predicts {target.kind} ({target.told}), but the data has "
+            f"inputs of shape {data.input_shape} and targets {data.target.kind} ({data.target.told}). Give the data "
+            "it was trained on."
         )
 
 
