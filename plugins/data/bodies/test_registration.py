@@ -194,10 +194,10 @@ def test_a_scanner_sees_one_side_and_cuts_no_more_than_asked():
     content = doll()
     mesh = Mesh("a doll", content["v_template"], content["f"])
     for seed in range(40):
-        found = scan(mesh, "partial", Scanner(2_000, 0.0, 0.1, 0.0), np.random.default_rng(seed))
+        found = scan(mesh, "partial", Scanner(points=2_000, noise=0.0, cut=0.1), np.random.default_rng(seed))
         # a tenth at most behind a plane or in a ball; or half, which faces away
         assert len(found) >= 1_800 or 800 < len(found) < 1_200
-    noisy = scan(mesh, "whole", Scanner(20_000, 0.01, 0.0, 0.0), np.random.default_rng(3))
+    noisy = scan(mesh, "whole", Scanner(points=20_000, noise=0.01), np.random.default_rng(3))
     assert len(noisy) == 20_000
     outside = np.linalg.norm(noisy[:, None] - JOINTS, axis=-1).min(1) > 0.0401
     assert 0.05 < outside.mean() < 0.6
