@@ -16,7 +16,6 @@ NO_FACES = np.empty((0, 3), int)
 def root(tmp_path_factory):
     folder = tmp_path_factory.mktemp("faust")
     people(folder)
-    write_ply(folder / "test/scans/test_scan_000.ply", person(5)[1], NO_FACES)
     return folder
 
 
@@ -47,20 +46,13 @@ def test_people_are_split_and_meshes_come_back_in_metres(root):
             gap = np.linalg.norm(cloud[:, None] - scan, axis=-1)
             assert gap.min(1).max() < 1e-6  # points of the scan,
             assert len(set(gap.argmin(1))) == 200  # none twice
-    assert faust.augment(batch) is batch
-    assert faust.picture(batch["input"][0]).shape == (160, 160, 3)
 
 
-def test_points_depend_on_the_seed_and_small_scans_are_padded(root, tmp_path):
-    one, same, other = data(root, points=150), data(root, points=150), data(root, points=150, data_seed=1)
-    for each in (one, same, other):
+def test_points_depend_on_the_seed_and_small_scans_are_padded(root):
+    one, other, whole = data(root, points=150), data(root, points=150, data_seed=1), data(root, points=500)
+    for each in (one, other, whole):
         each.prepare()
-    first = [each.splits().train.fields["input"] for each in (one, same, other)]
-    assert torch.equal(first[0], first[1])
-    assert not torch.equal(first[0], first[2])
-    assert one.fingerprint() == same.fingerprint()
-    whole = data(root, points=500)
-    whole.prepare()
+    assert not torch.equal(one.splits().train.fields["input"], other.splits().train.fields["input"])
     assert whole.splits().train.fields["input"].shape == (2, 300, 3)
 
 
@@ -73,12 +65,6 @@ def test_a_generated_layout_says_so(root, tmp_path):
     faust = data(tmp_path)
     faust.prepare()
     assert faust.synthetic
-
-
-def test_a_test_scan_is_read_without_preparing(root):
-    batch = data(root).read([root / "test/scans/test_scan_000.ply"]).__getitems__([0])
-    assert set(batch) == {"input", "centre", "scale", "index"}
-    assert batch["input"].shape == (1, 300, 3)
 
 
 def test_what_is_not_there_is_said(root, tmp_path):
@@ -97,9 +83,6 @@ def test_what_is_not_there_is_said(root, tmp_path):
         write_ply(tmp_path / f"training/scans/tr_scan_{number:03}.ply", scan, NO_FACES)
         write_ply(tmp_path / f"training/registrations/tr_reg_{number:03}.ply", mesh[: number - 40], NO_FACES)
     with pytest.raises(DataError, match=r"tr_reg_070\.ply: 30 vertices, the first registration has 40"):
-        data(tmp_path).prepare()
-    (tmp_path / "training/registrations/tr_reg_070.ply").write_text("ply\nno more")
-    with pytest.raises(DataError, match=r"tr_reg_070\.ply: cannot be read as PLY"):
         data(tmp_path).prepare()
     with pytest.raises(DataError, match=r"both name the people \[8\]"):
         data(root, validation=[7, 8]).prepare()

@@ -126,32 +126,17 @@ def test_poses_stay_within_their_limits_and_vary_as_stated():
 
 
 def test_people_are_split_and_drawn_by_the_data_seed(file):
-    one, same, other = prepared(file), prepared(file), prepared(file, data_seed=1)
-    batch = one.splits().test.__getitems__([3, 0, 29])
-    again = same.splits().test.__getitems__([29, 3])
-    assert torch.equal(
-        batch["input"][2].nan_to_num(), again["input"][0].nan_to_num()[: batch["input"].shape[1]]
-    )
-    assert torch.equal(batch["target"][[2, 0]], again["target"])
-    assert one.fingerprint() == same.fingerprint()
+    one, other = prepared(file), prepared(file, data_seed=1)
     assert one.fingerprint()["sha256"] != other.fingerprint()["sha256"]
     assert one.target.names[:4] == ("x0", "y0", "z0", "x1")
     assert len(one.target.names) == 3 * 132
     assert one.input_shape == (500, 3)
-    assert one.synthetic
     assert (one.groups, one.varies, one.columns) == (("whole", "partial", "outliers"), False, ("x", "y", "z"))
-    assert one.augment(batch) is batch
-    assert {name: (value.dtype, value.shape[0]) for name, value in batch.items() if name != "input"} == {
-        "target": (torch.float32, 3),
-        "centre": (torch.float32, 3),
-        "scale": (torch.float32, 3),
-        "group": (torch.int64, 3),
-        "index": (torch.int64, 3),
-    }
+    batch = one.splits().test.__getitems__([3, 0, 29])
+    assert {name: batch[name].dtype for name in ("target", "centre", "scale")} == dict.fromkeys(
+        ("target", "centre", "scale"), torch.float32
+    )
     assert one.splits().train.__getitems__([0])["target"].dtype == torch.float16
-    single = one.splits().test[7]
-    assert single["target"].shape == (396,)
-    assert one.picture(single["input"]).shape == (160, 160, 3)
 
 
 def test_points_lie_on_the_body_and_both_in_one_frame(file):
@@ -219,8 +204,6 @@ def test_a_users_scan_is_read_in_metres_without_preparing(file, tmp_path):
     assert sizes(batch["input"]).tolist() == [300, 40]
     back = denormalised(batch["input"].double(), batch["centre"].double(), batch["scale"].double())
     np.testing.assert_allclose(back[1, :40], points[:40], atol=1e-6)
-    with pytest.raises(DataError, match=r"c\.npy: no such file"):
-        data(file).read([tmp_path / "c.npy"])
 
 
 def test_bodies_that_poses_cannot_move_are_refused(file, tmp_path):
@@ -237,8 +220,6 @@ def test_bodies_that_poses_cannot_move_are_refused(file, tmp_path):
     named = Body(**{**body_files.read(file).__dict__, "names": tuple(map(str, range(22)))})
     with pytest.raises(DataError, match="has no joint 'root'"):
         poses.skeleton(named)
-    with pytest.raises(DataError, match="no such file"):
-        prepared(tmp_path / "none.npz")
 
 
 @pytest.mark.parametrize(
