@@ -1,7 +1,9 @@
 """Labelled points of the plane: as a split holds them, from a user's files, and as a person would see them."""
 
 import hashlib
+from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +12,9 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from pydantic import Field
 from torch import Tensor
+from torch.utils.data import Dataset
 
-from framework.data import Splits
+from framework.data import Batch, Data, Splits
 from framework.datasets.csv_columns import tables
 from framework.datasets.fields import Fields
 from framework.errors import DataError
@@ -25,6 +28,48 @@ SIDE = 96
 REACH = 4.0
 """A picture shows [-4, 4]², the square in which thesis §2.3.5 draws outliers."""
 COLOURS = np.array([[31, 119, 180], [255, 127, 14]], np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draws:
+    """How many points each split has, and what seeds their draws, whatever the seed of the run."""
+
+    train: Size = 500
+    validation: Size = 500
+    test: Size = 5000
+    data_seed: DataSeed = 0
+
+
+class PlanePoints(Data):
+    """Labelled points, independent draws in each split. A data set of the family adds its constructor, what to cite,
+    `drawn` and `fingerprint`."""
+
+    target = TARGET
+    input_shape = (2,)
+    synthetic = True
+    skipped = 0
+    varies = False
+    draws: Draws
+
+    @abstractmethod
+    def drawn(self, size: int, split: int) -> Fields:
+        """So many points of a split, 0 to 2."""
+
+    def prepare(self) -> None:
+        sizes = (self.draws.train, self.draws.validation, self.draws.test)
+        self._splits = [self.drawn(size, number) for number, size in enumerate(sizes)]
+
+    def splits(self) -> Splits:
+        return Splits(*self._splits)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return read_points(files)
+
+    def augment(self, batch: Batch) -> Batch:
+        return batch
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return picture(inputs, self._splits[0])
 
 
 def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
