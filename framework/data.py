@@ -93,7 +93,7 @@ class Data(ABC):
         """Unlabelled samples from a user's own files, for `mode=predict`: "input" and "index" only. Needs no `prepare`.
 
         Raises:
-            DataError: a file cannot be read; names it.
+            DataError: there is no file, or one cannot be read; names it.
         """
 
     def inputs(self, given: Any) -> Tensor:

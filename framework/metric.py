@@ -3,7 +3,9 @@
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+import torch
 import torchmetrics
+from jaxtyping import Float
 from torch import Tensor
 
 from framework.prediction import Prediction, Split
@@ -48,6 +50,36 @@ class Metric(torchmetrics.Metric, ABC):
 
         NaN where nothing was seen.
         """
+
+
+class Mean(Metric):
+    """What metrics share that are a mean over samples, of one number or several, with its standard error.
+
+    A metric of the family calls `start` in its constructor, `take_in` in `update` and `mean_and_error` in `compute`.
+    The states are sums of the numbers and of their squares: for numbers that are not negative, so that no large mean
+    hides a small spread (of scores in [0, 2] float64 resolves a spread of 1e-8).
+    """
+
+    count: Tensor
+    total: Tensor
+    squares: Tensor
+
+    def start(self, *shape: int) -> None:
+        """Declare the states for numbers of this shape in each sample."""
+        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        for name in ("total", "squares"):
+            self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
+
+    def take_in(self, numbers: Float[Tensor, "batch *shape"]) -> None:
+        self.count += len(numbers)
+        self.total += numbers.sum(0)
+        self.squares += numbers.square().sum(0)
+
+    def mean_and_error(self) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+        """Both are NaN of no sample, and of one the error is."""
+        mean = self.total / self.count
+        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
+        return mean, (spread / (self.count - 1).clamp(min=0)).sqrt()
 
 
 class Pictured(ABC):

@@ -21,6 +21,12 @@ LISTED = 5
 class Predictor(nn.Module, ABC):
     """Anything that turns inputs into a density and can be trained; a model or a wrapper around one."""
 
+    description: object = None
+    """What the checkpoint of a loaded model says of it; its text is what the model prints as."""
+
+    def __repr__(self) -> str:
+        return nn.Module.__repr__(self) if self.description is None else str(self.description)
+
     @abstractmethod
     def forward(self, inputs: Tensor) -> Distribution:
         """The density over the target for a batch of inputs, with batch_shape (batch,)."""

@@ -134,7 +134,9 @@ class Needles(Data):
             assert self.input_shape == (2,)
         if self.fault == "read sorts":
             files = sorted(files)
-        points = torch.tensor([self.line(Path(file), 2) for file in files])
+        if not files and self.fault != "no file is no sample":
+            raise DataError("no file was given; wanted one for each needle.")
+        points = torch.tensor([self.line(Path(file), 2) for file in files]).reshape(-1, 2)
         if self.fault == "read doubles":
             points = points.double()
         more = {"target": points[:, :1]} if self.fault == "read guesses the target" else {}
@@ -244,6 +246,7 @@ FAULTS = {
     "read wants prepare": "own files",
     "read sorts": "own files",
     "read doubles": "own files",
+    "no file is no sample": "own files",
     "read guesses the target": "own files",
     "bad own files are zeros": "damaged own files are named",
 }

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,6 +76,22 @@ def require(columns: Columns, names: Sequence[str], asked: str) -> None:
                 f"{asked} names {name!r}, which {columns.file} does not have.{did_you_mean(name, columns.cells)} "
                 f"Its columns: {', '.join(columns.cells)}."
             )
+
+
+def tables(
+    files: Sequence[Path], names: Sequence[str], asked: str
+) -> Iterator[tuple[Columns, Float[np.ndarray, "rows names"]]]:
+    """A user's own files one after the other, each with its columns of these names as numbers.
+
+    Raises:
+        DataError: there is no file; or as `read_columns`, `require` and `numbers`.
+    """
+    if not files:
+        raise DataError(f"No file was given; wanted at least one CSV table with {', '.join(names)}.")
+    for file in files:
+        columns = read_columns(Path(file))
+        require(columns, names, asked)
+        yield columns, np.stack([numbers(columns, name, missing="") for name in names], -1)
 
 
 def mostly_numbers(columns: Columns, name: str) -> bool:

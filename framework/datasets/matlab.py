@@ -13,6 +13,8 @@ from typing import Any
 
 import scipy.io
 
+from framework.errors import DataError
+
 HEADER_BYTES = 128
 UNSIGNED, MATRIX, COMPRESSED = 6, 14, 15
 COMPLEX = 0x0800
@@ -20,29 +22,37 @@ PLAIN_TYPES = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
 """Element types of the MAT-File Format, table 1-1: integers, floating point and text."""
 
 
-def read_variables(file: Path, names: list[str]) -> dict[str, Any]:
-    """Read the named variables of a file that is whole, structs as `scipy.io.matlab.mat_struct`, squeezed.
+def read_variables(file: Path, names: list[str], source: str) -> dict[str, Any]:
+    """Read the named variables of a file, structs as `scipy.io.matlab.mat_struct`, squeezed.
+
+    Args:
+        source: where the file can be had again, for messages: "the release".
 
     Raises:
-        FileNotFoundError: there is no such file.
-        NotImplementedError: a MATLAB 7.3 file.
-        Exception: nearly any other, where the file is damaged; see the module.
+        DataError: there is no such file, or it is damaged or of another version than 5.
     """
-    content = file.read_bytes()
-    check(content)
-    return scipy.io.loadmat(
-        io.BytesIO(content), squeeze_me=True, struct_as_record=False, variable_names=names
-    )
+    try:
+        content = file.read_bytes()
+        check(content)
+        return scipy.io.loadmat(
+            io.BytesIO(content), squeeze_me=True, struct_as_record=False, variable_names=names
+        )
+    except FileNotFoundError:
+        raise DataError(f"{file}: no such file. Restore it from {source}.") from None
+    except Exception as error:  # nearly any, where the file is damaged
+        raise DataError(
+            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from {source}."
+        ) from error
 
 
 def check(content: bytes) -> None:
-    """Raise ValueError, or zlib.error, for a damaged file; NotImplementedError for one of version 7.3."""
+    """Raise ValueError, or zlib.error, for a file that is damaged or of another version."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:HEADER_BYTES])
     if order is None:
         raise ValueError("no header of a MATLAB 5 file")
     (version,) = struct.unpack_from(f"{order}H", content, 124)
     if version == 0x0200:
-        raise NotImplementedError("version 7.3")
+        raise ValueError("it is a MATLAB 7.3 file; wanted version 5, which `save` writes with '-v7'")
     if version != 0x0100:
         raise ValueError(f"version {version:#06x} instead of 0x0100")
     position = HEADER_BYTES

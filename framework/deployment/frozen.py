@@ -20,6 +20,7 @@ from framework.data import Data
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.protocol import median
+from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.runs.loading import load_with_description, reader
 
@@ -43,7 +44,12 @@ def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "F
     Args:
         input_shape: of one sample. Needed by a predictor without fixed encoders in front; where it is not given, the
             first call tells, and takes seconds.
+
+    Raises:
+        ConfigError: it was loaded, and so takes raw input, which `freeze` makes ready in the frozen form too.
     """
+    if predictor.description is not None:
+        raise ConfigError("This model was loaded from a run or checkpoint. Give that to framework.freeze.")
     return Frozen(predictor, input_shape)
 
 

@@ -48,6 +48,20 @@ class Description:
         state = dict(data.state_dict())
         return cls(parts, data.target, data.input_shape, data.columns, data.synthetic, method, kept, state)
 
+    def __str__(self) -> str:
+        parts = [*self.config["encoder"], self.config["density_head"], *self.config["uncertainty"]]
+        names = " + ".join(part["name"] for part in parts)
+        unit = {"angle": "angles in radians", "real": "reals in their own unit", "class": "classes"}
+        return "\n".join(
+            [
+                f"{self.method or names}, trained on {self.config['data']['name']}{' (synthetic)' * self.synthetic}",
+                f"  reads    {'×'.join(map(str, self.input_shape))} {', '.join(self.columns)}".rstrip(),
+                f"  predicts {unit[self.target.kind]}: {self.target.told}",
+                f"  made of  {names}",
+                f"  from     {self.path}",
+            ]
+        )
+
     def stored(self) -> dict[str, Any]:
         """As a checkpoint holds it."""
         return {

@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import torch
-from torch import nn
-from torch.distributions import Distribution
+from torch import Tensor, nn
 
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
@@ -16,73 +15,18 @@ from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
 from framework.runs.description import Description
-from framework.target import Target
 from framework.training.checkpoint import latest_good, read
 
 PREFIX = "predictor."
 """What Lightning's checkpoints put before the predictor's own parameter names."""
 
 
-@final
-class Loaded(nn.Module):
-    """A trained model that takes what its user has, and answers in the user's unit.
+def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
+    """The trained model in evaluation mode, on the CPU; it takes what its user has, and answers in the user's unit.
 
-    Attributes:
-        predictor: the model itself, from inputs as its data set makes them to a density.
-        description: what its checkpoint says of it: parts, target, method, data.
-        data: the data set it was trained on, which nothing was read of: it knows how raw input is made ready.
-    """
-
-    def __init__(self, predictor: Predictor, description: Description, data: Data) -> None:
-        super().__init__()
-        self.predictor = predictor
-        self.description = description
-        self.data = data
-
-    @property
-    def target(self) -> Target:
-        """What is predicted: its kind, and the names of its numbers or classes."""
-        return self.description.target
-
-    def forward(self, given: Any) -> Distribution:
-        """The density over the target, with batch_shape (batch,): angles in radians, reals in their own unit.
-
-        Args:
-            given: files, arrays, or what else the data set takes (`Data.inputs`).
-
-        Raises:
-            DataError: it is no input of this model.
-        """
-        inputs = self.data.inputs(given)
-        own = next(self.predictor.parameters(), inputs)
-        # bytes are pixels, which encoders scale; any other number is one of the model's own type
-        return self.predictor(
-            inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
-        )
-
-    def __repr__(self) -> str:
-        about, parts = self.description, self.description.config
-        names = " + ".join(
-            part["name"] for part in [*parts["encoder"], parts["density_head"], *parts["uncertainty"]]
-        )
-        count = sum(parameter.numel() for parameter in self.predictor.parameters())
-        unit = {"angle": "angles in radians", "real": "reals in their own unit", "class": "classes"}[
-            about.target.kind
-        ]
-        data = f"{parts['data']['name']}{' (synthetic)' if about.synthetic else ''}"
-        return "\n".join(
-            [
-                f"{about.method or names}, trained on {data}",
-                f"  reads    {'×'.join(map(str, about.input_shape))} {', '.join(about.columns)}".rstrip(),
-                f"  predicts {unit}: {about.target.told}",
-                f"  made of  {names}, {count:,} parameters",
-                f"  from     {about.path}",
-            ]
-        )
-
-
-def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Loaded:
-    """The trained model in evaluation mode, on the CPU.
+    `model(given)` is the density over the target, with batch_shape (batch,): of files, arrays, or what else the data
+    set takes (`Data.inputs`); angles in radians, reals in their own unit, classes by their number in
+    `model.description.target.names`. Its other methods take inputs as the data set makes them.
 
     Args:
         run_or_checkpoint: a run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
@@ -92,7 +36,17 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Loaded:
         CheckpointError: nothing is there, it is damaged, or it does not fit the model it describes.
     """
     predictor, description = load_with_description(run_or_checkpoint, uri=uri)
-    return Loaded(predictor, description, reader(description)).eval()
+    predictor.description = description
+    data = reader(description)
+
+    def ready(model: nn.Module, given: tuple[Any]) -> Tensor:
+        inputs = data.inputs(*given)
+        own = next(model.parameters(), inputs)
+        # bytes are pixels, which encoders scale; any other number is one of the model's own type
+        return inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
+
+    predictor.register_forward_pre_hook(ready)
+    return predictor
 
 
 def reader(description: Description) -> Data:

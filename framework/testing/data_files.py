@@ -81,8 +81,9 @@ def left_out(bench: Workbench, worst: Worst) -> None:
 
 
 def own_files(bench: Workbench, worst: Worst) -> None:
-    """Files are read without preparing anything, in their order, as the samples of the splits are."""
+    """Files are read without preparing anything, in their order, as the splits' samples are; no file is refused."""
     files, data = _own(bench)
+    refused(lambda: data.read([]), [], "no file", worst)
     together = _read(data, files, bench, worst)
     apart = [sample for file in files for sample in _read(data, [file], bench, worst)]
     backwards = _read(data, files[::-1], bench, worst)

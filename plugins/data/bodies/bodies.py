@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture
 from framework.datasets.fields import Fields
+from framework.errors import DataError
 from framework.geometry import clouds
 from framework.geometry.mesh_files import XYZ
 from framework.target import Target
@@ -42,6 +43,8 @@ class Bodies(Data):
         return self._splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        if not files:
+            raise DataError("No file was given; wanted the scan of a body, or several.")
         found = clouds.pad([self.cloud(file) for file in files])
         return Fields(**normalised(found), index=torch.arange(len(files)))
 

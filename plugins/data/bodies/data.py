@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,16 +21,24 @@ from plugins.data.bodies.bodies import Bodies, normalised, target_of
 from plugins.data.bodies.body import BodyModel
 from plugins.data.bodies.faust import SUBJECTS, Scan, registered, scans
 from plugins.data.bodies.people import People, chosen_body
-from plugins.data.bodies.scanner import KINDS, Scanner, shares
+from plugins.data.bodies.scanner import KINDS, Kinds, Scanner
 from plugins.data.bodies.scans import Scans
 
 VERSION = 1
 """Of what is drawn; a change takes a new number."""
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Points = Annotated[int, Field(ge=100, le=1_000_000)]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Subjects = Annotated[list[Annotated[int, Field(ge=0, lt=SUBJECTS)]], Field(min_length=1)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """Bodies of each split."""
+
+    train: Size = 48_000
+    validation: Size = 400
+    test: Size = 1_000
 
 
 class Registration(Bodies):
@@ -39,11 +48,8 @@ class Registration(Bodies):
     that is kept: a sample is a function of (`data_seed`, split, number), made when it is fetched.
 
     Args:
-        train, validation, test: bodies of each split.
-        points: of a scan, at most.
-        noise: largest standard deviation of a coordinate, metres; each scan has its own, uniform below.
-        partial, outliers: shares of scans with missing parts and with points that are not the body's.
-        cut, strangers: the largest share of points such a scan lacks or has too many.
+        sizes: of the splits.
+        scanner, kinds: of every scan, and how many scans are of which kind.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body, extracted on first use.
         shape_spread: standard deviation of the first ten shape coefficients of a body from a file.
         data_seed: of the draws, whatever the seed of the run.
@@ -69,22 +75,16 @@ class Registration(Bodies):
     def __init__(
         self,
         *,
-        train: Size = 48_000,
-        validation: Size = 400,
-        test: Size = 1_000,
-        points: Points = 10_000,
-        noise: Annotated[float, Field(ge=0, le=0.1, allow_inf_nan=False)] = 0.004,
-        partial: Share = 0.2,
-        outliers: Share = 0.2,
-        cut: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.2,
-        strangers: Annotated[float, Field(ge=0, le=0.3, allow_inf_nan=False)] = 0.1,
+        sizes: Sizes,
+        scanner: Scanner,
+        kinds: Kinds,
         body: str | None = None,
         shape_spread: Annotated[float, Field(ge=0, le=5, allow_inf_nan=False)] = 1.0,
         data_seed: Seed = 0,
     ) -> None:
-        self.sizes = {"train": train, "validation": validation, "test": test}
-        self.scanner = Scanner(points, noise, cut, strangers)
-        self.shares = shares(partial, outliers)
+        self.sizes = asdict(sizes)
+        self.scanner = scanner
+        self.kinds = kinds
         self.body = body
         self.shape_spread = shape_spread
         self.data_seed = data_seed
@@ -104,7 +104,7 @@ class Registration(Bodies):
         name, seed = Splits._fields[split], (self.data_seed, split)
         random = np.random.default_rng(seed)
         people = self.people.draw(self.sizes[name], random)
-        kind = torch.from_numpy(random.choice(len(KINDS), self.sizes[name], p=self.shares))
+        kind = torch.from_numpy(random.choice(len(KINDS), self.sizes[name], p=self.kinds.shares()))
         # a quarter of a millimetre is nothing to learn from, and targets of all training bodies may be kept at once
         precision = torch.float16 if name == "train" else torch.float32
         return Scans(self.model, people, kind, self.scanner, seed, precision)

@@ -1,11 +1,12 @@
 """What a scanner makes of a body: points of its surface with noise, parts missing, and points of something else."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.random import Generator
+from pydantic import Field
 
 from framework.geometry.meshes import Mesh, normals, sample
 
@@ -13,27 +14,37 @@ Kind = Literal["whole", "partial", "outliers"]
 KINDS: tuple[Kind, ...] = ("whole", "partial", "outliers")
 
 
-@dataclass(frozen=True)
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scanner:
     """How a body is scanned.
 
     Attributes:
         points: of the surface and beside it, all in all; fewer where parts are missing.
-        noise: largest standard deviation of every coordinate, metres.
+        noise: largest standard deviation of every coordinate, metres; each scan has its own, uniform below.
         cut: largest share of the points that is missing behind a plane or within a ball.
         strangers: largest share of the points that are not the body's.
     """
 
-    points: int
-    noise: float
-    cut: float
-    strangers: float
+    points: Annotated[int, Field(ge=100, le=1_000_000)] = 10_000
+    noise: Annotated[float, Field(ge=0, le=0.1, allow_inf_nan=False)] = 0.004
+    cut: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.2
+    strangers: Annotated[float, Field(ge=0, le=0.3, allow_inf_nan=False)] = 0.1
 
 
-def shares(partial: float, outliers: float) -> Float[np.ndarray, "kind"]:
-    """Of each kind of scan, of sum 1; what is neither partial nor has outliers is whole."""
-    found = (1 - min(1, partial + outliers), partial, outliers)
-    return np.array(found) / sum(found)
+@dataclass(frozen=True, kw_only=True)
+class Kinds:
+    """Shares of the scans with missing parts and with points that are not the body's; all others are whole."""
+
+    partial: Share = 0.2
+    outliers: Share = 0.2
+
+    def shares(self) -> Float[np.ndarray, "kind"]:
+        """Of each kind of scan, of sum 1."""
+        found = (1 - min(1, self.partial + self.outliers), self.partial, self.outliers)
+        return np.array(found) / sum(found)
 
 
 def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:

@@ -1,23 +1,17 @@
 """The CAVIAR crops with partly hidden heads, and drawn ones in their layout: train/ and test/, `or_label.mat`."""
 
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
-from torch import Tensor
-from torch.utils.data import Dataset
 
-from framework.data import Batch, Data, Splits
-from framework.datasets import images
-from framework.storage.generated import read_mark
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
 from plugins.data.head_pose.caviar_labels import LABELS, Label, read_labels, write_labels
-from plugins.data.head_pose.labelled_images import Labelled, Reading, halves, load
+from plugins.data.head_pose.labelled_images import Found, Heads, Labelled, Reading
 from plugins.data.head_pose.synthetic_heads import Conditions, Pose
 
 SIDE = 50  # pixels, as published
@@ -29,8 +23,11 @@ CONDITIONS = Conditions(
 AS_PUBLISHED = Reading(image_size=SIDE)
 
 
-class Caviar(Data):
-    """Partly hidden heads of people in a shopping centre, and their gaze; generated where no root is given."""
+class Caviar(Heads):
+    """Partly hidden heads of people in a shopping centre, and their gaze; generated where no root is given.
+
+    Training mirrors no image: the thesis authors' data hold no mirror images.
+    """
 
     bibtex = """@misc{fisher2005caviar,
   author = {Fisher, Robert and Santos-Victor, Jose and Crowley, James},
@@ -59,36 +56,17 @@ class Caviar(Data):
     ) -> None:
         self.source = Source(ARCHIVE, root, images, generator_seed)
         self.reading = reading
-        self.input_shape = (3, reading.image_size, reading.image_size)
 
-    def prepare(self) -> None:
-        root = self.source.folder()
-        self.synthetic = read_mark(root) is not None
-        samples = {
-            split: [
-                Labelled(root / split / f"{label.name}.jpg", (math.radians(label.gaze),)) for label in labels
-            ]
-            for split, labels in read_labels(root / LABELS).items()
-        }
-        samples["validation"], samples["test"] = halves(samples["test"])
-        self.loaded = load(samples, self.target.names, self.reading, generated_in=self.source.generated_in())
-        self.skipped = self.loaded.skipped
-
-    def splits(self) -> Splits:
-        return Splits(**self.loaded.tables)
-
-    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return self.reading.own(files)
-
-    def augment(self, batch: Batch) -> Batch:
-        # No mirroring: the thesis authors' data hold no mirror images.
-        return images.varied(batch, (), self.reading.jitter)
-
-    def fingerprint(self) -> Mapping[str, str]:
-        return self.source.fingerprint(self.synthetic) | self.loaded.fingerprint
-
-    def picture(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+    def found(self, root: Path) -> Found:
+        labels = read_labels(root / LABELS)
+        return Found(
+            {
+                split: [
+                    Labelled(root / split / f"{each.name}.jpg", (math.radians(each.gaze),)) for each in some
+                ]
+                for split, some in labels.items()
+            }
+        )
 
 
 def _draw(root: Path, images: int, seed: int) -> None:

@@ -36,16 +36,7 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
         DataError: the file cannot be read, lacks a struct array, or one of its elements is no label.
     """
     names = [f"or_label_{split}" for split in TRAIN_AND_TEST]
-    try:
-        content = read_variables(file, names)
-    except NotImplementedError:
-        raise DataError(
-            f"{file}: a MATLAB 7.3 file; wanted version 5, as published. Save it with '-v7'."
-        ) from None
-    except Exception as error:  # nearly any, where the file is damaged
-        raise DataError(
-            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from its source."
-        ) from error
+    content = read_variables(file, names, "its source")
     missing = [name for name in names if name not in content]
     if missing:
         raise DataError(f"{file}: holds no {' and no '.join(missing)}. Restore it from its source.")

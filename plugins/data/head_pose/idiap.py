@@ -1,23 +1,17 @@
 """The IDIAP head-pose crops, and drawn heads in their layout: pictures in train/ and test/, `or_label_full.mat`."""
 
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
-from torch import Tensor
-from torch.utils.data import Dataset
 
-from framework.data import Batch, Data, Splits
-from framework.datasets import images
-from framework.storage.generated import read_mark
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
 from plugins.data.head_pose.idiap_labels import ANGLES, LABELS, Label, read_labels, write_labels
-from plugins.data.head_pose.labelled_images import Labelled, Reading, halves, load
+from plugins.data.head_pose.labelled_images import Found, Heads, Labelled, Reading
 from plugins.data.head_pose.synthetic_heads import Conditions, Person, Pose
 
 SIDE = 75  # pixels, as published
@@ -29,8 +23,11 @@ CONDITIONS = Conditions(
 AS_PUBLISHED = Reading(image_size=SIDE)
 
 
-class Idiap(Data):
-    """Heads of a few people in a meeting room, and their pan, tilt and roll; generated where no root is given."""
+class Idiap(Heads):
+    """Heads of a few people in a meeting room, and their pan, tilt and roll; generated where no root is given.
+
+    Training mirrors no image: the published ones hold their mirror images already.
+    """
 
     bibtex = """@inproceedings{ba2005evaluation,
   author = {Ba, Sil{\\`e}ye O. and Odobez, Jean-Marc},
@@ -64,38 +61,19 @@ class Idiap(Data):
         self.angles_in: Literal["radians", "degrees"] = "radians" if root is None else angles_in
         self.reading = reading
         self.target = Target("angle", tuple(dict.fromkeys(angles or ANGLES)))
-        self.input_shape = (3, reading.image_size, reading.image_size)
 
-    def prepare(self) -> None:
-        root = self.source.folder()
-        self.synthetic = read_mark(root) is not None
+    def found(self, root: Path) -> Found:
         columns = [ANGLES.index(name) for name in self.target.names]
-        samples = {
-            split: [
-                Labelled(root / split / label.name, tuple(label.angles[column] for column in columns))
-                for label in labels
-            ]
-            for split, labels in read_labels(root / LABELS, self.angles_in).items()
-        }
-        samples["validation"], samples["test"] = halves(samples["test"])
-        self.loaded = load(samples, self.target.names, self.reading, generated_in=self.source.generated_in())
-        self.skipped = self.loaded.skipped
-
-    def splits(self) -> Splits:
-        return Splits(**self.loaded.tables)
-
-    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return self.reading.own(files)
-
-    def augment(self, batch: Batch) -> Batch:
-        # No mirroring: the published training images hold their mirror images already.
-        return images.varied(batch, (), self.reading.jitter)
-
-    def fingerprint(self) -> Mapping[str, str]:
-        return self.source.fingerprint(self.synthetic) | self.loaded.fingerprint
-
-    def picture(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+        labels = read_labels(root / LABELS, self.angles_in)
+        return Found(
+            {
+                split: [
+                    Labelled(root / split / label.name, tuple(label.angles[column] for column in columns))
+                    for label in some
+                ]
+                for split, some in labels.items()
+            }
+        )
 
 
 def pose(random: np.random.Generator) -> Pose:

@@ -1,7 +1,8 @@
-"""Reads whole images with angles in three splits, once a data set knows which image has which label."""
+"""What the data sets of heads share: whole images with angles, read in three splits."""
 
 import hashlib
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,16 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
 
-from framework.data import Splits
+from framework.data import Batch, Data, Splits
 from framework.datasets import images
 from framework.datasets.fields import Fields
 from framework.datasets.images import Crop, Crops
 from framework.errors import DataError
+from framework.storage.generated import read_mark
+from plugins.data.head_pose.archive import Source
 
 SPLITS = Splits._fields
 SPLIT_SEED = 13
@@ -68,6 +73,66 @@ class Loaded(NamedTuple):
     fingerprint: dict[str, str]
 
 
+class Found(NamedTuple):
+    """What the labels of a data set say.
+
+    Attributes:
+        samples: images by split; without "validation" the published test set is halved.
+        faults: labels that could not be read; they count as unreadable images.
+        left_out: what else is missing from the splits, for the complaint about an empty one.
+    """
+
+    samples: dict[str, list[Labelled]]
+    faults: Sequence[DataError] = ()
+    left_out: str = ""
+
+
+class Heads(Data):
+    """Pictures of heads and where they look. A data set of the family adds its constructor, what to cite, and `found`.
+
+    The constructor sets `source`, `reading`, `target`, and `signs` where mirror images are shown in training.
+    """
+
+    source: Source
+    reading: Reading
+    signs: tuple[float, ...] = ()
+    """What a mirror image multiplies the angles by; empty: no image is mirrored."""
+
+    @abstractmethod
+    def found(self, root: Path) -> Found:
+        """What the labels in a folder say.
+
+        Raises:
+            DataError: the labels cannot be read.
+        """
+
+    def prepare(self) -> None:
+        root = self.source.folder()
+        self.synthetic = read_mark(root) is not None
+        samples, faults, left_out = self.found(root)
+        if "validation" not in samples:
+            samples["validation"], samples["test"] = halves(samples["test"])
+        names, drawn_in = self.target.names, self.source.generated_in()
+        self._loaded = load(samples, names, self.reading, faults, generated_in=drawn_in, left_out=left_out)
+        self.skipped = self._loaded.skipped
+        self.input_shape = (3, self.reading.image_size, self.reading.image_size)
+
+    def splits(self) -> Splits:
+        return Splits(**self._loaded.tables)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return self.reading.own(files)
+
+    def augment(self, batch: Batch) -> Batch:
+        return images.varied(batch, self.signs, self.reading.jitter)
+
+    def fingerprint(self) -> Mapping[str, str]:
+        return self.source.fingerprint(self.synthetic) | self._loaded.fingerprint
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return images.picture(inputs)
+
+
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
     """Halve what was published as one test set into validation and test, as the thesis authors' code does."""
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
@@ -88,9 +153,8 @@ def load(
 
     Args:
         names: of the angles.
-        faults: labels that could not be read; they count as unreadable images.
+        faults, left_out: as in Found.
         generated_in: the cache folder of generated images; None: they are the user's.
-        left_out: what else is missing from the splits, for the complaint about an empty one.
 
     Raises:
         DataError: an angle is not finite, images cannot be read and are not to be skipped, or a split is empty.

@@ -72,28 +72,6 @@ def test_other_contents_are_refused(root: Path) -> None:
         prepared("caviar", root)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "cannot be read as a MATLAB file"),
-        (b"no matrix at all" * 20, "cannot be read as a MATLAB file"),
-        (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400), r"a MATLAB 7\.3 file; .* '-v7'"),
-    ],
-)
-def test_label_file_that_cannot_be_read(root: Path, content: bytes, message: str) -> None:
-    (root / LABELS).write_bytes(content)
-    with pytest.raises(DataError, match=rf"or_label\.mat: {message}"):
-        prepared("caviar", root)
-
-
-def test_label_file_that_is_cut_short_is_named(root: Path) -> None:
-    whole = (root / LABELS).read_bytes()
-    for length in range(0, len(whole), 499):
-        (root / LABELS).write_bytes(whole[:length])
-        with pytest.raises(DataError, match=r"or_label\.mat: "):
-            prepared("caviar", root)
-
-
 @pytest.mark.parametrize("gaze", [math.nan, -math.inf])
 def test_gaze_that_is_not_finite_is_never_skipped(root: Path, gaze: float) -> None:
     rows = [caviar_row(n) for n in range(20, 31)]

@@ -58,15 +58,6 @@ def test_degrees_and_radians_are_told_apart(root: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("content", [b"", b"no HDF5 at all" * 99, b"MATLAB 5.0 MAT-file".ljust(600)])
-def test_label_file_that_cannot_be_read(root: Path, content: bytes) -> None:
-    (root / LABELS).write_bytes(content)
-    with pytest.raises(
-        DataError, match=r"or_label_full\.mat: cannot be read as the MATLAB 7\.3 \(HDF5\) file"
-    ):
-        prepared("idiap", root)
-
-
 def test_label_file_that_is_cut_short_or_lacks_something_is_named(root: Path) -> None:
     whole = (root / LABELS).read_bytes()
     for length in range(0, len(whole) - 1, 4999):

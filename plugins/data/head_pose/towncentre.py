@@ -1,22 +1,17 @@
 """The TownCentre heads, and drawn ones in their layout: a folder a person, an image and a text file a head."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from PIL import Image
 from pydantic import Field
-from torch import Tensor
-from torch.utils.data import Dataset
 
-from framework.data import Batch, Data, Splits
-from framework.datasets import images
-from framework.storage.generated import draw_all, read_mark
+from framework.storage.generated import draw_all
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source
-from plugins.data.head_pose.labelled_images import Reading, load
+from plugins.data.head_pose.labelled_images import Found, Heads, Reading
 from plugins.data.head_pose.synthetic_heads import Conditions, Pose
 from plugins.data.head_pose.towncentre_labels import FOLDER, by_person, find_heads, label_text
 
@@ -29,7 +24,7 @@ CONDITIONS = Conditions(
 AS_PUBLISHED = Reading(image_size=SIDE)
 
 
-class TownCentre(Data):
+class TownCentre(Heads):
     """Heads of pedestrians seen by a surveillance camera, and their pan; generated where no root is given.
 
     Attributes:
@@ -62,38 +57,12 @@ class TownCentre(Data):
     ) -> None:
         self.source = Source(ARCHIVE, root, images, generator_seed)
         self.reading = reading
-        self.mirror = mirror
-        self.input_shape = (3, reading.image_size, reading.image_size)
-
-    def prepare(self) -> None:
-        root = self.source.folder()
-        self.synthetic = read_mark(root) is not None
-        heads, self.invalid, faults = find_heads(root)
-        self.loaded = load(
-            by_person(heads),
-            self.target.names,
-            self.reading,
-            faults,
-            generated_in=self.source.generated_in(),
-            left_out=f", {self.invalid} marked as not valid",
-        )
-        self.skipped = self.loaded.skipped
-
-    def splits(self) -> Splits:
-        return Splits(**self.loaded.tables)
-
-    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return self.reading.own(files)
-
-    def augment(self, batch: Batch) -> Batch:
         # The mirror image of a head at pan p shows one at -p, 360° - p in the words of Beyer et al.
-        return images.varied(batch, (-1.0,) if self.mirror else (), self.reading.jitter)
+        self.signs = (-1.0,) if mirror else ()
 
-    def fingerprint(self) -> Mapping[str, str]:
-        return self.source.fingerprint(self.synthetic) | self.loaded.fingerprint
-
-    def picture(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+    def found(self, root: Path) -> Found:
+        heads, self.invalid, faults = find_heads(root)
+        return Found(by_person(heads), faults, f", {self.invalid} marked as not valid")
 
 
 def pose(heading: float, random: np.random.Generator) -> Pose:

@@ -1,6 +1,6 @@
 """ModelNet40, a user's own folders, and DALES; the contract is framework.data's."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +24,21 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Surfaces:
+    """How surfaces become points, drawn uniformly by area.
+
+    Attributes:
+        points: of each surface (thesis §6.5.1: 2048).
+        normals: add the faces' normals as columns.
+        data_seed: of the points and of the validation split, whatever the seed of the run.
+    """
+
+    points: Annotated[int, Field(ge=1, le=1_000_000)] = 2048
+    normals: bool = False
+    data_seed: Seed = 0
+
+
 class ModelNet40(LabelledClouds):
     """CAD models of everyday things as points of their surfaces, z up; generated where no root is given.
 
@@ -31,15 +46,12 @@ class ModelNet40(LabelledClouds):
 
     Args:
         root: the unpacked ModelNet40; None: a generated set in its layout, 23 classes.
-        points: of each surface, uniform by area (thesis §6.5.1: 2048).
+        surfaces: how meshes become points.
         classes: some of them; None: all.
-        normals: add the faces' normals as columns.
         validation_share: of the official training split, of every class alike.
         rotations: a training cloud comes so many times, turned about the up axis in equal steps (thesis §6.5.1).
         unreadable: what becomes of files that cannot be read.
-        data_seed: of points and validation split, whatever the seed of the run.
-        train_models, test_models: generated models of each class.
-        generator_seed: of these.
+        models: what is generated.
     """
 
     bibtex = """@inproceedings{wu2015modelnet,
@@ -56,21 +68,17 @@ class ModelNet40(LabelledClouds):
         self,
         *,
         root: str | None = None,
-        points: Annotated[int, Field(ge=1, le=1_000_000)] = 2048,
+        surfaces: Surfaces,
         classes: list[str] | None = None,
-        normals: bool = False,
         validation_share: Share = 0.15,
         rotations: Annotated[int, Field(ge=1, le=360)] = 1,
         unreadable: Unreadable = "error",
-        data_seed: Seed = 0,
-        train_models: Annotated[int, Field(ge=2, le=10_000)] = 60,
-        test_models: Annotated[int, Field(ge=1, le=10_000)] = 25,
-        generator_seed: Seed = 0,
+        models: Models,
     ) -> None:
         self.root = root
-        self.models = Models(train_models, test_models, generator_seed)
+        self.models = models
         self.classes = classes
-        self.reading = Reading(points, NORMALS if normals else (), data_seed)
+        self.reading = Reading(surfaces.points, NORMALS if surfaces.normals else (), surfaces.data_seed)
         self.columns = self.reading.all_columns
         self.unreadable: Unreadable = unreadable
         self.validation_share = validation_share
@@ -78,7 +86,7 @@ class ModelNet40(LabelledClouds):
 
     def found(self) -> Found:
         if self.root is None:
-            root, name = generated(self.models), f"synthetic, seed {self.models.seed}"
+            root, name = generated(self.models), f"synthetic, seed {self.models.generator_seed}"
             remedy = {"remedy": f"Delete {root}: the models are generated anew."}
         else:
             root, name, remedy = Path(self.root).expanduser(), self.root, {}

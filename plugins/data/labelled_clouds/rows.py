@@ -11,6 +11,7 @@ from framework.testing.sample_files import meshes, surface, write_off
 UNMISSED = ("empty", "cut", "garbage", "folder")
 """Which files there are is for the folder to say: one fewer is a smaller set."""
 MODELS = {"train_models": 3, "test_models": 1, "points": 20, "classes": ["bolt", "bowl", "stool"]}
+CLASSES = ("building", "car", "tree")
 MADE = {"data_seed": 1, "generator_seed": 1}
 
 
@@ -26,19 +27,22 @@ def folder_of_classes(folder: Path) -> Mapping[str, str]:
     return {"root": str(folder)}
 
 
-def archive(folder: Path) -> Mapping[str, str]:
-    """33 objects of 2 to 20 points and three classes."""
+def objects(counts: tuple[int, ...] = (11, 10, 12)) -> dict[str, np.ndarray]:
+    """An archive's arrays: so many objects of each class, of 2 to 20 points."""
     random = np.random.default_rng(0)
-    label = random.permutation(np.repeat(np.arange(3), (11, 10, 12)))
+    label = random.permutation(np.repeat(np.arange(len(counts)), counts))
     sizes = random.integers(2, 21, len(label))
-    np.savez(
-        folder / "objects.npz",
-        points=random.normal(size=(sizes.sum(), 3)).astype(np.float32),
-        offset=np.concatenate([[0], np.cumsum(sizes)]),
-        label=label,
-        object_id=np.arange(len(label)) + 100,
-        classes=np.array(["building", "car", "tree"]),
-    )
+    return {
+        "points": random.normal(size=(sizes.sum(), 3)).astype(np.float32),
+        "offset": np.concatenate([[0], np.cumsum(sizes)]),
+        "label": label,
+        "object_id": np.arange(len(label)) + 100,
+        "classes": np.array(CLASSES[: len(counts)]),
+    }
+
+
+def archive(folder: Path) -> Mapping[str, str]:
+    np.savez(folder / "objects.npz", **objects())  # type: ignore[arg-type]
     return {"root": str(folder / "objects.npz")}
 
 

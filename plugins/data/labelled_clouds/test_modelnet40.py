@@ -38,18 +38,14 @@ def test_splits_labels_and_attributes(prepared, tmp_path):
     assert clouds.target.names == ("box", "crate", "cube")
     assert clouds.input_shape == (64, 3)
     assert clouds.columns == ("x", "y", "z")
-    assert (clouds.synthetic, clouds.skipped, clouds.varies) == (False, 0, False)
+    assert not clouds.varies
     sizes = {}
     for name, split in clouds.splits()._asdict().items():
         batch = split.__getitems__(range(len(split)))
         sizes[name] = torch.bincount(batch["target"]).tolist()
         assert batch["input"].shape == (len(split), 64, 3)
-        assert batch["input"].dtype == torch.float32
-        assert batch["index"].tolist() == list(range(len(split)))
-        assert not batch["group"].any()
         surface = (batch["input"] - torch.tensor([0, 0, 0.5])).abs().amax(-1)
         torch.testing.assert_close(surface, torch.full_like(surface, 0.5))
-        assert clouds.augment(batch) is batch
     assert sizes == {"train": [4, 4, 4], "validation": [1, 1, 1], "test": [2, 2, 2]}
     print_of = clouds.fingerprint()
     assert (print_of["train"], print_of["version"]) == ("12", "ModelNet40")
@@ -65,7 +61,6 @@ def test_points_are_those_of_the_file_whatever_else_is_read(data, prepared, tmp_
         np.testing.assert_array_equal(last["input"], wanted)
     unlabelled = data(points=64, data_seed=7).read([file])  # without prepare
     np.testing.assert_array_equal(unlabelled[0]["input"], wanted)
-    assert set(unlabelled[0]) == {"input", "index"}
 
 
 def test_the_second_run_reads_no_mesh(prepared, tmp_path, monkeypatch):
@@ -76,7 +71,6 @@ def test_the_second_run_reads_no_mesh(prepared, tmp_path, monkeypatch):
     assert torch.equal(
         first.splits().train.__getitems__([3, 1])["input"], again.splits().train.__getitems__([3, 1])["input"]
     )
-    assert first.fingerprint() == again.fingerprint()
 
 
 def test_normals_are_those_of_the_faces(prepared, tmp_path):
@@ -116,24 +110,8 @@ def test_rotations_repeat_the_training_split_about_the_up_axis(prepared, tmp_pat
         turned.splits().train[3 * count]
 
 
-def test_what_cannot_be_read_is_refused_or_skipped_and_counted(prepared, tmp_path):
-    root = official(tmp_path / "ModelNet40")
-    cube(root, "cube/train/cube_0001.off", content="OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n")
-    cube(root, "box/test/box_0005.off", content="OFF 1\n")
-    with pytest.raises(
-        DataError, match=r"(?s)2 of 21 samples cannot.*it has no faces.*data\.unreadable=skip"
-    ):
-        prepared(root=root)
-    clouds = prepared(root=root, unreadable="skip", validation_share=0.2)
-    assert clouds.skipped == 2
-    assert torch.bincount(clouds.splits().test.fields.fields["target"]).tolist() == [1, 2, 2]
-    assert len(clouds.splits().train) + len(clouds.splits().validation) == 14
-
-
 def test_other_layouts_and_classes_are_refused(prepared, tmp_path):
     root = official(tmp_path / "ModelNet40")
-    with pytest.raises(DataError, match="no such folder"):
-        prepared(root=tmp_path / "elsewhere")
     with pytest.raises(DataError, match="ModelNet40 has no folders train and test"):
         prepared(root=tmp_path)
     with pytest.raises(DataError, match=r"names 'crat', which .* Did you mean 'crate'"):
@@ -146,12 +124,8 @@ def test_other_layouts_and_classes_are_refused(prepared, tmp_path):
         prepared(root=root)
 
 
-def test_without_a_root_a_marked_set_is_read(prepared):
+def test_without_a_root_every_class_is_made(prepared):
     clouds = prepared(points=128, **SIZES)
-    assert clouds.synthetic
     assert len(clouds.target.names) == len(CLASSES) >= 16
     assert clouds.fingerprint()["root"] == "synthetic, seed 0"
     assert torch.bincount(clouds.splits().test.fields.fields["target"]).tolist() == [2] * len(CLASSES)
-    image = clouds.picture(clouds.splits().test[0]["input"])
-    assert image.shape == (160, 160, 3)
-    assert 0.02 < (image < 255).any(-1).mean() < 0.9

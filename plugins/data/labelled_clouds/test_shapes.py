@@ -17,21 +17,21 @@ def root(tmp_path_factory):
     """A generated root of 4 + 2 models a class; its cache too is the module's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FRAMEWORK_CACHE", str(tmp_path_factory.mktemp("cache")))
-        return generated(Models(4, 2, 0))
+        return generated(Models(train_models=4, test_models=2))
 
 
 def test_a_root_is_a_function_of_its_seed_to_the_byte(root):
-    again = generated(Models(4, 2, 0))
+    again = generated(Models(train_models=4, test_models=2))
     assert again != root
 
     def content(folder):
         return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*.off"))}
 
     assert content(again) == content(root)
-    more = content(generated(Models(5, 2, 0)))
+    more = content(generated(Models(train_models=5, test_models=2)))
     first = {name: text for name, text in content(root).items() if name.parts[1] == "train"}
     assert {name: more[name] for name in first} == first  # the first of more are those of fewer
-    assert content(generated(Models(4, 2, 1))) != content(root)
+    assert content(generated(Models(train_models=4, test_models=2, generator_seed=1))) != content(root)
     assert json.loads((again / "synthetic.json").read_text())["seed"] == 0
 
 

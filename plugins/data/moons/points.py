@@ -1,7 +1,9 @@
 """Labelled points of the plane: as a split holds them, from a user's files, and as a person would see them."""
 
 import hashlib
+from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,9 +12,10 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 from pydantic import Field
 from torch import Tensor
+from torch.utils.data import Dataset
 
-from framework.data import Splits
-from framework.datasets.csv_columns import numbers, read_columns, require
+from framework.data import Batch, Data, Splits
+from framework.datasets.csv_columns import tables
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.target import Target
@@ -25,6 +28,48 @@ SIDE = 96
 REACH = 4.0
 """A picture shows [-4, 4]², the square in which thesis §2.3.5 draws outliers."""
 COLOURS = np.array([[31, 119, 180], [255, 127, 14]], np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draws:
+    """How many points each split has, and what seeds their draws, whatever the seed of the run."""
+
+    train: Size = 500
+    validation: Size = 500
+    test: Size = 5000
+    data_seed: DataSeed = 0
+
+
+class PlanePoints(Data):
+    """Labelled points, independent draws in each split. A data set of the family adds its constructor, what to cite,
+    `drawn` and `fingerprint`."""
+
+    target = TARGET
+    input_shape = (2,)
+    synthetic = True
+    skipped = 0
+    varies = False
+    draws: Draws
+
+    @abstractmethod
+    def drawn(self, size: int, split: int) -> Fields:
+        """So many points of a split, 0 to 2."""
+
+    def prepare(self) -> None:
+        sizes = (self.draws.train, self.draws.validation, self.draws.test)
+        self._splits = [self.drawn(size, number) for number, size in enumerate(sizes)]
+
+    def splits(self) -> Splits:
+        return Splits(*self._splits)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        return read_points(files)
+
+    def augment(self, batch: Batch) -> Batch:
+        return batch
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return picture(inputs, self._splits[0])
 
 
 def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
@@ -56,22 +101,20 @@ def read_points(files: Sequence[Path]) -> Fields:
     """The columns `x` and `y` of CSV files, in standard units, one sample a row.
 
     Raises:
-        DataError: a file cannot be read, lacks a column, or holds a cell that is no finite number; names it.
+        DataError: there is no file, or one cannot be read, lacks a column, or holds a cell that is no finite
+            number; names it.
     """
-    tables = []
-    for file in files:
-        columns = read_columns(Path(file))
-        require(columns, ("x", "y"), "A file of points")
-        points = np.stack([numbers(columns, name, missing="") for name in ("x", "y")], -1)
+    found = []
+    for columns, points in tables(files, ("x", "y"), "A file of points"):
         wide = np.flatnonzero(np.abs(points).max(-1) > np.finfo(np.float32).max)
         if len(wide):
             x, y = points[wide[0]]
             raise DataError(
-                f"{file} line {columns.lines[wide[0]]}: ({x:g}, {y:g}) lies beyond single precision (3.4e38); wanted "
-                "points in the units of the training data, some units from 0. Mend it."
+                f"{columns.file} line {columns.lines[wide[0]]}: ({x:g}, {y:g}) lies beyond single precision "
+                "(3.4e38); wanted points in the units of the training data, some units from 0. Mend it."
             )
-        tables.append(points)
-    points = np.concatenate(tables)
+        found.append(points)
+    points = np.concatenate(found)
     return Fields(input=torch.from_numpy(points).float(), index=torch.arange(len(points)))
 
 

@@ -154,21 +154,7 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
 
 
 def _load(file: Path) -> mat_struct:
-    try:
-        content = read_variables(file, ["record"])
-    except FileNotFoundError:
-        raise DataError(
-            f"{file}: no such file, though a list names it. Restore it from the release."
-        ) from None
-    except NotImplementedError:
-        raise DataError(
-            f"{file}: a MATLAB 7.3 file; wanted version 5, as released. Save it with '-v7'."
-        ) from None
-    except Exception as error:  # nearly any, where the file is damaged
-        raise DataError(
-            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from the release."
-        ) from error
-    record = content.get("record")
+    record = read_variables(file, ["record"], "the release").get("record")
     if not isinstance(record, mat_struct):
         raise DataError(
             f"{file}: holds no struct `record`; wanted a PASCAL3D+ annotation. Restore it from the release."

@@ -11,7 +11,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.data import Splits
-from framework.datasets.csv_columns import Columns, mostly_numbers, number, numbers, read_columns, require
+from framework.datasets.csv_columns import (
+    Columns,
+    mostly_numbers,
+    number,
+    numbers,
+    read_columns,
+    require,
+    tables,
+)
 from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
 from framework.errors import DataError, did_you_mean
@@ -100,13 +108,10 @@ def read(files: Sequence[Path], table: Table) -> Fields:
     """The same columns of other files, standardised as the training rows were, one sample a row.
 
     Raises:
-        DataError: a file cannot be read, lacks a column, or a cell of one is no finite number.
+        DataError: there is no file, or one cannot be read, lacks a column, or a cell of one is no finite number.
     """
     parts = []
-    for file in files:
-        cells = read_columns(Path(file))
-        require(cells, table.columns, "The trained model")
-        inputs = np.stack([numbers(cells, name, missing="") for name in table.columns], -1)
+    for cells, inputs in tables(files, table.columns, "The trained model"):
         rows = np.arange(len(inputs))
         parts.append(as_float32(cells, table.columns, rows, standardised(inputs, table.scaling)))
     inputs = torch.cat(parts)

@@ -9,12 +9,20 @@ from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.circular import angular_distance
-from framework.metric import Metric
+from framework.metric import Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
+BEYER = """@inproceedings{beyer2015biternion,
+  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
+  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
+  booktitle = {German Conference on Pattern Recognition},
+  pages     = {157--168},
+  year      = {2015}
+}"""
 
-class MeanAngularDeviation(Metric):
+
+class MeanAngularDeviation(Mean):
     """Mean absolute angular deviation (MAAD) of the point prediction, degrees, with its standard error.
 
     `maad_deg` takes the mean over the angles of a sample first, so that its standard error counts samples;
@@ -25,40 +33,22 @@ class MeanAngularDeviation(Metric):
         ConfigError: the target is not made of angles.
     """
 
-    bibtex = """@inproceedings{beyer2015biternion,
-  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
-  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
-  booktitle = {German Conference on Pattern Recognition},
-  pages     = {157--168},
-  year      = {2015}
-}"""
+    bibtex = BEYER
     columns: ClassVar[dict[str, str]] = {"maad_deg": "MAAD °"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"maad_deg": "lower"}
-    count: Tensor
-    total: Tensor
-    squares: Tensor
 
     def __init__(self, target: Target) -> None:
         super().__init__()
         target.require("angle", by="angular_deviation")
         self.names = ("maad_deg", *(f"maad_{name}_deg" for name in target.names))
-        zeros = torch.zeros(len(self.names), dtype=torch.float64)
-        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("total", zeros, dist_reduce_fx="sum")
-        # A sum of squares will do: in [0°, 180°] float64 resolves a spread of 1e-5° around any mean.
-        self.add_state("squares", zeros.clone(), dist_reduce_fx="sum")
+        self.start(len(self.names))
 
     def update(self, prediction: Prediction) -> None:
         each = deviations(prediction) * (180 / math.pi)
-        deviation = torch.cat([each.mean(-1, keepdim=True), each], -1)
-        self.count += len(deviation)
-        self.total += deviation.sum(0)
-        self.squares += deviation.square().sum(0)
+        self.take_in(torch.cat([each.mean(-1, keepdim=True), each], -1))
 
     def compute(self) -> dict[str, Tensor]:
-        mean = self.total / self.count
-        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
-        error = (spread / (self.count - 1).clamp(min=0)).sqrt()
+        mean, error = self.mean_and_error()
         found: dict[str, Tensor] = {}
         for index, name in enumerate(self.names):
             found[name] = mean[index]
@@ -77,13 +67,7 @@ class MedianAngularDeviation(Metric):
         ConfigError: the target is not made of angles.
     """
 
-    bibtex = """@inproceedings{beyer2015biternion,
-  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
-  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
-  booktitle = {German Conference on Pattern Recognition},
-  pages     = {157--168},
-  year      = {2015}
-}"""
+    bibtex = BEYER
     columns: ClassVar[dict[str, str]] = {"median_deviation_deg": "median °"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"median_deviation_deg": "lower"}
     deviations: list[Tensor] | Tensor

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import sem
-from torch.distributions import Distribution
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.prediction import Prediction
 from framework.target import Target
@@ -18,24 +16,9 @@ ONE = Target("angle", ("azimuth",))
 THREE = Target("angle", ("azimuth", "elevation", "tilt"))
 
 
-class At(Distribution):
-    """A density of which only the point prediction is known."""
-
-    arg_constraints = {}  # noqa: RUF012 - as torch has it
-
-    def __init__(self, point):
-        self.point = point
-        super().__init__(point.shape[:-1], point.shape[-1:], validate_args=False)
-
-
-@median.register
-def _(density: At, samples: int) -> torch.Tensor:
-    return density.point
-
-
 def prediction(point, target, dtype=torch.float64):
     return Prediction(
-        At(torch.as_tensor(point, dtype=dtype)), {"target": torch.as_tensor(target, dtype=dtype)}
+        Cardioid(torch.as_tensor(point, dtype=dtype)), {"target": torch.as_tensor(target, dtype=dtype)}
     )
 
 

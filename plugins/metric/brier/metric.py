@@ -7,12 +7,12 @@ from jaxtyping import Float64, Int
 from torch import Tensor
 
 from framework.distributions.class_probabilities import require_labels
-from framework.metric import Metric
+from framework.metric import Mean
 from framework.prediction import Prediction
 from framework.target import Target
 
 
-class Brier(Metric):
+class Brier(Mean):
     """Mean Brier score, a proper scoring rule of class probabilities (thesis eq. 2.26), with its standard error.
 
     Of two classes the squared error of the second's probability, in [0, 1]: eq. 2.26 as a mean. Of more, the sum of
@@ -35,30 +35,19 @@ class Brier(Metric):
 }"""
     columns: ClassVar[dict[str, str]] = {"brier": "Brier"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"brier": "lower"}
-    count: Tensor
-    total: Tensor
-    squares: Tensor
 
     def __init__(self, target: Target) -> None:
         super().__init__()
         target.require("class", by="metric brier")
-        zero = torch.zeros((), dtype=torch.float64)
-        self.add_state("count", zero, dist_reduce_fx="sum")
-        self.add_state("total", zero.clone(), dist_reduce_fx="sum")
-        # A sum of squares will do: of scores in [0, 2] float64 resolves a spread of 1e-8.
-        self.add_state("squares", zero.clone(), dist_reduce_fx="sum")
+        self.start()
 
     def update(self, prediction: Prediction) -> None:
         probability = prediction.class_probabilities
-        score = brier(probability, require_labels(prediction.target, probability.shape[-1]))
-        self.count += len(score)
-        self.total += score.sum()
-        self.squares += score.square().sum()
+        self.take_in(brier(probability, require_labels(prediction.target, probability.shape[-1])))
 
     def compute(self) -> dict[str, Tensor]:
-        mean = self.total / self.count
-        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
-        return {"brier": mean, "brier_sem": (spread / (self.count - 1).clamp(min=0)).sqrt()}
+        mean, error = self.mean_and_error()
+        return {"brier": mean, "brier_sem": error}
 
 
 def brier(

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
 from framework.errors import ConfigError
-from framework.metric import Metric
+from framework.metric import Mean
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.crps.score import REPLICATES, crps
 
 
-class CRPS(Metric):
+class CRPS(Mean):
     """Continuous ranked probability score (CRPS): a proper scoring rule in the unit of the target; lower is better.
 
     `crps` of reals, `crps_deg` of angles in degrees: the mean over the numbers of a sample, each by its marginal
@@ -45,9 +45,6 @@ class CRPS(Metric):
 }"""
     columns: ClassVar[dict[str, str]] = {"crps": "CRPS"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"crps": "lower"}
-    count: Tensor
-    total: Tensor
-    squares: Tensor
     variance: Tensor
 
     def __init__(
@@ -66,11 +63,7 @@ class CRPS(Metric):
             self.columns = {"crps_deg": "CRPS °"}  # pyright: ignore[reportAttributeAccessIssue]
             self.better = {"crps_deg": "lower"}  # pyright: ignore[reportAttributeAccessIssue]
         self.names = target.names
-        zeros = torch.zeros(len(self.names) + 1, dtype=torch.float64)
-        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("total", zeros, dist_reduce_fx="sum")
-        # A sum of squares will do: scores are not negative, so that no large mean hides a small spread for long.
-        self.add_state("squares", zeros.clone(), dist_reduce_fx="sum")
+        self.start(len(self.names) + 1)
         self.add_state("variance", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
@@ -85,16 +78,12 @@ class CRPS(Metric):
         error = self.factor * torch.stack([score.error for score in scores], -1)
         score = torch.cat([each.mean(-1, keepdim=True), each], -1)
         refuse_nan(score[:, 0], "scores")
-        self.count += len(score)
-        self.total += score.sum(0)
-        self.squares += score.square().sum(0)
+        self.take_in(score)
         # each marginal is drawn from anew: variances add
         self.variance += error.square().sum() / len(self.names) ** 2
 
     def compute(self) -> dict[str, Tensor]:
-        mean = self.total / self.count
-        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
-        error = (spread / (self.count - 1).clamp(min=0)).sqrt()
+        mean, error = self.mean_and_error()
         found = {f"crps{self.unit}": mean[0], f"crps{self.unit}_sem": error[0]}
         if len(self.names) > 1:
             for index, name in enumerate(self.names, start=1):

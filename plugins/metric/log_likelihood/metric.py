@@ -12,7 +12,24 @@ from framework.metric import Metric
 from framework.prediction import Prediction
 
 
-class LogLikelihood(Metric):
+class Moments(Metric):
+    """What the two metrics share: the moments of log-likelihoods, and what sampling did to them."""
+
+    moments: Tensor
+    sampling: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        # One state, not three: count, mean and squared deviations can only be merged together.
+        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
+        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
+
+    def take_in(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
+        self.moments = merged_moments(torch.stack([self.moments, moments_of(log_prob)]))
+        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(estimate)]))
+
+
+class LogLikelihood(Moments):
     """Mean log-likelihood of the targets, nats, with its standard error (thesis Tables 3.1 to 3.3).
 
     A target the density rules out has log-likelihood -inf; the mean is then -inf and the error NaN.
@@ -34,24 +51,15 @@ class LogLikelihood(Metric):
 }"""
     columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
-    moments: Tensor
-    sampling: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        # One state, not three: count, mean and squared deviations can only be merged together.
-        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
-        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
 
     def update(self, prediction: Prediction) -> None:
-        self.moments = merged_moments(torch.stack([self.moments, moments_of(prediction.log_prob)]))
-        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
+        self.take_in(prediction.log_prob, prediction.estimate)
 
     def compute(self) -> dict[str, Tensor]:
         return summary("log_likelihood", self.moments, self.sampling)
 
 
-class NegativeLogLikelihood(Metric):
+class NegativeLogLikelihood(Moments):
     """Mean negative log-likelihood of the targets, nats, with its standard error (thesis eq. 2.25 as a mean).
 
     The negative of `log_likelihood`, for tables in which lower is better, with the same further numbers of densities
@@ -72,18 +80,9 @@ class NegativeLogLikelihood(Metric):
 }"""
     columns: ClassVar[dict[str, str]] = {"nll": "NLL"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"nll": "lower"}
-    moments: Tensor
-    sampling: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
-        self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
 
     def update(self, prediction: Prediction) -> None:
-        log_prob = refuse_nan(prediction.log_prob, "log-likelihoods of the targets")
-        self.moments = merged_moments(torch.stack([self.moments, moments_of(log_prob)]))
-        self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(prediction.estimate)]))
+        self.take_in(refuse_nan(prediction.log_prob, "log-likelihoods of the targets"), prediction.estimate)
 
     def compute(self) -> dict[str, Tensor]:
         found = summary("nll", self.moments, self.sampling)

@@ -10,7 +10,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import ConfigError, DataError
 from framework.geometry.clouds import denormalised
-from framework.metric import Metric
+from framework.metric import Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.vertices.correspondence import correspondence
@@ -25,7 +25,7 @@ FAUST = """@inproceedings{bogo2014faust,
 }"""
 
 
-class VertexError(Metric):
+class VertexError(Mean):
     """Euclidean distance between predicted and true vertices, centimetres (thesis §6.5.2).
 
     The target is x, y, z of each vertex in turn; a batch's "scale" (batch,), metres per unit of the target, leads to
@@ -44,34 +44,25 @@ class VertexError(Metric):
         "vertex_error_95_cm": "95 % cm",
     }
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
-    count: Tensor
-    total: Tensor
-    squares: Tensor
     histogram: Tensor
 
     def __init__(self, target: Target) -> None:
         super().__init__()
         require_vertices(target, "vertex_error")
-        zero = torch.zeros((), dtype=torch.float64)
-        for name in ("count", "total", "squares"):
-            self.add_state(name, zero.clone(), dist_reduce_fx="sum")
+        self.start()
         self.add_state("histogram", torch.zeros(BINS, dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Prediction) -> None:
         (scale,) = fields(prediction, "vertex_error", {"scale": "metres per unit of the target"})
         distance = distances(prediction.point, prediction.target, scale)
-        each = distance.mean(1)
-        self.count += len(each)
-        self.total += each.sum()
-        self.squares += each.square().sum()
+        self.take_in(distance.mean(1))
         self.histogram += torch.bincount(bins(distance).flatten(), minlength=BINS)
 
     def compute(self) -> dict[str, Tensor]:
-        mean = self.total / self.count
-        spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
+        mean, error = self.mean_and_error()
         return {
             "vertex_error_cm": mean,
-            "vertex_error_cm_sem": (spread / (self.count - 1).clamp(min=0)).sqrt(),
+            "vertex_error_cm_sem": error,
             "vertex_error_median_cm": quantile(self.histogram, 0.5),
             "vertex_error_95_cm": quantile(self.histogram, 0.95),
         }

@@ -5,10 +5,12 @@ of more objects are those of fewer. It is written beside its place and renamed w
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from framework.storage import cache
 from framework.storage.generated import draw_all
@@ -51,12 +53,13 @@ STRETCH = 0.15
 """Standard deviation of the logarithm of each axis's own stretch."""
 
 
-class Models(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Models:
     """How many models of each class are generated for each split, and from which seed."""
 
-    train: int
-    test: int
-    seed: int
+    train_models: Annotated[int, Field(ge=2, le=10_000)] = 60
+    test_models: Annotated[int, Field(ge=1, le=10_000)] = 25
+    generator_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
 def generated(models: Models) -> Path:
@@ -65,9 +68,15 @@ def generated(models: Models) -> Path:
     Raises:
         DataError: the cache cannot be written, or holds something else in its place.
     """
-    mark = {"generator_version": VERSION, "seed": models.seed, "train": models.train, "test": models.test}
-    mark |= {"classes": list(CLASSES)}
-    root = cache.folder("modelnet40") / f"v{VERSION}-seed{models.seed}-train{models.train}-test{models.test}"
+    train, test, seed = models.train_models, models.test_models, models.generator_seed
+    mark = {
+        "generator_version": VERSION,
+        "seed": seed,
+        "train": train,
+        "test": test,
+        "classes": list(CLASSES),
+    }
+    root = cache.folder("modelnet40") / f"v{VERSION}-seed{seed}-train{train}-test{test}"
     return whole(root, mark, lambda part: _write(part, models))
 
 
@@ -92,7 +101,7 @@ def as_off(solid: Solid) -> str:
 
 
 def _write(part: Path, models: Models) -> None:
-    sizes = {"train": models.train, "test": models.test}
+    sizes = {"train": models.train_models, "test": models.test_models}
     jobs = [(name, split, number) for name in CLASSES for split in SPLITS for number in range(sizes[split])]
     for name in CLASSES:
         for split in SPLITS:
@@ -101,8 +110,8 @@ def _write(part: Path, models: Models) -> None:
     def write(job: int) -> None:
         name, split, number = jobs[job]
         # numbered through, as the official files are
-        place = number + 1 + (models.train if split == "test" else 0)
-        text = as_off(model(name, split, number, models.seed))
+        place = number + 1 + (models.train_models if split == "test" else 0)
+        text = as_off(model(name, split, number, models.generator_seed))
         (part / name / split / f"{name}_{place:04d}.off").write_text(text, encoding="ascii", newline="\n")
 
     draw_all(len(jobs), write, "the synthetic CAD models")
