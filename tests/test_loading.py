@@ -1,6 +1,5 @@
 """Checkpoints of heads without gradient, and of encoders whose first weights came from a file."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Model
 from framework.runs import loading
+from framework.runs.description import Description
 from framework.runs.session import require_fit
 from framework.target import Target
 from framework.training.checkpoint import WholeCheckpoints, read
@@ -68,10 +68,10 @@ def test_a_loaded_model_does_not_ask_for_what_its_training_started_from(
 
 def test_other_data_are_refused_in_a_sentence_however_many_numbers_they_have() -> None:
     mesh, twin = (Target("real", tuple(f"{axis}{row}" for row in range(999))) for axis in "xy")
-    described, data = {"target": asdict(mesh), "input_shape": [5]}, build("data", resolve("data", "moons"))
+    described, data = Description({}, mesh, (5,), (), synthetic=True), build("data", resolve("data", "moons"))
     data.target, data.input_shape = mesh, (5,)
-    require_fit(data, described, "a.ckpt")
+    require_fit(data, described)
     for data.target, data.input_shape in (twin, (5,)), (mesh, (6,)), (Target("class", mesh.names), (5,)):
         with pytest.raises(CheckpointError, match=r"predicts real \(x0, .* and 989 more\), but") as caught:
-            require_fit(data, described, "a.ckpt")
+            require_fit(data, described)
         assert len(str(caught.value)) < 400

@@ -62,7 +62,7 @@ class Crop:
             DataError: the file is missing, is no image, is cut short, or the box lies outside the image.
         """
         with opened(self.file) as raw:
-            image = _plain(raw, self.channels, upright=self.upright)
+            image = plain(raw, self.channels, upright=self.upright)
         whole = (0.0, 0.0, float(image.width), float(image.height))
         pixels = square(image, self.box or whole, self.margin, self.side)
         if pixels is None:
@@ -107,7 +107,7 @@ def opened(file: Path) -> Iterator[Image.Image]:
         raise DataError(f"{file}: {error}. Scale the image down.") from error
 
 
-def _plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
+def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
     """Decode an image to RGB or grey with eight bits, however it was stored; transparent pixels become white."""
     whole = ImageOps.exif_transpose(image) if upright else image
     if whole.mode == "F":

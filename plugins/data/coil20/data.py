@@ -4,7 +4,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
-from framework.datasets import images
+from framework.datasets import given_images, images
 from framework.datasets.fields import Fields
 from framework.datasets.images import Crop
 from framework.target import Target
@@ -97,6 +97,9 @@ class COIL20(Data):
         return images.unlabelled(
             [Crop(Path(file), None, 0.0, self.image_size, 1, upright=True) for file in files]
         )
+
+    def inputs(self, given: Any) -> Tensor:
+        return given_images.inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
         if self.interpolate:

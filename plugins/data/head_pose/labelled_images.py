@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
-from framework.datasets import images
+from framework.datasets import given_images, images
 from framework.datasets.fields import Fields
 from framework.datasets.images import Crop, Crops
 from framework.errors import DataError
@@ -122,6 +122,9 @@ class Heads(Data):
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return self.reading.own(files)
+
+    def inputs(self, given: Any) -> Tensor:
+        return given_images.inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
         return images.varied(batch, self.signs, self.reading.jitter)

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
-from framework.datasets import images
+from framework.datasets import given_images, images
 from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
 from framework.target import Target
@@ -96,6 +96,9 @@ class ImagesWithAngles(Data):
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return images.unlabelled([self._crop(Path(file)) for file in files])
+
+    def inputs(self, given: Any) -> Tensor:
+        return given_images.inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
         return images.varied(batch, self._signs, self.jitter)

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
-from framework.datasets import images
+from framework.datasets import given_images, images
 from framework.datasets.images import Box, Crop
 from framework.errors import DataError, did_you_mean
 from framework.renderer import Renderer
@@ -216,6 +216,9 @@ class Pascal3D(Data):
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         side = self.framing.image_size
         return images.unlabelled([Crop(Path(file), None, 0.0, side, upright=True) for file in files])
+
+    def inputs(self, given: Any) -> Tensor:
+        return given_images.inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
         return images.varied(batch, MIRRORED if self.variation.mirror else (), self.variation.jitter)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.errors import DataError
 from plugins.data.tabular.picture import bars
-from plugins.data.tabular.table import Kind, Missing, Question, Table, load, read
+from plugins.data.tabular.table import Kind, Missing, Question, Reading, Scaling, Table, load, of_rows, read
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
@@ -58,13 +58,15 @@ class Tabular(Data):
         names = (target,) if isinstance(target, str) else tuple(dict.fromkeys(target))
         chosen = None if columns is None else tuple(columns)
         self.path = path
+        self._trained: Reading | None = None
         self.question = Question(names, kind, chosen, validation, test, data_seed, missing)
 
     def prepare(self) -> None:
         table = self._table
         self.target = table.target
-        self.input_shape = (len(table.columns),)
-        self.plane = len(table.columns) == 2
+        self.columns = table.reading.columns
+        self.input_shape = (len(self.columns),)
+        self.plane = len(self.columns) == 2
         self.groups = table.groups
         self.skipped = table.skipped
 
@@ -83,14 +85,34 @@ class Tabular(Data):
                 f"data.validation + data.test = {asked.validation + asked.test:g}: wanted less than 1, so that rows "
                 "are left for training."
             )
-        return load(Path(self.path).expanduser(), asked)
+        return load(Path(self.path).expanduser(), asked, self._trained)
 
     def splits(self) -> Splits:
         return self._table.splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        # the training table again, for its columns, means and deviations: a checkpoint does not hold them
-        return read(files, self._table)
+        return read(files, self._reading)
+
+    def inputs(self, given: Any) -> Tensor:
+        """Of rows as the table has them: a CSV file, a DataFrame, a mapping by column, or an array."""
+        if isinstance(given, str | Path) or (isinstance(given, list) and isinstance(given[0], str | Path)):
+            return Data.inputs(self, given)
+        return of_rows(given, self._reading)
+
+    @property
+    def _reading(self) -> Reading:
+        # a checkpoint of version 0.1 does not hold it: then the training table is read again
+        return self._trained or self._table.reading
+
+    def state_dict(self) -> Mapping[str, Any]:
+        columns, scaling = self._reading
+        numbers = {name: array.tolist() for name, array in scaling._asdict().items()}
+        return {"columns": list(columns), **numbers}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        if state:
+            numbers = (np.array(state[name], np.float64) for name in Scaling._fields)
+            self._trained = Reading(tuple(state["columns"]), Scaling(*numbers))
 
     def augment(self, batch: Batch) -> Batch:
         return batch
@@ -101,7 +123,7 @@ class Tabular(Data):
             "root": str(self.path),
             "version": "tabular 1",
             **table.sizes,
-            "columns": ", ".join(table.columns),
+            "columns": ", ".join(self.columns),
             "constant": ", ".join(table.constant) or "none",
             "sha256": table.digest,
         }

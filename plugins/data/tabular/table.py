@@ -1,16 +1,16 @@
 """From a user's CSV table to numbers: which columns, which rows, which split."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from framework.data import Splits
+from framework.data import Splits, as_inputs
 from framework.datasets.csv_columns import (
     Columns,
     mostly_numbers,
@@ -53,29 +53,39 @@ class Scaling(NamedTuple):
     deviation: Float[np.ndarray, "column"]
 
 
+class Reading(NamedTuple):
+    """How rows become inputs."""
+
+    columns: tuple[str, ...]
+    scaling: Scaling
+
+
 class Table(NamedTuple):
     """A table's answer."""
 
     target: Target
-    columns: tuple[str, ...]
+    reading: Reading
     constant: tuple[str, ...]
     groups: tuple[str, ...]
-    scaling: Scaling
     splits: Splits
     sizes: dict[str, str]
     skipped: int
     digest: str
 
 
-def load(file: Path, question: Question) -> Table:
+def load(file: Path, question: Question, trained: Reading | None = None) -> Table:
     """Read, check, split and standardise a table.
+
+    Args:
+        trained: how the model reads rows for which the table is; None: its own training rows say.
 
     Raises:
         DataError: the file, a column, a cell, a label or a split is not as wanted; names line and column.
     """
     cells = read_columns(file)
     digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
-    columns = _inputs(cells, question)
+    columns = _inputs(cells, question) if trained is None else trained.columns
+    require(cells, columns, "The trained model")
     otherwise = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
     inputs = np.stack([numbers(cells, name, missing=otherwise) for name in columns], -1)
     values, absent = _targets(cells, question, otherwise)
@@ -85,6 +95,7 @@ def load(file: Path, question: Question) -> Table:
     split = _splits(cells, rows, question)
     training = rows[split == 0]
     scaling, constant = fit_scaling(inputs[training])
+    scaling = scaling if trained is None else trained.scaling
     target, encoded = _encode(cells, rows, training, values, question)
     scaled = as_float32(cells, columns, rows, standardised(inputs[rows], scaling))
     lines = torch.tensor(cells.lines)[torch.from_numpy(rows)]
@@ -101,21 +112,54 @@ def load(file: Path, question: Question) -> Table:
     sizes = {name: str(len(part)) for name, part in parts.items()}
     names = tuple(name for name, same in zip(columns, constant.tolist(), strict=True) if same)
     skipped = len(whole) - len(rows)
-    return Table(target, columns, names, groups, scaling, Splits(**parts), sizes, skipped, digest)
+    reading = Reading(columns, scaling)
+    return Table(target, reading, names, groups, Splits(**parts), sizes, skipped, digest)
 
 
-def read(files: Sequence[Path], table: Table) -> Fields:
+def read(files: Sequence[Path], reading: Reading) -> Fields:
     """The same columns of other files, standardised as the training rows were, one sample a row.
 
     Raises:
         DataError: there is no file, or one cannot be read, lacks a column, or a cell of one is no finite number.
     """
     parts = []
-    for cells, inputs in tables(files, table.columns, "The trained model"):
+    for cells, inputs in tables(files, reading.columns, "The trained model"):
         rows = np.arange(len(inputs))
-        parts.append(as_float32(cells, table.columns, rows, standardised(inputs, table.scaling)))
+        parts.append(as_float32(cells, reading.columns, rows, standardised(inputs, reading.scaling)))
     inputs = torch.cat(parts)
     return Fields(input=inputs, index=torch.arange(len(inputs)))
+
+
+def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
+    """Rows that a user has in memory, standardised: a DataFrame or a mapping by column, or an array in their order.
+
+    Raises:
+        DataError: a column is missing, a cell is no finite number, or an array has another number of columns.
+    """
+    if hasattr(given, "columns") or isinstance(given, Mapping):
+        missing = [name for name in reading.columns if name not in given]
+        if missing:
+            raise DataError(
+                f"The model reads a column {missing[0]!r}, which is not given.{did_you_mean(missing[0], given)} "
+                f"It reads: {', '.join(reading.columns)}."
+            )
+        given = np.stack([np.atleast_1d(np.asarray(given[name])) for name in reading.columns], -1)
+    try:
+        rows = np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"{str(error)[:200]}; wanted rows of numbers: {', '.join(reading.columns)}."
+        ) from error
+    rows = as_inputs(rows, (len(reading.columns),)).numpy()
+    scaled = standardised(rows, reading.scaling)
+    wrong = np.argwhere(~(np.abs(scaled) <= np.finfo(np.float32).max))
+    if len(wrong):
+        row, column = wrong[0]
+        raise DataError(
+            f"row {row}, column {reading.columns[column]!r}: {rows[row, column]} is no finite number within single "
+            "precision. Mend it, or leave the row out."
+        )
+    return torch.from_numpy(scaled.astype(np.float32))
 
 
 def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.ndarray]:

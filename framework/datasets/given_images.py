@@ -1,0 +1,53 @@
+"""Images that a user has in memory, as the models of image data read them."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image
+from torch import Tensor
+
+from framework.data import Data
+from framework.datasets.images import plain, square
+from framework.errors import DataError
+
+
+def inputs(data: Data, given: Any) -> Tensor:
+    """`Data.inputs` of a data set of square images, of `input_shape` (channels, side, side).
+
+    Beside files and arrays of that shape it takes Pillow images, and arrays of bytes as Pillow and OpenCV hold them:
+    (height, width), (height, width, channels), or a batch of these. Images of another size are made square by repeating
+    their border pixels, and scaled, as files are. Floats are from 0 to 1.
+
+    Raises:
+        DataError: it is none of these.
+    """
+    items = given if isinstance(given, list | tuple) else [given]
+    if items and all(isinstance(item, Image.Image) for item in items):
+        return torch.stack([_whole(item, data.input_shape) for item in items])
+    if isinstance(given, np.ndarray | Tensor) and data.input_shape not in (given.shape, given.shape[1:]):
+        pixels = given.numpy(force=True) if isinstance(given, Tensor) else given
+        if pixels.ndim in (2, 3) and pixels.shape[2:] in ((), (1,), (3,), (4,)):
+            pixels = pixels[None]
+        if pixels.dtype != np.uint8 or pixels.shape[3:] not in ((), (1,), (3,), (4,)) or pixels.ndim < 3:
+            raise DataError(
+                f"an array of shape {'×'.join(map(str, given.shape))} and type {given.dtype} is no image; wanted bytes "
+                f"(uint8), (height, width, 3), or inputs {'×'.join(map(str, data.input_shape))}, bytes or 0 to 1."
+            )
+        pixels = pixels[..., 0] if pixels.shape[3:] == (1,) else pixels
+        return torch.stack([_whole(Image.fromarray(item), data.input_shape) for item in pixels])
+    found = Data.inputs(data, given)
+    if found.is_floating_point() and found.numel() and not (found.amin() >= 0 and found.amax() <= 1):
+        raise DataError(
+            f"floating-point images from {found.amin():.4g} to {found.amax():.4g}; wanted 0 to 1, or bytes (uint8)."
+        )
+    return found
+
+
+def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channels side side"]:
+    decoded = plain(image, shape[0], upright=True)
+    pixels = square(decoded, (0.0, 0.0, float(decoded.width), float(decoded.height)), 0.0, shape[1])
+    if pixels is None:
+        raise DataError(f"an image of {image.width} × {image.height} pixels shows nothing.")
+    return torch.from_numpy(pixels)
