@@ -99,4 +99,4 @@ def _columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
 
 
 def _text(value: Tensor) -> str:
-    return f"{float(value):.6g}"
+    return f"{float(value):.10g}"  # of a large number in the user's unit the small digits count

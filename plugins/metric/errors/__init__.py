@@ -1,0 +1,1 @@
+"""Mean absolute and root mean square errors of reals."""
