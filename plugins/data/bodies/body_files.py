@@ -6,6 +6,7 @@ The layout of the published body models with linear blend skinning: `v_template`
 plugins.data.bodies.restricted_pickle: nothing that a file names is run.
 """
 
+import math
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -13,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from framework.errors import DataError
 from framework.storage.files import replacing
@@ -22,8 +22,8 @@ from plugins.data.bodies.body import Body
 
 NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
-LARGEST = 2**27
-"""Numbers that a sparse matrix may have when it is written out."""
+LARGEST = 2**24
+"""Numbers of the joints' displacements, joints x 3 x coefficients; published bodies have below 2**17."""
 WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
 
 
@@ -116,6 +116,8 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
         or shapes.shape[:2] != template.shape
         or table.ndim != 2
         or regressor.shape != (table.shape[1], len(template))
+        or not template.size
+        or len(regressor) * math.prod(shapes.shape[1:]) > LARGEST
     ):
         shown = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
         raise DataError(f"{file}: {shown} do not fit together. {WANTED}")
@@ -138,11 +140,10 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
 
 
 def _numbers(file: Path, name: str, value: Any) -> np.ndarray:
-    if sparse.issparse(value) and value.shape[0] * value.shape[1] > LARGEST:
-        raise DataError(
-            f"{file}: {name} is a sparse matrix of {value.shape}, too large to be a body's. {WANTED}"
-        )
-    array = value.toarray() if sparse.issparse(value) else np.asarray(value)
+    # no lists: of nested ones that hold each other twice an array would be without end
+    if not isinstance(value, np.ndarray | np.generic | int | float | str):
+        raise DataError(f"{file}: {name} is {type(value).__name__}; wanted an array. {WANTED}")
+    array = np.asarray(value)
     if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
         raise DataError(
             f"{file}: {name} is {array.dtype} {array.shape} with numbers that are not finite, or no numbers. {WANTED}"
