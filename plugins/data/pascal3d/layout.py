@@ -5,13 +5,12 @@ Image_sets/<class>_imagenet_{train,val}.txt, PASCAL/VOCdevkit/VOC2012/ImageSets/
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io.matlab import mat_struct
 
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
@@ -22,6 +21,7 @@ CLASSES = (
     "chair", "diningtable", "motorbike", "sofa", "train", "tvmonitor",
 )  # fmt: skip
 VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
+Struct = Mapping[str, Any]
 SUFFIXES = {"pascal": (".jpg", ".JPEG"), "imagenet": (".JPEG", ".jpg")}
 
 
@@ -126,7 +126,7 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     record = _load(file)
     image = _image(root / "Images" / folder, name, source, _text(record, "filename"))
     found = []
-    for number, entry in enumerate(_structs(getattr(record, "objects", None)), start=1):
+    for number, entry in enumerate(_structs(record.get("objects")), start=1):
         if _text(entry, "class") != category:
             continue
         corners = _numbers(entry, "bbox")
@@ -142,7 +142,7 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
                 file=file,
                 image=image,
                 box=(x1 - 1, y1 - 1, x2, y2),  # counted from 1, both ends included
-                angles=_angles(getattr(entry, "viewpoint", None)),
+                angles=_angles(entry.get("viewpoint")),
                 truncated=bool(_number(entry, "truncated")),
                 occluded=bool(_number(entry, "occluded")),
                 difficult=bool(_number(entry, "difficult")),
@@ -153,23 +153,11 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     return found
 
 
-def _load(file: Path) -> mat_struct:
-    try:
-        content = read_variables(file, ["record"])
-    except FileNotFoundError:
-        raise DataError(
-            f"{file}: no such file, though a list names it. Restore it from the release."
-        ) from None
-    except NotImplementedError:
-        raise DataError(
-            f"{file}: a MATLAB 7.3 file; wanted version 5, as released. Save it with '-v7'."
-        ) from None
-    except Exception as error:  # nearly any, where the file is damaged
-        raise DataError(
-            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from the release."
-        ) from error
-    record = content.get("record")
-    if not isinstance(record, mat_struct):
+def _load(file: Path) -> Struct:
+    if not file.exists():
+        raise DataError(f"{file}: no such file, though a list names it. Restore it from the release.")
+    record = read_variables(file, ["record"], "Restore it from the release.").get("record")
+    if not isinstance(record, dict):
         raise DataError(
             f"{file}: holds no struct `record`; wanted a PASCAL3D+ annotation. Restore it from the release."
         )
@@ -184,27 +172,27 @@ def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
     return next((path for path in candidates if path.is_file()), candidates[0])
 
 
-def _structs(value: Any) -> Iterator[mat_struct]:
+def _structs(value: Any) -> Iterator[Struct]:
     """The structs of a struct array or cell array of any length; one struct alone comes without the array."""
     for item in np.atleast_1d(np.asarray(value, dtype=object)).ravel():
-        if isinstance(item, mat_struct):
+        if isinstance(item, dict):
             yield item
 
 
-def _text(entry: mat_struct, name: str) -> str:
+def _text(entry: Struct, name: str) -> str:
     """A field's text; nothing where it is missing, empty or no text."""
-    value = getattr(entry, name, None)
+    value = entry.get(name)
     return value.strip() if isinstance(value, str) else ""
 
 
-def _numbers(entry: mat_struct, name: str) -> list[float]:
-    """A field's numbers; none where it is missing, empty or holds something else."""
-    value = np.asarray(getattr(entry, name, None))
+def _numbers(entry: Struct, name: str) -> list[float]:
+    """A field's numbers, at most five; none where it is missing, empty or holds something else."""
+    value = np.asarray(entry.get(name))
     real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
-    return value.astype(np.float64).ravel().tolist() if real else []
+    return value.ravel()[:5].astype(np.float64).tolist() if real else []
 
 
-def _number(entry: mat_struct, name: str) -> float | None:
+def _number(entry: Struct, name: str) -> float | None:
     """A field's first number; None where there is none."""
     return next(iter(_numbers(entry, name)), None)
 
@@ -214,7 +202,7 @@ def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
 
     An object is finely annotated where the fields are filled and its distance is not 0.
     """
-    if not isinstance(viewpoint, mat_struct) or _number(viewpoint, "distance") == 0:
+    if not isinstance(viewpoint, dict) or _number(viewpoint, "distance") == 0:
         return None
     azimuth, elevation, tilt = (_number(viewpoint, name) for name in ("azimuth", "elevation", "theta"))
     if azimuth is None or elevation is None or tilt is None:

@@ -1,0 +1,77 @@
+"""Reads files that may be damaged or a stranger's: regular ones, within bounds; what goes wrong is one sentence.
+
+What a file may unfold to is bounded by its size, before anything is allocated: `room`.
+"""
+
+import os
+import stat
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from framework.errors import DataError, UserError, shown
+
+RESTORE = "Restore it from its source."
+SMALL, MOST_TIMES = 2**27, 20
+"""A compressed file may unfold to the larger of so many bytes, and so many times its size."""
+
+
+@contextmanager
+def guarded(
+    file: Path, wanted: str, remedy: str = RESTORE, missing: str = "Mend the path."
+) -> Iterator[None]:
+    """Everything that damage leads a library to becomes a DataError that names the file; UserErrors pass.
+
+    Args:
+        wanted: what the file should be, "a MATLAB file" say.
+        remedy, missing: what to do about a damaged file, and about one that is not there.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise DataError(f"{file}: no such file; wanted {wanted}. {missing}") from None
+    except Exception as error:
+        why = shown(error) or type(error).__name__
+        raise DataError(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
+
+
+@contextmanager
+def opened(file: Path) -> Iterator[BinaryIO]:
+    """A file to read.
+
+    Raises:
+        OSError: it is missing, or no regular file: a pipe could block for ever, a device go on without end.
+    """
+    with open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as stream:
+        if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+            raise OSError("no regular file")
+        yield stream
+
+
+def read_bytes(file: Path) -> bytes:
+    """All of a file; errors as `opened`."""
+    with opened(file) as stream:
+        return stream.read()
+
+
+def room(size: int) -> int:
+    """Bytes that a compressed file of `size` bytes may unfold to."""
+    return max(SMALL, MOST_TIMES * size)
+
+
+def inflated(data: bytes, most: int, *, part: bool = False) -> bytes:
+    """What zlib compressed; `part`: the first `most` bytes of it will do.
+
+    Raises:
+        ValueError: it is cut short, or more than `most` bytes.
+        zlib.error: it is damaged.
+    """
+    unpacker = zlib.decompressobj()
+    found = unpacker.decompress(data, most if part else most + 1)
+    if not part and (len(found) > most or not unpacker.eof):
+        raise ValueError(f"what is compressed is cut short, or unfolds to more than {most} bytes")
+    return found
