@@ -26,9 +26,15 @@ class NonFiniteLoss(UserError):
 
 
 def shown(damage: object, most: int = 200) -> str:
-    """What a file holds, or what a library says of it, cut where a message would drown in it."""
+    """What a file holds, or what a library says of it, for a message: cut, and without what steers a terminal."""
     text = str(damage)
-    return text if len(text) <= most else text[: most - 1] + "…"
+    text = text if len(text) <= most else text[: most - 1] + "…"
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
+def quoted(damage: object) -> str:
+    """The same in quotation marks."""
+    return shown(repr(damage))
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

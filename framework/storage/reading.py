@@ -19,21 +19,20 @@ SMALL, MOST_TIMES = 2**27, 20
 
 
 @contextmanager
-def guarded(
-    file: Path, wanted: str, remedy: str = RESTORE, missing: str = "Mend the path."
-) -> Iterator[None]:
+def guarded(file: Path, wanted: str, remedy: str = RESTORE, missing: str = "") -> Iterator[None]:
     """Everything that damage leads a library to becomes a DataError that names the file; UserErrors pass.
 
     Args:
         wanted: what the file should be, "a MATLAB file" say.
-        remedy, missing: what to do about a damaged file, and about one that is not there.
+        remedy: what to do about a damaged file.
+        missing: what to say of one that is not there, beside that.
     """
     try:
         yield
     except UserError:
         raise
     except FileNotFoundError:
-        raise DataError(f"{file}: no such file; wanted {wanted}. {missing}") from None
+        raise DataError(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
     except Exception as error:
         why = shown(error) or type(error).__name__
         raise DataError(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error

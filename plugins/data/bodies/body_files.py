@@ -7,16 +7,16 @@ plugins.data.bodies.restricted_pickle: nothing that a file names is run.
 """
 
 import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from framework.errors import DataError
+from framework.errors import DataError, shown
+from framework.storage.arrays import archive
 from framework.storage.files import replacing
+from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies import restricted_pickle
 from plugins.data.bodies.body import Body
 
@@ -34,17 +34,11 @@ def read(file: Path) -> Body:
         DataError: no such file, another format, something in it that is neither arrays nor plain values, an array
             missing or of another shape. Says which.
     """
-    try:
+    with guarded(file, "a body model", missing="wanted a body model. Mend the path."):
         if file.suffix == ".npz":
-            # a stream of our own: NumPy leaves a damaged file open
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                return _body(file, {name: _member(file, stored, name) for name in _named(stored)})
+            return _body(file, archive(read_bytes(file), (*NEEDED, "posedirs")))
         if file.suffix == ".pkl":
             return _body(file, _unpickled(file))
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file; wanted a body model. Mend the path.") from None
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{file}: cannot be read ({error}). Restore it from its source.") from error
     raise DataError(f"{file}: wanted a body model whose name ends in .npz or .pkl.")
 
 
@@ -64,32 +58,16 @@ def load(file: Path) -> Body:
     Raises:
         DataError: the file is missing or damaged.
     """
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+    with guarded(file, "a body", "Delete it: it is made anew."):
+        arrays = archive(read_bytes(file))
         parents = tuple(int(parent) for parent in arrays.pop("parents"))
         names = tuple(str(name) for name in arrays.pop("names"))
         return Body(source=str(arrays.pop("source")), parents=parents, names=names, **arrays)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{file}: cannot be read as a body ({error}). Delete it: it is made anew.") from error
-
-
-def _named(stored: Any) -> list[str]:
-    return [name for name in (*NEEDED, "posedirs") if name in stored.files]
-
-
-def _member(file: Path, stored: Any, name: str) -> np.ndarray:
-    try:
-        return stored[name]
-    except ValueError as error:
-        raise DataError(
-            f"{file}: {name} cannot be read as plain numbers ({error}). Save it as an array of numbers. {WANTED}"
-        ) from error
 
 
 def _unpickled(file: Path) -> Mapping[str, Any]:
     try:
-        found = restricted_pickle.load(file.read_bytes())
+        found = restricted_pickle.load(read_bytes(file))
     except restricted_pickle.PickleRefused as error:
         raise DataError(
             f"{file}: refused as a pickle: {error}. Only arrays are read from pickles; nothing in this file was run. "
@@ -103,7 +81,7 @@ def _unpickled(file: Path) -> Mapping[str, Any]:
 def _body(file: Path, found: Mapping[str, Any]) -> Body:
     missing = [name for name in NEEDED if name not in found]
     if missing:
-        names = ", ".join(map(str, found)) or "nothing"
+        names = shown(", ".join(map(str, found))) or "nothing"
         raise DataError(f"{file}: {', '.join(missing)} not in it; it holds {names}. {WANTED}")
     posedirs = found.get("posedirs")
     arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}
@@ -119,8 +97,8 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
         or not template.size
         or len(regressor) * math.prod(shapes.shape[1:]) > LARGEST
     ):
-        shown = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise DataError(f"{file}: {shown} do not fit together. {WANTED}")
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise DataError(f"{file}: {shapes} do not fit together. {WANTED}")
     wanted = template.dtype
     return Body(
         source=str(file),

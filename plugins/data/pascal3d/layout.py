@@ -14,7 +14,8 @@ import numpy as np
 
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError
+from framework.errors import DataError, quoted
+from framework.storage.reading import guarded, read_bytes
 
 CLASSES = (
     "aeroplane", "bicycle", "boat", "bottle", "bus", "car",
@@ -93,12 +94,8 @@ def read_list(file: Path) -> list[str]:
         DataError: a line is neither a name nor a name and one of the flags -1, 0, 1.
     """
     names = []
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"{file}: cannot be read ({error}); wanted a list of image names. Restore it."
-        ) from error
+    with guarded(file, "a list of image names", "Restore it from the release."):
+        lines = read_bytes(file).decode("utf-8").splitlines()
     for number, line in enumerate(lines, start=1):
         match line.split():
             case []:
@@ -109,7 +106,7 @@ def read_list(file: Path) -> list[str]:
                 continue
             case _:
                 raise DataError(
-                    f"{file} line {number}: {line!r}; wanted an image name, or a name and one of -1, 0, 1. "
+                    f"{file} line {number}: {quoted(line)}; wanted an image name, or a name and one of -1, 0, 1. "
                     "Restore the list from the release."
                 )
     return list(dict.fromkeys(names))
@@ -121,10 +118,13 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     Raises:
         DataError: the file is missing, is no MATLAB file, or is not built like an annotation.
     """
-    folder = f"{category}_{source}"
-    file = root / "Annotations" / folder / f"{name}.mat"
-    record = _load(file)
-    image = _image(root / "Images" / folder, name, source, _text(record, "filename"))
+    file = root / "Annotations" / f"{category}_{source}" / f"{name}.mat"
+    with guarded(file, "a PASCAL3D+ annotation", "Restore it from the release."):
+        return _objects(file, _load(file), root / "Images" / file.parent.name, category, source)
+
+
+def _objects(file: Path, record: Struct, images: Path, category: str, source: str) -> list[Annotation]:
+    image = _image(images, file.stem, source, _text(record, "filename"))
     found = []
     for number, entry in enumerate(_structs(record.get("objects")), start=1):
         if _text(entry, "class") != category:
