@@ -27,7 +27,7 @@ class NonFiniteLoss(UserError):
 
 def shown(damage: object, most: int = 200) -> str:
     """What a file holds, or what a library says of it, for a message: cut, and without what steers a terminal."""
-    text = str(damage)
+    text = " ".join(line.strip() for line in str(damage).splitlines())
     text = text if len(text) <= most else text[: most - 1] + "…"
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 

@@ -15,6 +15,7 @@ from framework.data import Data
 from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
+from framework.storage.reading import guarded
 from framework.target import Target
 from framework.training.checkpoint import latest_good, read
 
@@ -60,14 +61,16 @@ def load_with_description(
             f"{path} was not written by this framework (it holds no model description of format 1). "
             "Give a run folder, or a checkpoint from its checkpoints/."
         )
-    resolved = checked(described["config"])
-    for part in resolved["encoder"]:
-        # the checkpoint holds the weights now; the file they were started from may be gone
-        part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
-    target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
-    columns = tuple(described.get("columns", ()))
-    predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)
-    fill(predictor, weights(content), str(path))
+    remedy = "This framework did not write it: do not use it."
+    with guarded(path, "a checkpoint of this framework", remedy, kind=CheckpointError):
+        resolved = checked(described["config"])
+        for part in resolved["encoder"]:
+            # the checkpoint holds the weights now; the file they were started from may be gone
+            part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
+        target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
+        columns = tuple(described.get("columns", ()))
+        predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)
+        fill(predictor, weights(content), str(path))
     return predictor.eval(), {**described, "config": resolved, "path": str(path)}
 
 

@@ -19,8 +19,10 @@ SMALL, MOST_TIMES = 2**27, 20
 
 
 @contextmanager
-def guarded(file: Path, wanted: str, remedy: str = RESTORE, missing: str = "") -> Iterator[None]:
-    """Everything that damage leads a library to becomes a DataError that names the file; UserErrors pass.
+def guarded(
+    file: Path, wanted: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
+) -> Iterator[None]:
+    """Everything that damage leads a library to becomes an error of one `kind` that names the file; UserErrors pass.
 
     Args:
         wanted: what the file should be, "a MATLAB file" say.
@@ -31,11 +33,11 @@ def guarded(file: Path, wanted: str, remedy: str = RESTORE, missing: str = "") -
         yield
     except UserError:
         raise
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
     except Exception as error:
+        if isinstance(error, FileNotFoundError) and not file.exists():
+            raise kind(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
         why = shown(error) or type(error).__name__
-        raise DataError(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
+        raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
 
 
 @contextmanager
