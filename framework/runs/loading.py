@@ -56,7 +56,8 @@ def load_with_description(
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
     described = content.get("framework")
-    if not isinstance(described, Mapping) or described.get("format") != 1:
+    format_of = described.get("format") if isinstance(described, Mapping) else None
+    if not isinstance(described, Mapping) or not isinstance(format_of, int) or format_of != 1:
         raise CheckpointError(
             f"{path} was not written by this framework (it holds no model description of format 1). "
             "Give a run folder, or a checkpoint from its checkpoints/."

@@ -22,7 +22,7 @@ SMALL, MOST_TIMES = 2**27, 20
 def guarded(
     file: Path, wanted: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
 ) -> Iterator[None]:
-    """Everything that damage leads a library to becomes an error of one `kind` that names the file; UserErrors pass.
+    """Everything that damage leads a library to becomes an error of one `kind`, a UserError stays; all name the file.
 
     Args:
         wanted: what the file should be, "a MATLAB file" say.
@@ -31,8 +31,10 @@ def guarded(
     """
     try:
         yield
-    except UserError:
-        raise
+    except UserError as error:
+        if str(file) in str(error):
+            raise
+        raise type(error)(f"{file}: {error}") from error
     except Exception as error:
         if isinstance(error, FileNotFoundError) and not file.exists():
             raise kind(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
@@ -40,17 +42,17 @@ def guarded(
         raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
 
 
-@contextmanager
-def opened(file: Path) -> Iterator[BinaryIO]:
-    """A file to read.
+def opened(file: Path) -> BinaryIO:
+    """A file to read; whoever asks closes it.
 
     Raises:
         OSError: it is missing, or no regular file: a pipe could block for ever, a device go on without end.
     """
-    with open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as stream:
-        if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-            raise OSError("no regular file")
-        yield stream
+    stream = open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK))  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError("no regular file")
+    return stream
 
 
 def read_bytes(file: Path) -> bytes:
