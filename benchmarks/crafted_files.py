@@ -18,7 +18,7 @@ from PIL import Image
 
 from framework.training.checkpoint import _MARK
 
-BOMB = 2**28
+BOMB = 2**27 + 2**20
 """Bytes that a compressed file of a thousandth unfolds to; more than `framework.storage.reading.room` allows."""
 HUGE = 10**9
 
@@ -173,9 +173,11 @@ def mat(name: str) -> Iterator[bytes]:
     most = 2**31 - 1
     for kind, sides, data in (
         (6, (most, most), mat_element(9, bytes(8))), (1, (most, 2), mat_element(14, b"")), (2, (most, 1), fields),
-        (2, (most, 1), mat_element(5, struct.pack("<i", 1)) + mat_element(1, b"")), (4, (most, 1), mat_element(4, b"ab")),
+        (2, (most, 1), mat_element(5, struct.pack("<i", 1)) + mat_element(1, b"")),
+        (4, (most, 1), mat_element(4, b"ab")),
         (4, (10**6, 10**6), mat_element(16, b"ab")), (6, (-1, -1), mat_element(9, bytes(8))), (5, (9, 9), b""),
-        (6, (0, most), mat_element(9, b"")), (1, (0, most), b""), (17, (1, 1), b""), (2, (1, 1), mat_element(5, bytes(4))),
+        (6, (0, most), mat_element(9, b"")), (1, (0, most), b""), (17, (1, 1), b""),
+        (2, (1, 1), mat_element(5, bytes(4))),
     ):  # fmt: skip
         yield header + mat_array(name, kind, sides, data)
     deep = mat_array("", 6, (1, 1), mat_element(9, bytes(8)))
@@ -295,8 +297,10 @@ JSONS = [
     b" " * 2**25,
 ]
 JOURNALS = [
-    b'{"n":1,"values":{"a":{}},"time":0,"step":0,"epoch":0}\n', b'{"n":1,"values":[1],"time":0}\n', b'{"n":-5,"values":{}}\n',
-    b'{"n":1,"a":' + b"[" * 10**5 + b"\n", b'{"n":9' + b"9" * 5000 + b"}\n", b"\n" * 10**6, b'{"n":1,"values":{"a":"9"}}\n',
+    b'{"n":1,"values":{"a":{}},"time":0,"step":0,"epoch":0}\n', b'{"n":1,"values":[1],"time":0}\n',
+    b'{"n":-5,"values":{}}\n',
+    b'{"n":1,"a":' + b"[" * 10**5 + b"\n", b'{"n":9' + b"9" * 5000 + b"}\n", b"\n" * 10**6,
+    b'{"n":1,"values":{"a":"9"}}\n',
 ]  # fmt: skip
 
 
@@ -306,8 +310,10 @@ def checkpoints(whole: bytes, signed: Callable[[bytes], bytes]) -> Iterator[byte
     odd: list[Any] = [None, [], {}, 1, "x", {"framework": None}, {"framework": {"format": torch.zeros(2)}}]
     odd += [{**described, "framework": {"format": 1}}, {"framework": described["framework"]}]
     for key, value in (
-        ("config", {}), ("config", []), ("config", {"encoder": [{}]}), ("target", {}), ("target", {"kind": "class", "names": 5}),
-        ("target", {"kind": ["a"], "names": ["a", "b"]}), ("target", {"kind": "class", "names": [1, None]}), ("input_shape", 3),
+        ("config", {}), ("config", []), ("config", {"encoder": [{}]}), ("target", {}),
+        ("target", {"kind": "class", "names": 5}),
+        ("target", {"kind": ["a"], "names": ["a", "b"]}), ("target", {"kind": "class", "names": [1, None]}),
+        ("input_shape", 3),
         ("input_shape", [10**12]), ("input_shape", [-3]), ("input_shape", ["a"]), ("input_shape", []), ("columns", 7),
     ):  # fmt: skip
         odd.append({**described, "framework": {**described["framework"], key: value}})

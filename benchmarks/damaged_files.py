@@ -158,7 +158,8 @@ COLOURS = RANDOM.integers(0, 256, (len(VERTICES), 3))
 def ply_binary(order: str, name: str) -> bytes:
     head = [
         "ply", f"format {name} 1.0", "comment of nobody", f"element vertex {len(VERTICES)}",
-        *(f"property double {axis}" for axis in "xyz"), *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        *(f"property double {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
         f"element face {len(FACES)}", "property list uchar int vertex_indices", "property float quality", "end_header",
     ]  # fmt: skip
     content = "\n".join([*head, ""]).encode()
@@ -251,7 +252,8 @@ def body() -> dict[str, Any]:
     weights = RANDOM.random((vertices, joints))
     return {
         "v_template": RANDOM.normal(size=(vertices, 3)), "shapedirs": RANDOM.normal(size=(vertices, 3, shapes)),
-        "posedirs": RANDOM.normal(size=(vertices, 3, 9 * (joints - 1))), "J_regressor": np.full((joints, vertices), 1 / vertices),
+        "posedirs": RANDOM.normal(size=(vertices, 3, 9 * (joints - 1))),
+        "J_regressor": np.full((joints, vertices), 1 / vertices),
         "weights": weights / weights.sum(1, keepdims=True), "f": RANDOM.integers(0, vertices, (5, 3)).astype(np.uint32),
         "kintree_table": np.array([[2**32 - 1, 0, 1], [0, 1, 2]], dtype=np.uint32),
     }  # fmt: skip

@@ -140,8 +140,8 @@ def tables_and_images() -> Iterator[Reader]:
 
 def labels() -> Iterator[Reader]:
     yield Reader(
-        "MATLAB 5, labels of CAVIAR", "or_label.mat", [whole.caviar(False), whole.caviar(True)], caviar_labels.read_labels,
-        [in_mat], [*crafted.mat("or_label_train")],
+        "MATLAB 5, labels of CAVIAR", "or_label.mat", [whole.caviar(False), whole.caviar(True)],
+        caviar_labels.read_labels, [in_mat], [*crafted.mat("or_label_train")],
     )  # fmt: skip
     yield Reader(
         "MATLAB 5, annotations of PASCAL3D+", "Annotations/car_pascal/one.mat",
@@ -152,7 +152,8 @@ def labels() -> Iterator[Reader]:
         [*crafted.mat("X")],
     )  # fmt: skip
     yield Reader(
-        "MATLAB 7.3 (HDF5), labels of IDIAP", "or_label_full.mat", [whole.idiap(4), whole.idiap(1), whole.idiap_of_ours()],
+        "MATLAB 7.3 (HDF5), labels of IDIAP", "or_label_full.mat",
+        [whole.idiap(4), whole.idiap(1), whole.idiap_of_ours()],
         lambda file: idiap_labels.read_labels(file, "radians"), crafted=[*crafted.hdf5()],
     )  # fmt: skip
     text = b"pan = -13.50\nvalid = 1\n"

@@ -11,6 +11,7 @@ with checksums or compression are damaged inside them, so that the checksum is r
 
 import argparse
 import os
+import signal
 import sys
 import time
 import warnings
@@ -21,7 +22,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before anything starts threads: readers r
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.damage import Reader, Tally, fuzz, replay, scratch
+from benchmarks.damage import Reader, Tally, fuzz, outcome_of, replay, scratch
 from benchmarks.damaged_readers import readers
 from benchmarks.machine import machine
 
@@ -48,6 +49,7 @@ def main() -> int:
     for reader in chosen:
         with scratch() as folder:
             whole(reader, folder)
+            irregular(reader, folder)
             found[reader.name] = fuzz(reader, arguments.files, folder)
         tell(reader.name, found[reader.name])
         if not arguments.check and not arguments.only:
@@ -62,6 +64,24 @@ def whole(reader: Reader, folder: Path) -> None:
     for content in reader.samples:
         file.write_bytes(content)
         reader.read(file)
+
+
+def irregular(reader: Reader, folder: Path) -> None:
+    """A pipe, which would block, a device that goes on without end, and a folder are refused.
+
+    Raises:
+        AssertionError: one is read.
+    """
+    file = folder / reader.file
+    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero"), Path.mkdir):
+        file.unlink(missing_ok=True)
+        make(file)
+        signal.alarm(20)  # ends this process
+        outcome, text = outcome_of(reader, file)
+        signal.alarm(0)
+        if outcome == 2 and str(file.parent) not in text:
+            raise AssertionError(f"{reader.name}: {text}")
+    file.rmdir()
 
 
 def tell(name: str, tally: Tally) -> None:

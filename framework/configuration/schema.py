@@ -34,7 +34,7 @@ def forbid_targets(config: Any, path: str = "") -> None:
             here = f"{path}.{key}" if path else str(key)
             if key == "_target_":
                 raise ConfigError(
-                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not be able to run code. "
+                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not run code. "
                     "Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
                 )
             forbid_targets(value, here)
@@ -59,7 +59,8 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
         config = {"name": config}
     if not isinstance(config, Mapping):
         raise ConfigError(
-            f"{shown(path)} = {quoted(config)}: wanted the name of a {group}, or a mapping with `name` and its parameters."
+            f"{shown(path)} = {quoted(config)}: wanted the name of a {group}, or a mapping with `name` and "
+            "its parameters."
         )
     forbid_targets(config, path)
     values = dict(config)

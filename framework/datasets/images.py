@@ -150,7 +150,7 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
     inside = (max(0, first_x), max(0, first_y), min(image.width, last_x), min(image.height, last_y))
     padded = inside != (first_x, first_y, last_x, last_y)
     if padded and (last_x - first_x) * (last_y - first_y) > MOST_PADDED:  # a strip, say
-        step = math.ceil((last_x - first_x) / math.isqrt(MOST_PADDED))
+        step = math.ceil(max(last_x - first_x, last_y - first_y) / math.isqrt(MOST_PADDED))
         small = (left / step, top / step, right / step, bottom / step)
         return square(image.reduce(step), small, margin, side)
     cut = image if inside == (0, 0, *image.size) else image.crop(inside)

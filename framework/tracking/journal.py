@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 from framework.errors import DataError
 from framework.storage.files import write_whole
-from framework.storage.reading import opened
+from framework.storage.reading import guarded, opened
 
 _log = logging.getLogger(__name__)
 # json.dumps with options builds its encoder anew at each call; this one is built once.
@@ -103,7 +103,8 @@ class Journal:
             rewritten = self._rewritten
             if not self.path.exists():
                 return []
-            file = opened(self.path)  # stays the file it is, should drop_after replace it now
+            with guarded(self.path, "a journal"):
+                file = opened(self.path)  # stays the file it is, should drop_after replace it now
         records: list[dict[str, Any]] = []
         with file:
             file.seek(offset)
