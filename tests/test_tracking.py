@@ -1085,10 +1085,10 @@ def test_what_to_type_to_see_a_run(folder: Path) -> None:
 
 def test_damaged_run_json_is_said(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{")
-    with pytest.raises(DataError, match=r"run\.json is damaged"):
+    with pytest.raises(DataError, match=r"run\.json: cannot be read"):
         read_run_info(tmp_path)
     (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(DataError, match=r"run\.json is damaged"):
+    with pytest.raises(DataError, match=r"run\.json: cannot be read"):
         NoTracker(tmp_path).open()
     assert read_run_info(tmp_path / "missing") is None
 

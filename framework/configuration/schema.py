@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from framework.configuration.registry import group_of, load
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, quoted, shown
 
 
 def forbid_targets(config: Any, path: str = "") -> None:
@@ -34,7 +34,7 @@ def forbid_targets(config: Any, path: str = "") -> None:
             here = f"{path}.{key}" if path else str(key)
             if key == "_target_":
                 raise ConfigError(
-                    f"{here} = {value!r}: `_target_` is refused, since a config must not be able to run code. "
+                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not run code. "
                     "Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
                 )
             forbid_targets(value, here)
@@ -59,13 +59,16 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
         config = {"name": config}
     if not isinstance(config, Mapping):
         raise ConfigError(
-            f"{path} = {config!r}: wanted the name of a {group}, or a mapping with `name` and its parameters."
+            f"{shown(path)} = {quoted(config)}: wanted the name of a {group}, or a mapping with `name` and "
+            "its parameters."
         )
     forbid_targets(config, path)
     values = dict(config)
     name = values.pop("name", None)
     if not isinstance(name, str):
-        raise ConfigError(f"{path}.name is missing: write the name of a {group} (`mode=plugins` lists them).")
+        raise ConfigError(
+            f"{shown(path)}.name is missing: write the name of a {group} (`mode=plugins` lists them)."
+        )
     cls = load(group, name)
     checked = check(_model(cls), values, path)
     for key, part in parts(cls).items():
@@ -117,7 +120,7 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
         return model.model_validate(dict(values)).model_dump()
     except ValidationError as error:
         fault = error.errors()[0]
-        where = ".".join(filter(None, [path, *(str(item) for item in fault["loc"])]))
+        where = shown(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
         known = list(model.model_fields)
         if fault["type"] == "extra_forbidden":
             key = str(fault["loc"][-1])
@@ -131,7 +134,7 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
             hint = did_you_mean(str(fault["input"]), expected)
         else:
             hint = ""
-        raise ConfigError(f"{where} = {fault['input']!r}: {fault['msg']}.{hint}") from None
+        raise ConfigError(f"{where} = {quoted(fault['input'])}: {fault['msg']}.{hint}") from None
 
 
 class Part(typing.NamedTuple):

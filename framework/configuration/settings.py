@@ -75,6 +75,15 @@ def store_experiment(config: Mapping[str, Any]) -> str:
 
 TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
 """Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
+FRAMEWORKS_OWN = {
+    "callbacks",
+    "logger",
+    "plugins",
+    "default_root_dir",
+    "enable_checkpointing",
+    "use_distributed_sampler",
+}
+"""Of the Trainer's arguments those that the framework gives it."""
 
 
 def settings(config: Mapping[str, Any]) -> Settings:
@@ -111,6 +120,9 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
             isinstance(value, bool) or not isinstance(value, kind) or not value >= least
         ):
             raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
+    given = sorted(FRAMEWORKS_OWN & set(trainer))
+    if given:
+        raise ConfigError(f"trainer.{given[0]}: the framework itself says that to the Trainer. Leave it out.")
     every, epochs = trainer.get("check_val_every_n_epoch") or 1, trainer.get("max_epochs")
     if epochs is not None and every > epochs:
         raise ConfigError(

@@ -29,7 +29,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
 
 def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """The config and overrides the run in `folder` was started with: resuming changes neither."""
-    from framework.runs.run import stored_config, stored_overrides
+    from framework.storage.plain_values import read_yaml
     from framework.tracking.run_info import read_run_info
 
     others = [item for item in overrides if not item.startswith("resume=")]
@@ -43,7 +43,14 @@ def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], lis
         raise ConfigError(
             f"resume={folder}: that run has finished; there is nothing to go on with. Start a new run."
         )
-    values = stored_config(folder)
-    if not isinstance(values, dict):
+    values, changed = (
+        read_yaml(folder / name, "a config that a run has left", "Start a new run.", ConfigError)
+        for name in ("config.yaml", "overrides.yaml")
+    )
+    if (
+        not isinstance(values, dict)
+        or not isinstance(changed, list)
+        or not all(isinstance(item, str) for item in (*values, *changed))
+    ):
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
-    return values, stored_overrides(folder)
+    return values, changed

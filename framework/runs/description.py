@@ -75,8 +75,9 @@ class Description:
         """Out of a checkpoint's contents; the config is checked again: it can only choose among installed plugins.
 
         Raises:
-            CheckpointError: it is missing or lacks something.
+            CheckpointError: there is none.
             ConfigError: a part of the config is unknown here.
+            LookupError, TypeError, ValueError: it is not whole.
         """
         stored = content.get("framework")
         if not isinstance(stored, Mapping) or stored.get("format") != 1:
@@ -84,27 +85,21 @@ class Description:
                 f"{path} was not written by this framework (it holds no model description of format 1). "
                 "Give a run folder, or a checkpoint from its checkpoints/."
             )
-        try:
-            target = {
-                key: tuple(value) if isinstance(value, list | tuple) else value
-                for key, value in stored["target"].items()
-            }
-            return cls(
-                checked(stored["config"]),
-                Target(**target),  # pyright: ignore[reportArgumentType]  # checked by Target's readers
-                tuple(map(int, stored["input_shape"])),
-                tuple(map(str, stored.get("columns", ()))),
-                bool(stored.get("synthetic", False)),
-                str(stored.get("method", "")),
-                {key: value for key, value in dict(stored.get("settings", {})).items() if key in INHERITED},
-                dict(stored.get("data_state", {})),
-                path,
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise CheckpointError(
-                f"The description of the model in {path} is not whole ({type(error).__name__}: {str(error)[:200]}). "
-                "Restore the file, or train anew."
-            ) from error
+        target = {
+            key: tuple(value) if isinstance(value, list | tuple) else value
+            for key, value in stored["target"].items()
+        }
+        return cls(
+            checked(stored["config"]),
+            Target(**target),  # pyright: ignore[reportArgumentType]  # checked by Target's readers
+            tuple(map(int, stored["input_shape"])),
+            tuple(map(str, stored.get("columns", ()))),
+            bool(stored.get("synthetic", False)),
+            str(stored.get("method", "")),
+            {key: value for key, value in dict(stored.get("settings", {})).items() if key in INHERITED},
+            dict(stored.get("data_state", {})),
+            path,
+        )
 
 
 def checked(config: Mapping[str, Any]) -> Resolved:

@@ -15,6 +15,7 @@ from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
 from framework.runs.description import Description
+from framework.storage.reading import guarded
 from framework.training.checkpoint import latest_good, read
 
 PREFIX = "predictor."
@@ -64,13 +65,16 @@ def load_with_description(
     """The trained predictor, as `load`, with what the checkpoint says of itself."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
-    description = Description.read(content, str(path))
-    parts = description.config
-    for part in parts["encoder"]:
-        # the checkpoint holds the weights now; the file they were started from may be gone
-        part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
-    predictor = build_predictor(parts, description.target, description.input_shape, 0, description.columns)
-    fill(predictor, weights(content), str(path))
+    remedy = "This framework did not write it: do not use it."
+    with guarded(path, "a checkpoint of this framework", remedy, kind=CheckpointError):
+        description = Description.read(content, str(path))
+        parts = description.config
+        for part in parts["encoder"]:
+            # the checkpoint holds the weights now; the file they were started from may be gone
+            part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
+        shape, columns = description.input_shape, description.columns
+        predictor = build_predictor(parts, description.target, shape, 0, columns)
+        fill(predictor, weights(content), str(path))
     return predictor.eval(), description
 
 

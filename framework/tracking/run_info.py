@@ -4,12 +4,15 @@ import json
 import logging
 import re
 import threading
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, DataError
+from pydantic import TypeAdapter
+
+from framework.errors import ConfigError
 from framework.storage.files import write_whole
+from framework.storage.reading import guarded, read_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -55,16 +58,10 @@ def read_run_info(folder: Path) -> RunInfo | None:
         DataError: it is not what a tracker wrote.
     """
     path = folder / SIDECAR
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        known = {item.name: stored[item.name] for item in fields(RunInfo) if item.name in stored}
-        return RunInfo(**{**known, "owed": tuple((file, place) for file, place in stored["owed"])})
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (ValueError, TypeError, KeyError) as error:
-        raise DataError(
-            f"{path} is damaged ({type(error).__name__}: {error}). Remove it, and the run begins anew."
-        ) from error
+    with guarded(path, "what a tracker wrote", "Remove it, and the run begins anew."):
+        return TypeAdapter(RunInfo).validate_json(read_bytes(path))
 
 
 class Sidecar:
