@@ -10,6 +10,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.protocol import (
     Normals,
+    about,
     estimate,
     exactly,
     mahalanobis,
@@ -115,6 +116,11 @@ def _(density: Gaussian, index: Tensor) -> Gaussian:
         size = coefficients.shape[-1]
         coefficients = take(coefficients.flatten(-2), index).unflatten(-1, (size, size))
     return Gaussian(take(density.location, index), take(density.scale, index), coefficients)
+
+
+@about.register
+def _(density: Gaussian, index: tuple[Tensor, ...], place: Tensor) -> Gaussian:
+    return Gaussian(density.location.double()[index] - place, density.scale.double()[index])
 
 
 @median.register

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid
+from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exactly, marginal, pick, take, tempered
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
@@ -131,7 +132,7 @@ class Angle(Distribution):
 
     def entropy(self) -> Tensor:
         """Nats, by quadrature."""
-        return -self.expectation(self._log_density).to(self.joint.dtype)
+        return entropy_of_one(self)
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*batch"]:
         """E function(angle), float64; `function` takes and gives (*batch, point), radians in."""

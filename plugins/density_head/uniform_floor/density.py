@@ -6,16 +6,18 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.circular import Circular
-from framework.distributions.density import circular_entropy, merged
+from framework.distributions.density import merged
+from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
+    about,
     arc,
     estimate,
     marginal,
     median,
     peaks,
     pick,
+    scales,
     tempered,
     turn,
 )
@@ -77,8 +79,8 @@ class Floored(Distribution):
         if self.event_shape == ():
             log_prob = self.log_prob(self.enumerate_support())
             return -(log_prob.exp() * log_prob).sum(0)
-        if self.event_shape == (1,) and isinstance(self.support, Circular):
-            return circular_entropy(self)
+        if has_range(self):
+            return entropy_of_one(self)
         return -self.log_prob(self.sample(torch.Size((1000,)))).mean(0)
 
 
@@ -107,6 +109,16 @@ def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
 @peaks.register
 def _(density: Floored) -> Tensor:
     return peaks(density.density)
+
+
+@scales.register
+def _(density: Floored) -> Tensor:
+    return scales(density.density)
+
+
+@about.register
+def _(density: Floored, index: tuple[Tensor, ...], place: Tensor) -> Floored:
+    return Floored(about(density.density, index, place), density.weight, density.log_uniform)
 
 
 @median.register

@@ -7,6 +7,7 @@ from torch.distributions import Distribution, constraints, register_kl
 
 from framework.distributions.circular import circular
 from framework.distributions.protocol import (
+    about,
     arc,
     estimate,
     exactly,
@@ -74,6 +75,11 @@ def _(density: VonMises, index: int) -> VonMises:
 @pick.register
 def _(density: VonMises, index: Tensor) -> VonMises:
     return VonMises(take(density.location, index), take(density.concentration, index))
+
+
+@about.register
+def _(density: VonMises, index: tuple[Tensor, ...], place: Tensor) -> VonMises:
+    return VonMises(density.location.double()[index] - place, density.concentration.double()[index])
 
 
 @median.register
