@@ -20,7 +20,6 @@ from framework.testing.metrics import Cardioid
 from plugins.density_head.uniform_floor.density import Floored
 from plugins.density_head.von_mises.density import VonMises
 
-TURN = 2 * math.pi
 VIEWPOINT = Target("angle", ("azimuth", "elevation", "tilt"))
 
 
@@ -102,7 +101,7 @@ def test_of_mixtures_of_any_width_against_50_digits(kind: type, seed: int) -> No
     shapes = (
         Reshaped(density, (1, 1)),
         Mixture(torch.zeros(1, 2).double(), Stacked([density, density])),
-        Floored(density, 1e-30, -math.log(TURN)) if kind is VonMises else density,
+        Floored(density, 1e-30) if kind is VonMises else density,
     )
     for same in shapes:
         assert circular_entropy(same).item() == pytest.approx(wanted, abs=1e-9)
@@ -191,6 +190,11 @@ def test_of_a_stranger_it_is_right_or_drawn_and_said(caplog: pytest.LogCaptureFi
 def test_nothing_and_not_a_number() -> None:
     empty = Mixture(torch.zeros(0, 2), VonMises(torch.zeros(0, 2, 1), torch.ones(0, 2, 1)))
     assert empty.entropy().shape == (0,)
+    single = mixture_of([0.0, 1.0], [0.0, 2.0], [3.0, 4.0])
+    alone = Mixture(
+        single.log_weights[0], VonMises(single.components.location[0], single.components.concentration[0])
+    )
+    assert alone.entropy().shape == () and alone.entropy() == single.entropy()[0]
     broken = mixture_of([0.0, 0.0], [1.0, math.nan], [3.0, 4.0])
     assert broken.entropy().isnan().all()
 

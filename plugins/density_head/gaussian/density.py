@@ -120,7 +120,8 @@ def _(density: Gaussian, index: Tensor) -> Gaussian:
 
 @about.register
 def _(density: Gaussian, index: tuple[Tensor, ...], place: Tensor) -> Gaussian:
-    return Gaussian(density.location.double()[index] - place, density.scale.double()[index])
+    location = density.location.double()[index] - place
+    return Gaussian(location, density.scale.double()[index].expand_as(location))
 
 
 @median.register

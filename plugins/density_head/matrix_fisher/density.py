@@ -12,6 +12,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular, grid
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exactly, marginal, pick, take, tempered
+from framework.distributions.uniform import uniform
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
 VOLUME = 8 * math.pi**2
@@ -157,6 +158,17 @@ estimate.register(Angle, exactly)  # by quadrature, which draws nothing
 @marginal.register
 def _(density: MatrixFisher, index: int) -> Angle:
     return Angle(density, index)
+
+
+@uniform.register
+def _(density: MatrixFisher) -> MatrixFisher:
+    """Of rotations: that of Haar's measure, cos e / 8π² on the chart."""
+    return MatrixFisher(torch.zeros_like(density.parameter), density.dtype)
+
+
+@uniform.register
+def _(density: Angle) -> Angle:
+    return Angle(uniform(density.joint), density.index)  # pyright: ignore[reportArgumentType]
 
 
 @pick.register

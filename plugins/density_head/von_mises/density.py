@@ -79,7 +79,8 @@ def _(density: VonMises, index: Tensor) -> VonMises:
 
 @about.register
 def _(density: VonMises, index: tuple[Tensor, ...], place: Tensor) -> VonMises:
-    return VonMises(density.location.double()[index] - place, density.concentration.double()[index])
+    location = density.location.double()[index] - place
+    return VonMises(location, density.concentration.double()[index].expand_as(location))
 
 
 @median.register
