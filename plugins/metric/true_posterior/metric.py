@@ -48,7 +48,7 @@ class TruePosterior(Metric):
     bibtex = """@inproceedings{prokudin2018deep,
   author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
   title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  booktitle = {European Conference on Computer Vision},
+  booktitle = {European Conference on Computer Vision (ECCV)},
   pages     = {534--551},
   year      = {2018}
 }"""
