@@ -1,6 +1,7 @@
 """Builds the parts of the density pipeline from a config: data, predictor, objectives, metrics."""
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -163,6 +164,15 @@ def citations(resolved: Resolved) -> dict[str, str]:
             visit(group, part)
     for part in _items(resolved.get("outliers")):
         visit("data", part)
+    return found
+
+
+def entries(bibtex: Iterable[str]) -> dict[str, str]:
+    """The entries of several pieces of BibTeX by their keys, each once, in their order."""
+    found: dict[str, str] = {}
+    for entry in re.split(r"^(?=@)", "\n".join(bibtex), flags=re.MULTILINE):
+        if entry.strip():
+            found.setdefault(entry.partition("{")[2].partition(",")[0].strip(), entry.strip())
     return found
 
 

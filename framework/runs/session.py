@@ -21,6 +21,7 @@ from framework.configuration.assembly import (
     build_outliers,
     build_predictor,
     citations,
+    entries,
     require_outliers,
 )
 from framework.configuration.config import Config
@@ -118,7 +119,7 @@ def record_citations(run: Run, parts: Resolved) -> None:
     """Write what to cite into the run folder and the store."""
     path = run.folder / "citations.bib"
     if first_rank():
-        path.write_text("\n\n".join(dict.fromkeys(citations(parts).values())) + "\n", encoding="utf-8")
+        path.write_text("\n\n".join(entries(citations(parts).values()).values()) + "\n", encoding="utf-8")
     run.tracker.log_artifact(path)
 
 

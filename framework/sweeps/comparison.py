@@ -14,7 +14,8 @@ from framework.errors import ConfigError, did_you_mean
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
 from framework.runs.job import RECORD
 from framework.storage.plain_values import read_json
-from framework.tracking.tracker import MlflowTracker, mark_dead
+from framework.tracking.ended import mark_dead
+from framework.tracking.tracker import MlflowTracker
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
 PARENT_OF = "what a sweep keeps of its parent run"

@@ -176,7 +176,7 @@ def run(
 
 def _sync(folder: Path) -> None:
     """Send what a job left unsent; one that died is closed and sent by the comparison."""
-    from framework.tracking.tracker import sync  # Hydra imports this module at every start
+    from framework.tracking.ended import sync  # Hydra imports this module at every start
 
     try:
         sync(folder)

@@ -2,11 +2,13 @@
 
 import json
 import logging
+import os
 import re
 import threading
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from pydantic import TypeAdapter
 
@@ -82,6 +84,24 @@ class Sidecar:
                 OSError
             ) as error:  # an old one costs only that lines are sent again, which the store ignores
                 _log.warning("%s could not be written: %s.", self._path, error.strerror)
+
+
+def require_own_store(uri: str, given: str | None, source: Path) -> None:
+    """Refuse to send to a server that only a file names: a run folder may be a stranger's.
+
+    Args:
+        given: the store that the user names.
+
+    Raises:
+        ConfigError: it is neither a local file, nor on this machine, nor named by `given` or MLFLOW_TRACKING_URI.
+    """
+    own = [without_password(name) for name in (given, os.environ.get("MLFLOW_TRACKING_URI")) if name]
+    here = not uri or uri.startswith(_SQLITE) or urlsplit(uri).hostname in ("localhost", "127.0.0.1", "::1")
+    if not here and without_password(uri) not in own:
+        raise ConfigError(
+            f"{source} says that the run goes to {without_password(uri)}. If that is where you keep runs, say so: add "
+            f"logger.uri={without_password(uri)}"
+        )
 
 
 def default_uri(folder: Path) -> str:

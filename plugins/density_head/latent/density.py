@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.protocol import Estimate, estimate, marginal, median, tempered
+from framework.distributions.uniform import uniform
 from plugins.density_head.latent.monte_carlo import (
     Effort,
     NormalPoints,
@@ -157,6 +158,11 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
 @marginal.register
 def _(density: LatentDensity, index: int) -> Distribution:
     return marginal(density.mixture, index)
+
+
+@uniform.register
+def _(density: LatentDensity) -> Distribution:
+    return uniform(density._example)
 
 
 @median.register
