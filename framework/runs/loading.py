@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
@@ -16,9 +16,11 @@ from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
 from framework.storage.reading import guarded
-from framework.target import Target
+from framework.target import Kind, Target
 from framework.training.checkpoint import latest_good, read
 
+LONGEST_NAME = 1000
+"""Letters of a target's name."""
 PREFIX = "predictor."
 """What Lightning's checkpoints put before the predictor's own parameter names."""
 
@@ -69,6 +71,8 @@ def load_with_description(
             # the checkpoint holds the weights now; the file they were started from may be gone
             part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
         target = Target(described["target"]["kind"], tuple(described["target"]["names"]))
+        if target.kind not in get_args(Kind) or any(len(name) > LONGEST_NAME for name in target.names):
+            raise ValueError(f"a target of kind {target.kind!r} with the names {target.names}")
         columns = tuple(described.get("columns", ()))
         predictor = build_predictor(resolved, target, tuple(described["input_shape"]), 0, columns)
         fill(predictor, weights(content), str(path))
