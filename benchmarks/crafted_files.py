@@ -71,9 +71,11 @@ def npz(name: str) -> Iterator[bytes]:
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
         yield zip_of({f"{name}.npy": array}, compression=method)
     whole = zip_of({f"{name}.npy": array})
-    for old, new in ((b"PK\x01\x02\x14\x03\x14\x00\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01\x00"),):
-        yield whole.replace(old, new)  # as if encrypted
-    yield whole.replace(b"\x00\x00\x00\x00!\x00", b"\x00\x00\x63\x00!\x00")  # a method that nobody knows
+    central = whole.index(b"PK\x01\x02")
+    for at, flag in ((6, 1), (8, 99)):  # as if encrypted, and by a method that nobody knows
+        made = bytearray(whole)
+        made[at] = made[central + at + 2] = flag
+        yield bytes(made)
     yield from (zip_of({f"{name}.npy": one}) for one in NPY)
 
 

@@ -1026,11 +1026,11 @@ def test_nobody_else_touches_a_living_run(folder: Path) -> None:
     program = """
 import sys
 from pathlib import Path
-from framework.tracking import tracker as tracking
+from framework.tracking import ended, tracker as tracking
 
 for act in (
-    tracking.sync,
-    tracking.mark_dead,
+    ended.sync,
+    ended.mark_dead,
     lambda folder: tracking.NoTracker(folder).open(),
 ):
     try:

@@ -34,8 +34,8 @@ def forbid_targets(config: Any, path: str = "") -> None:
             here = f"{path}.{key}" if path else str(key)
             if key == "_target_":
                 raise ConfigError(
-                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not run code. "
-                    "Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
+                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not be able "
+                    "to run code. Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
                 )
             forbid_targets(value, here)
     elif isinstance(config, list | tuple):

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from framework.configuration.registry import GROUPS
 from framework.configuration.schema import check, forbid_targets
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, quoted, shown
 
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
@@ -119,7 +119,9 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
         if value is not None and (
             isinstance(value, bool) or not isinstance(value, kind) or not value >= least
         ):
-            raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
+            raise ConfigError(
+                f"trainer.{key} = {quoted(value)}: wanted a number of at least {least}, or null."
+            )
     given = sorted(FRAMEWORKS_OWN & set(trainer))
     if given:
         raise ConfigError(f"trainer.{given[0]}: the framework itself says that to the Trainer. Leave it out.")
@@ -131,7 +133,8 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
         )
     if trainer.get("keep", "best") not in ("best", "last"):
         raise ConfigError(
-            f"trainer.keep = {trainer['keep']!r}: wanted `best` (the weights of the lowest validation loss) or `last`."
+            f"trainer.keep = {quoted(trainer['keep'])}: wanted `best` (the weights of the lowest validation "
+            "loss) or `last`."
         )
 
 
@@ -144,7 +147,7 @@ def check_trainer_keys(trainer: Mapping[str, Any], known: set[str]) -> None:
     for key in trainer:
         if key not in known | TRAINER_OURS:
             raise ConfigError(
-                f"trainer.{key}: unknown key.{did_you_mean(key, known | TRAINER_OURS)} "
+                f"trainer.{shown(key)}: unknown key.{did_you_mean(key, known | TRAINER_OURS)} "
                 "Known: the arguments of pytorch_lightning.Trainer, "
                 f"and {', '.join(sorted(TRAINER_OURS))}."
             )

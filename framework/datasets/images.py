@@ -23,7 +23,6 @@ from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.storage import reading
-from framework.storage.reading import guarded
 
 READERS = min(8, os.cpu_count() or 1)
 """So many threads decode at once."""
@@ -100,11 +99,8 @@ def opened(file: Path) -> Iterator[Image.Image]:
     Raises:
         DataError: the file is missing, is no image, or is cut short; names it.
     """
-    missing = "wanted an image. Mend the path, or restore it."
     with (
-        guarded(
-            file, "an image", "Restore it from its source. Scale the image down if it is too large.", missing
-        ),
+        reading.guarded(file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."),
         reading.opened(file) as stream,
         Image.open(stream, formats=FORMATS) as image,
     ):
@@ -141,12 +137,8 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
     half = (0.5 + margin) * max(right - left, bottom - top)
     x, y = (left + right) / 2, (top + bottom) / 2
     # whole pixels around the square, then those of them that exist, then the square within what was cut
-    first_x, first_y, last_x, last_y = (
-        math.floor(x - half),
-        math.floor(y - half),
-        math.ceil(x + half),
-        math.ceil(y + half),
-    )
+    first_x, first_y = math.floor(x - half), math.floor(y - half)
+    last_x, last_y = math.ceil(x + half), math.ceil(y + half)
     inside = (max(0, first_x), max(0, first_y), min(image.width, last_x), min(image.height, last_y))
     padded = inside != (first_x, first_y, last_x, last_y)
     if padded and (last_x - first_x) * (last_y - first_y) > MOST_PADDED:  # a strip, say

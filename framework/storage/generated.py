@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from framework.errors import DataError
 from framework.storage.files import alone
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.plain_values import read_json
 
 MARK = "synthetic.json"
 PAINTERS = 2
@@ -55,8 +55,7 @@ def read_mark(root: Path) -> dict[str, Any] | None:
     """
     if not (root / MARK).exists():
         return None
-    with guarded(root / MARK, "the mark of generated data", f"Delete {root}: it is made anew."):
-        return json.loads(read_bytes(root / MARK))
+    return read_json(root / MARK, "the mark of generated data", f"Delete {root}: it is made anew.")
 
 
 def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
