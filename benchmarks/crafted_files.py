@@ -298,6 +298,10 @@ JSONS = [
     b"{}",
     b" " * 2**25,
 ]
+SAME_TUPLE_TWICE = b"\x80\x02}K\x01\x85q\x00" + b"".join(
+    b"h%ch%c\x86q%c" % (number, number, number + 1) for number in range(40)
+)
+"""... and this tuple again, forty deep, for a key."""
 JOURNALS = [
     b'{"n":1,"values":{"a":{}},"time":0,"step":0,"epoch":0}\n', b'{"n":1,"values":[1],"time":0}\n',
     b'{"n":-5,"values":{}}\n',
@@ -326,6 +330,10 @@ def checkpoints(whole: bytes, signed: Callable[[bytes], bytes]) -> Iterator[byte
         torch.save(one, packed)
         yield signed(packed.getvalue())
     yield signed(deflated_part("archive/data.pkl", zeros(), BOMB))
+    pickled = SAME_TUPLE_TWICE + b"Ns."
+    yield signed(
+        zip_of({"archive/data.pkl": pickled, "archive/version": b"3\n", "archive/byteorder": b"little"})
+    )
     yield signed(b"")
     yield signed(b"\x80\x02}K\x01\x85" + b"2\x86" * 10 + b"Ns.")
     yield signed(json.dumps({"framework": 1}).encode())

@@ -277,7 +277,7 @@ def dales(packed: bool) -> bytes:
 def checkpoint() -> bytes:
     resolved = {
         "encoder": [resolve("encoder", {"name": "mlp", "widths": [4], "dropout": 0.1})],
-        "density_head": resolve("density_head", "categorical"), "uncertainty": [],
+        "density_head": resolve("density_head", "categorical"), "uncertainty": [], "data": {"name": "moons"},
     }  # fmt: skip
     model = build_predictor(resolved, Target("class", ("a", "b")), (3,), 0)
     described = {

@@ -1,5 +1,6 @@
 """Damaged and harmful files: every reader of the project reads them or says a sentence, and soon."""
 
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from framework.datasets import images
 from framework.datasets.images import Crop, square
 from framework.errors import ConfigError, DataError, quoted, shown
 from framework.storage import reading
-from framework.storage.plain_values import read_yaml
+from framework.storage.plain_values import read_yaml, require_flat
 from framework.storage.reading import guarded, inflated
 
 ROOT = Path(__file__).parent.parent
@@ -130,6 +131,18 @@ def test_stored_values_are_plain(tmp_path: Path) -> None:
             read_yaml(file, "a config", "Start anew.", ConfigError)
     file.write_text("a: [1, {b: null}]\n")
     assert read_yaml(file, "a config") == {"a": [1, {"b": None}]}
+
+
+def test_a_pickle_of_tuples_that_hold_the_same_tuple_twice_is_refused() -> None:
+    """As a key, thirty deep, it takes minutes to hash; what is as deep and holds no tuple twice is all right."""
+    nested: tuple = (1,)
+    deep: tuple = (1,)
+    for number in range(30):
+        nested, deep = (nested, nested), (deep, number)
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        require_flat(pickle.dumps({"a": deep, "b": [(1, (2, 3))] * 9, "c": tuple(range(9999))}, protocol))
+        with pytest.raises(ValueError, match="stands for more than"):
+            require_flat(pickle.dumps([nested], protocol))
 
 
 @pytest.mark.parametrize("key", sorted(FRAMEWORKS_OWN))

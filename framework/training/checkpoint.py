@@ -17,6 +17,7 @@ from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError, shown
 from framework.storage.files import remove_leftovers, replacing
+from framework.storage.plain_values import require_flat
 
 # A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
 # all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
@@ -101,12 +102,15 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _require_unfolded(file: BinaryIO) -> None:
-    """Refuse compressed parts, which torch does not write: a small file could take any memory."""
+    """Refuse what torch does not write and a small file could take any memory or time by."""
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
-    size = os.fstat(file.fileno()).st_size
-    if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
-        raise ValueError("its parts unfold to more than the file")
+        size = os.fstat(file.fileno()).st_size
+        if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
+            raise ValueError("its parts unfold to more than the file")
+        for part in parts:
+            if part.filename.endswith("data.pkl"):
+                require_flat(archive.read(part))
     file.seek(0)
 
 
