@@ -1026,6 +1026,7 @@ def test_nobody_else_touches_a_living_run(folder: Path) -> None:
     program = """
 import sys
 from pathlib import Path
+from framework.errors import DataError
 from framework.tracking import ended, tracker as tracking
 
 for act in (
@@ -1035,7 +1036,7 @@ for act in (
 ):
     try:
         act(Path(sys.argv[1]))
-    except tracking.DataError as error:
+    except DataError as error:
         assert "another process" in str(error), error
     else:
         sys.exit("it was allowed")
