@@ -1,5 +1,6 @@
 """Composed configs: every experiment composes, and Hydra's errors become sentences."""
 
+import json
 import re
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from framework.configuration.composition import (
 )
 from framework.configuration.settings import check_trainer_keys, settings
 from framework.errors import ConfigError
+from tests.conftest import Framework
 
 EXPERIMENTS = sorted(
     str(path.relative_to(folder() / "experiment").with_suffix(""))
@@ -41,6 +43,40 @@ def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
     settings(values)
     resolved = resolve_all(values)
     assert resolved["metric"], "an experiment reports something"
+
+
+SMOKE_RUNS = {
+    "idiap": "idiap/von_mises",
+    "towncentre": "towncentre/von_mises",
+    "caviar": "caviar/fixed_kappa",
+    "moons": "moons/vanilla_128",
+    "modelnet40": "modelnet40/bps_extra_trees",
+}
+"""An experiment on each data set that is generated in seconds."""
+NOT_RUN = {"coil20", "dales", "registration", "pascal3d"}
+"""The files of two are the user's; the third first makes a body, which takes minutes; test_ranks.py runs the last."""
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_can_be_shortened(name: str) -> None:
+    """By the preset and by hand; an interval of validation beyond the end becomes the end."""
+    from framework.configuration.assembly import resolve_all
+
+    values = plain(composed(f"experiment={name}", "debug=fast"))
+    resolve_all(values)
+    assert values["data"]["name"] in {*SMOKE_RUNS, *NOT_RUN}
+    for epochs in (values["trainer"]["max_epochs"], 2):
+        trainer = settings({**values, "trainer": {**values["trainer"], "max_epochs": epochs}}).trainer
+        assert 1 <= trainer["check_val_every_n_epoch"] <= epochs
+
+
+@pytest.mark.parametrize("data", SMOKE_RUNS)
+def test_a_smoke_run_goes_through_every_stage(data: str, framework: Framework) -> None:
+    run = ("debug=fast", "logger=none", "pictures=false", "samples=50", "threads=1")
+    done = framework(f"experiment={SMOKE_RUNS[data]}", *run)
+    assert done.code == 0, done.out
+    results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+    assert results["data"] == data, results
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

@@ -92,6 +92,9 @@ def settings(config: Mapping[str, Any]) -> Settings:
     values = check(Settings, own, "")
     checked = Settings.model_validate(values)
     _check_trainer(checked.trainer)
+    every, epochs = checked.trainer.get("check_val_every_n_epoch"), checked.trainer.get("max_epochs")
+    if every and epochs:  # a shorter run is validated at its end, too
+        checked.trainer["check_val_every_n_epoch"] = min(every, epochs)
     return checked
 
 
@@ -111,12 +114,6 @@ def _check_trainer(trainer: Mapping[str, Any]) -> None:
             isinstance(value, bool) or not isinstance(value, kind) or not value >= least
         ):
             raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
-    every, epochs = trainer.get("check_val_every_n_epoch") or 1, trainer.get("max_epochs")
-    if epochs is not None and every > epochs:
-        raise ConfigError(
-            f"trainer.check_val_every_n_epoch = {every} exceeds trainer.max_epochs = {epochs}: nothing would ever be "
-            "validated. Lower it."
-        )
     if trainer.get("keep", "best") not in ("best", "last"):
         raise ConfigError(
             f"trainer.keep = {trainer['keep']!r}: wanted `best` (the weights of the lowest validation loss) or `last`."
