@@ -1,5 +1,6 @@
 """Composed configs: every experiment composes, and Hydra's errors become sentences."""
 
+import inspect
 import json
 import re
 import subprocess
@@ -17,7 +18,13 @@ from framework.configuration.composition import (
     register,
     sentence,
 )
-from framework.configuration.settings import check_trainer_keys, settings
+from framework.configuration.settings import (
+    PRECISIONS,
+    STRATEGIES,
+    TRAINER_OURS,
+    TrainerSettings,
+    settings,
+)
 from framework.errors import ConfigError
 from tests.conftest import Framework
 
@@ -143,7 +150,21 @@ def test_core_settings_are_checked(overrides: list[str], message: str) -> None:
 
 def test_an_unknown_trainer_argument_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"Did you mean 'max_steps'\?"):
-        check_trainer_keys({"max_step": 3}, {"max_steps", "devices"})
+        settings({"trainer": {"max_step": 3}})
+
+
+def test_the_trainer_takes_what_lightning_takes() -> None:
+    """The core knows Lightning's names without importing it; what it leaves out it sets itself."""
+    import pytorch_lightning as pl
+
+    known = inspect.signature(pl.Trainer.__init__).parameters
+    ours = {"self", "logger", "callbacks", "plugins", "enable_checkpointing", "use_distributed_sampler"}
+    assert TrainerSettings.model_fields.keys() - TRAINER_OURS == known.keys() - ours - {"default_root_dir"}
+    registered = pl.strategies.StrategyRegistry.available_strategies()
+    assert set(registered) - set(STRATEGIES) <= {name for name in registered if name.startswith("ddp_")}
+    assert set(STRATEGIES) - {"auto"} <= set(registered)
+    for name in PRECISIONS:
+        assert str(name) in str(known["precision"].annotation)
 
 
 @pytest.mark.parametrize(
