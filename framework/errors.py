@@ -37,7 +37,15 @@ def quoted(damage: object) -> str:
     return shown(repr(damage))
 
 
+def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str | None:
+    """The name like `word`, if there is one; 'lr' is like learning_rate."""
+    names = list(islice(known, 1000))
+    near = get_close_matches(shown(word), names, n=1, cutoff=likeness)
+    near = near or [name for name in names if "".join(piece[:1] for piece in name.split("_")) == word]
+    return near[0] if near else None
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """' Did you mean ...?' with a leading space, or nothing where nothing is near."""
-    near = get_close_matches(shown(word), islice(known, 1000), n=1, cutoff=0.5)
-    return f" Did you mean {near[0]!r}?" if near else ""
+    near = nearest(word, known)
+    return f" Did you mean {near!r}?" if near else ""

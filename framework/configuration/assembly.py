@@ -47,6 +47,10 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     outliers = config.get("outliers")
     resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
     require_outliers(resolved)
+    target = getattr(build_data(resolved), "target", None)
+    if target is not None:  # known without reading: what cannot describe it says so now
+        build("density_head", resolved["density_head"], target=target)
+        build_metrics(resolved, target)
     return resolved
 
 

@@ -92,11 +92,15 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
     cls = load(group, config["name"])
     values = {key: value for key, value in config.items() if key != "name"}
     for key, part in parts(cls).items():
-        if values.get(key) is not None:
+        if values.get(key) is None:
+            continue
+        try:
             if part.many:
                 values[key] = [build(part.group, item, **context) for item in values[key]]
             else:
                 values[key] = build(part.group, values[key], **context)
+        except ConfigError as error:  # which the user may never have named
+            raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
     given = []
     for parameter in _positional(cls):
         if parameter.name not in context:
@@ -134,7 +138,8 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
             hint = did_you_mean(str(fault["input"]), expected)
         else:
             hint = ""
-        raise ConfigError(f"{where} = {quoted(fault['input'])}: {fault['msg']}.{hint}") from None
+        message = fault["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{where} = {quoted(fault['input'])}: {message}.{hint}") from None
 
 
 class Part(typing.NamedTuple):

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from framework.configuration.config import Config
+from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
 
 MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
+
+READING = ("test", "predict", "work_precision")
+"""Modes that read `checkpoint`."""
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
@@ -24,7 +28,16 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         raise ConfigError(
             f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}."
         )
-    return import_module(f"framework.modes.{name}").run(Config.of(values, folder, overrides))
+    config = Config.of(values, folder, overrides)
+    if config.settings.checkpoint is not None and name not in READING:
+        raise ConfigError(
+            f"checkpoint={config.settings.checkpoint}: mode={name} reads none, {', '.join(READING)} do. To go "
+            "on with a run that was stopped: resume=<run folder>."
+        )
+    if name == "train":  # what is wrong is found before Lightning is imported, which takes seconds
+        require_device(config.settings.trainer.get("accelerator"))
+        _ = config.parts
+    return import_module(f"framework.modes.{name}").run(config)
 
 
 def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:

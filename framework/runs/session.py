@@ -1,7 +1,6 @@
 """A session: threads, device, and all parts of a command, built and matched before a step is trained."""
 
 import ctypes
-import inspect
 import logging
 import platform
 import warnings
@@ -9,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from rich.console import Console
 
@@ -26,7 +24,7 @@ from framework.configuration.assembly import (
 )
 from framework.configuration.config import Config
 from framework.configuration.schema import resolve
-from framework.configuration.settings import Settings, check_trainer_keys
+from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
 from framework.distributions.noise import seed_step
@@ -140,8 +138,6 @@ def for_training(config: Config) -> Session:
         DataError: as `Data.prepare`.
     """
     console = begin(config.settings)
-    known = set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"}
-    check_trainer_keys(config.settings.trainer, known)
     parts = config.parts
     data = build_data(parts)
     data.prepare()
