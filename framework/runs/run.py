@@ -34,6 +34,7 @@ LEFT_BY_RUNS = (
     "predictions.csv",
     "work_precision.csv",
     "traceback.txt",
+    "unreadable.txt",
 )
 """What modes write into a run folder, but for the journal, which the tracker keeps."""
 
