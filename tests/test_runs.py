@@ -103,11 +103,21 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     killed = framework(*arguments)
     assert killed.code == -signal.SIGKILL
     assert status(killed) == "RUNNING"
-    resumed = framework(f"resume={killed.folder}")
+    resumed = framework(f"resume={killed.folder}", f"workers={2 - workers}", "threads=1")
     assert resumed.code == 0, resumed.out
     assert "resuming from" in resumed.out
     assert killed.losses() == whole.losses()  # one journal holds both lives of the run
     assert status(killed) == "FINISHED"
+
+
+def test_what_a_resumed_run_computes_is_not_changed(
+    framework: Framework, whole: Done, tmp_path: Path
+) -> None:
+    shutil.copytree(whole.folder, tmp_path / "copy")
+    done = framework(f"resume={tmp_path / 'copy'}", "threads=1", "batch_size=4")
+    assert done.code == 2
+    assert "batch_size=4 would change it" in done.out
+    assert "threads, workers, logger.uri may be given" in done.out
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

@@ -22,7 +22,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         ConfigError: an unknown mode, or a fault in the config.
     """
     if values.get("resume") not in ("auto", "never", None):
-        values, overrides = _stored(folder, overrides)
+        values, overrides = _stored(folder, values, overrides)
     name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
     if name not in MODES:
         raise ConfigError(
@@ -40,16 +40,19 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     return import_module(f"framework.modes.{name}").run(config)
 
 
-def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """The config and overrides the run in `folder` was started with: resuming changes neither."""
-    from framework.runs.run import stored_config, stored_overrides
+def _stored(
+    folder: Path, given: dict[str, Any], overrides: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """The config and overrides the run in `folder` was started with, but for how it is run now, which is `given`."""
+    from framework.runs.run import HOW, stored_config, stored_overrides
     from framework.tracking.run_info import read_run_info
 
-    others = [item for item in overrides if not item.startswith("resume=")]
+    keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
+    others = [item for item, key in keys.items() if key not in ("resume", *HOW)]
     if others:
         raise ConfigError(
             f"resume={folder} goes on with that run's own config; {' '.join(others)} would change it. "
-            "Leave them out, or start a new run."
+            f"Leave them out, or start a new run. {', '.join(HOW)} may be given."
         )
     earlier = read_run_info(folder)
     if earlier is not None and earlier.status == "FINISHED":
@@ -59,4 +62,9 @@ def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], lis
     values = stored_config(folder)
     if not isinstance(values, dict):
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
+    for key in HOW:
+        if key in keys.values():
+            group, _, name = key.rpartition(".")
+            into, of = (values[group], given[group]) if group else (values, given)
+            into[name] = of[name]
     return values, stored_overrides(folder)
