@@ -118,3 +118,32 @@ def test_from_the_command_line(framework: Framework, root: Path, tmp_path: Path)
     assert json.loads(run.read_text())["status"] == "FINISHED"
     done = call("encoder=[bps]", *places, "mode.share=0/2")
     assert done.code != 0 and "mode.share" in done.out and "Traceback" not in done.out
+
+
+def test_a_folder_may_hold_other_files_and_a_failure_leaves_nothing(
+    framework: Framework, root: Path, tmp_path: Path
+) -> None:
+    (root / "README").write_text("clouds")
+    (root / "a" / "angles.csv").write_text("file,pan\n00.npy,3\n")
+    (root / "a" / "00.npy").write_bytes(b"damaged")
+    common = (
+        "mode=encode",
+        "data=point_cloud_folder",
+        "logger=none",
+        "encoder=[bps]",
+        "encoder.bps.points=20",
+    )
+    places = (f"mode.files={root}", "mode.into=features", "mode.part=20")
+    failed = framework(*common, *places, folder=None)
+    assert failed.code == 1, failed.out
+    assert "00.npy" in failed.out
+    assert not [*(tmp_path / "features").iterdir()], "what failed says nothing of a later attempt"
+    done = framework(*common, *places, "data.unreadable=skip", folder=None)
+    assert done.code == 0, done.out
+    assert "2 files ignored, being of another kind: README, angles.csv" in done.out
+    assert "1 files left out, since they cannot be read: 00.npy" in done.out
+    features = tmp_path / "features"
+    assert (features / "unreadable.txt").read_text() == "a/00.npy\n"
+    names = (features / "files.txt").read_text().splitlines()
+    assert names == sorted(f"{'ab'[number % 2]}/{number:02}.npy" for number in range(1, 11))
+    assert np.load(features / "part-000000.npy").shape == (10, 20)

@@ -103,11 +103,21 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     killed = framework(*arguments)
     assert killed.code == -signal.SIGKILL
     assert status(killed) == "RUNNING"
-    resumed = framework(f"resume={killed.folder}")
+    resumed = framework(f"resume={killed.folder}", f"workers={2 - workers}", "threads=1")
     assert resumed.code == 0, resumed.out
     assert "resuming from" in resumed.out
     assert killed.losses() == whole.losses()  # one journal holds both lives of the run
     assert status(killed) == "FINISHED"
+
+
+def test_what_a_resumed_run_computes_is_not_changed(
+    framework: Framework, whole: Done, tmp_path: Path
+) -> None:
+    shutil.copytree(whole.folder, tmp_path / "copy")
+    done = framework(f"resume={tmp_path / 'copy'}", "threads=1", "batch_size=4")
+    assert done.code == 2
+    assert "batch_size=4 would change it" in done.out
+    assert "threads, workers, logger.uri may be given" in done.out
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
@@ -347,3 +357,30 @@ def test_a_run_is_named_by_what_tells_it_from_its_neighbours() -> None:
     assert store_experiment({"experiment_name": "faces/mixture"}) == "faces"
     assert store_experiment({"experiment_name": None, "logger": {"experiment": None}}) == "default"
     assert store_experiment({"experiment_name": "a/b", "logger": {"experiment": "mine"}}) == "mine"
+
+
+def test_predictions_of_a_folder_leave_out_what_is_no_input(framework: Framework, tmp_path: Path) -> None:
+    from PIL import Image
+
+    model = ("encoder=[biternion_vgg]", "density_head=von_mises", "metric=[log_likelihood]", "samples=10")
+    small = ("debug=fast", "data=caviar", "data.image_size=32", "pictures=false", "threads=1", "logger=none")
+    trained = framework(*small, *model, folder="trained")
+    assert trained.code == 0, trained.out
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name in ("one", "two"):
+        Image.new("RGB", (30, 30), "red").save(folder / f"{name}.png")
+    (folder / "broken.png").write_bytes(b"no picture")
+    for name in ("README", "angles.csv", ".hidden.png"):
+        (folder / name).write_text("file,gaze\none.png,3\n")
+    predict = ("mode=predict", f"checkpoint={trained.folder}", f"mode.files={folder}", "logger=none")
+    refused = framework(*predict, folder="predicted")
+    assert refused.code == 1
+    assert "broken.png" in refused.out
+    skip = ("data=caviar", "data.image_size=32", "data.skip_unreadable=true")
+    done = framework(*predict, *skip, folder="predicted")
+    assert done.code == 0, done.out
+    assert "3 files ignored, being of another kind" in done.out
+    assert (done.folder / "unreadable.txt").read_text() == f"{folder / 'broken.png'}\n"
+    rows = (done.folder / "predictions.csv").read_text().splitlines()[1:]
+    assert [row.partition(",")[0] for row in rows] == [str(folder / "one.png"), str(folder / "two.png")]

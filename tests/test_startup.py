@@ -32,3 +32,10 @@ def test_asking_imports_nothing_heavy_and_no_plugin(arguments: tuple[str, ...], 
     assert not HEAVY & {name.partition(".")[0] for name in modules}
     assert not [name for name in modules if name.startswith("plugins.")]
     assert list(tmp_path.iterdir()) == [], "asking leaves nothing behind"
+
+
+@pytest.mark.parametrize("mistake", ["density_head=scvae", "trainer.strategy=dpp", "encoder.mlp.widths=[0]"])
+def test_a_mistake_is_found_before_what_trains_is_imported(mistake: str, tmp_path: Path) -> None:
+    done = listed("experiment=moons/vanilla_128", mistake, folder=tmp_path)
+    assert done.code == 2, done.out
+    assert not {"pytorch_lightning", "mlflow"} & done.modules

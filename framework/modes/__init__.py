@@ -1,5 +1,6 @@
 """What a command line can ask for; each mode is a module of its own, imported when it is chosen."""
 
+import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +23,9 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         ConfigError: an unknown mode, or a fault in the config.
     """
     if values.get("resume") not in ("auto", "never", None):
-        values, overrides = _stored(folder, overrides)
+        if _sent_the_rest(folder, (values.get("logger") or {}).get("uri")):
+            return None
+        values, overrides = _stored(folder, values, overrides)
     name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
     if name not in MODES:
         raise ConfigError(
@@ -40,16 +43,37 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     return import_module(f"framework.modes.{name}").run(config)
 
 
-def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """The config and overrides the run in `folder` was started with: resuming changes neither."""
-    from framework.storage.plain_values import read_yaml
-    from framework.tracking.run_info import read_run_info
+def _sent_the_rest(folder: Path, store: str | None) -> bool:
+    """Send what a run that finished could not send, since its process was killed meanwhile; whether there was any."""
+    from framework.tracking.ended import sync
+    from framework.tracking.run_info import read_run_info, require_own_store
 
-    others = [item for item in overrides if not item.startswith("resume=")]
+    info = read_run_info(folder)
+    if info is None or info.status != "FINISHED" or not info.uri:
+        return False
+    require_own_store(info.uri, store, folder / "run.json")
+    sent = sync(folder)
+    if sent:
+        sys.stdout.write(
+            f"that run had finished; {sent} lines of its journal that were not sent yet are in its store.\n"
+        )
+    return sent > 0
+
+
+def _stored(
+    folder: Path, given: dict[str, Any], overrides: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """The config and overrides the run in `folder` was started with, but for how it is run now, which is `given`."""
+    from framework.runs.run import HOW
+    from framework.storage.plain_values import read_yaml
+    from framework.tracking.run_info import read_run_info, require_own_store
+
+    keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
+    others = [item for item, key in keys.items() if key not in ("resume", *HOW)]
     if others:
         raise ConfigError(
             f"resume={folder} goes on with that run's own config; {' '.join(others)} would change it. "
-            "Leave them out, or start a new run."
+            f"Leave them out, or start a new run. {', '.join(HOW)} may be given."
         )
     earlier = read_run_info(folder)
     if earlier is not None and earlier.status == "FINISHED":
@@ -66,4 +90,11 @@ def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], lis
         or not all(isinstance(item, str) for item in (*values, *changed))
     ):
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
+    store = (given["logger"] or {}).get("uri") if "logger.uri" in keys.values() else None
+    require_own_store(str((values.get("logger") or {}).get("uri") or ""), store, folder / "config.yaml")
+    for key in HOW:
+        if key in keys.values():
+            group, _, name = key.rpartition(".")
+            into, of = (values[group], given[group]) if group else (values, given)
+            into[name] = of[name]
     return values, changed

@@ -4,7 +4,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +21,7 @@ from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.runs.run import opened
 from framework.runs.session import begin, record_citations
+from framework.runs.user_files import UNREADABLE, to_read
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.training.batches import Batches
@@ -83,11 +84,26 @@ def run(config: Config) -> None:
     if not parts["encoder"]:
         raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
     collection = collected(Path(options.files).expanduser(), Path(options.into).expanduser(), options.part)
+    files = [collection.root / name for name in collection.names]
+    kept, bad = to_read(build("data", parts["data"]), files, parts["data"], console)
+    collection = replace(collection, names=[file.relative_to(collection.root).as_posix() for file in kept])
     mine = share(collection.parts, options.share)
     with opened(config) as run:
         record_citations(run, parts)
         describe(collection, parts)
-        written = encode(collection, parts, mine, config.settings)
+        try:
+            written = encode(collection, parts, mine, config.settings)
+        except BaseException:
+            if (
+                len(collection.missing()) == collection.parts
+            ):  # nothing is described: another attempt may differ
+                for name in (DESCRIPTION, NAMES):
+                    (collection.into / name).unlink(missing_ok=True)
+            raise
+        describe(collection, parts)  # again, where another job failed meanwhile
+        if bad:
+            left_out = "".join(f"{file.relative_to(collection.root).as_posix()}\n" for file in bad)
+            write_whole(collection.into / UNREADABLE, left_out.encode())
         left = len(collection.missing())
         console.print(
             f"{written} parts written, {len(mine) - written} of this job's {len(mine)} were there; "

@@ -21,6 +21,7 @@ from framework.model import Predictor
 from framework.prediction import Prediction
 from framework.runs.run import opened
 from framework.runs.session import for_trained
+from framework.runs.user_files import UNREADABLE, to_read
 from framework.target import Target
 
 
@@ -35,7 +36,12 @@ def run(config: Config) -> None:
     wanted = config.options(PredictOptions).files
     files = _files(Path(wanted).expanduser()) if wanted else []
     session = for_trained(config, prepare=not files)
+    bad: list[Path] = []
+    if len(files) > 1:
+        files, bad = to_read(session.data, files, session.parts["data"], session.console)
     with opened(session.config) as run:
+        if bad:
+            (run.folder / UNREADABLE).write_text("".join(f"{file}\n" for file in bad), encoding="utf-8")
         rows = predictions(session.predictor, session.data, session.target, files, session.settings)
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:

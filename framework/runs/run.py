@@ -35,8 +35,11 @@ LEFT_BY_RUNS = (
     "predictions.csv",
     "work_precision.csv",
     "traceback.txt",
+    "unreadable.txt",
 )
 """What modes write into a run folder, but for the journal, which the tracker keeps."""
+HOW = ("threads", "workers", "logger.uri")
+"""Keys that say how a run is run and not what it computes: a resumed one may be given others."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,11 @@ def _begin_folder(config: Config) -> None:
 def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
     if stored is None:
         return False
-    return {**stored, "resume": None} == {**values, "resume": None}
+    one, two = (
+        {key: value for key, value in flatten(config).items() if key not in ("resume", *HOW)}
+        for config in (stored, values)
+    )
+    return one == two
 
 
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
