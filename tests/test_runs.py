@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from framework.configuration.settings import Settings, store_experiment
 from framework.runs.run import run_name
@@ -384,3 +385,30 @@ def test_predictions_of_a_folder_leave_out_what_is_no_input(framework: Framework
     assert (done.folder / "unreadable.txt").read_text() == f"{folder / 'broken.png'}\n"
     rows = (done.folder / "predictions.csv").read_text().splitlines()[1:]
     assert [row.partition(",")[0] for row in rows] == [str(folder / "one.png"), str(folder / "two.png")]
+
+
+def test_a_run_killed_while_it_was_closed_is_sent_by_resume(framework: Framework) -> None:
+    done = framework(*TINY, "trainer.max_epochs=1")
+    assert done.code == 0, done.out
+    info = json.loads((done.folder / "run.json").read_text(encoding="utf-8"))
+    with closing(sqlite3.connect(store_of(done))) as store:
+        store.execute("update runs set status = 'RUNNING'")
+        store.commit()
+    (done.folder / "run.json").write_text(json.dumps({**info, "sent": info["sent"] - 2}), encoding="utf-8")
+    resumed = framework(f"resume={done.folder}")
+    assert resumed.code == 0, resumed.out
+    assert "2 lines of its journal" in resumed.out
+    assert stored_statuses(done) == ["FINISHED"]
+    again = framework(f"resume={done.folder}")
+    assert again.code == 2
+    assert "that run has finished" in again.out
+
+
+def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: Framework) -> None:
+    killed = framework(*QUIET, "+data.signal_at=2", "+data.signal_number=9", "+data.signal_marker=marker")
+    config = yaml.safe_load((killed.folder / "config.yaml").read_text(encoding="utf-8"))
+    config["logger"] = {"name": "mlflow", "uri": "https://attacker.example", "experiment": None}
+    (killed.folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 2, resumed.out
+    assert "If that is where you keep runs, say so: add logger.uri=https://attacker.example" in resumed.out
