@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -29,7 +30,8 @@ class Boxes:
     Attributes:
         value: (node, rows, number), where the density was evaluated last; log_prob: (node, rows), nats.
         weight: (node, rows) volume of each node. Σ weight · exp(log_prob) is the integral.
-        border: of one number (box + 1, rows) ascending, mass (box, rows) between them; values, not map coordinates.
+        border: of one number (box + 1, rows) ascending, mass (box, rows) between them.
+        way: the coordinates in which boxes are cut.
     """
 
     value: Tensor
@@ -37,6 +39,7 @@ class Boxes:
     weight: Tensor
     border: Tensor
     mass: Tensor
+    way: "_Map"
 
     def mean(self, of: Tensor) -> Tensor:
         """∫ p f of f (node, rows)."""
@@ -46,6 +49,20 @@ class Boxes:
     def entropy(self) -> Tensor:
         return -self.mean(self.log_prob)
 
+    def below(self, value: Tensor) -> Tensor:
+        """Mass from the first border to `value` (several, rows) of one number; of angles from half a turn before the
+        mode."""
+        place = self.way.back(value.unsqueeze(-1))
+        border = self.way.back(self.border.unsqueeze(-1))[..., 0]
+        border[0], border[-1] = (end[:, 0] for end in self.way.ends)
+        box = torch.searchsorted(border.T.contiguous(), place[..., 0].T.contiguous()).T.clamp(
+            1, len(border) - 1
+        )
+        low = border.gather(0, box - 1).unsqueeze(-1)
+        _, log_prob, weight = _nodes(self.way, low, place, RULES[1][0])
+        before = torch.cat([torch.zeros_like(self.mass[:1]), self.mass.cumsum(0)]).gather(0, box - 1)
+        return before + (weight * log_prob.exp()).sum(1)
+
 
 class _Map:
     """Coordinates in which boxes are cut → values: sinh along the density's own axes, in its own widths."""
@@ -54,13 +71,21 @@ class _Map:
         self.density = density
         self.mode = density.mode.double()
         self.angles = isinstance(density.support, Circular)
+        self.chart = isinstance(density.support, Circular) and density.support.ranges is not None
+        if self.chart:
+            self.mode = wrap(self.mode)
         self.scale = self._widths()
         self.slope = torch.zeros_like(self.mode[:, 0])
         if not self.angles and self.mode.shape[1] == 2:
             self._whiten()
-        self.end = torch.full_like(self.mode, REACH)
-        if self.angles:
-            self.end = (math.pi / self.scale).asinh()
+        end = torch.full_like(self.mode, REACH)
+        self.ends = -end, end
+        if isinstance(density.support, Circular):
+            turn = [(-math.pi, math.pi)] * self.mode.shape[1]
+            first, last = torch.tensor(density.support.ranges or turn, dtype=torch.float64).T
+            if density.support.ranges is None:
+                first, last = first + self.mode, last + self.mode
+            self.ends = ((first - self.mode) / self.scale).asinh(), ((last - self.mode) / self.scale).asinh()
 
     def log_prob(self, value: Tensor) -> Tensor:
         like = self.density.sample(torch.Size((0,)))
@@ -76,7 +101,9 @@ class _Map:
             axis[number] = 1
             there = self.mode + steps[:, None, None] * axis
             fallen = (top - self.log_prob(there) > 0.5).int()
-            first = torch.where(fallen.amax(0) > 0, fallen.argmax(0), 40)  # a width of 1 where it does not fall
+            first = torch.where(
+                fallen.amax(0) > 0, fallen.argmax(0), 40
+            )  # a width of 1 where it does not fall
             found.append(steps[first])
         return torch.stack(found, -1)
 
@@ -108,12 +135,12 @@ class _Map:
 
     def back(self, value: Tensor) -> Tensor:
         """Coordinates of values."""
-        offset = value.double() - self.mode
-        if self.angles:
+        offset = (wrap(value.double()) if self.chart else value.double()) - self.mode
+        if self.angles and not self.chart:
             offset = wrap(offset)
         if offset.shape[-1] == 2:
             offset = torch.stack([offset[..., 0], offset[..., 1] - self.slope * offset[..., 0]], -1)
-        return (offset / self.scale).asinh().clamp(-self.end, self.end)
+        return (offset / self.scale).asinh().clamp(*self.ends)
 
 
 def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
@@ -124,6 +151,7 @@ def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
     return nodes, weights
 
 
+@lru_cache(maxsize=4)
 def boxes(density: Distribution) -> Boxes:
     """The density of one or two numbers, batch_shape (rows,), in boxes on which two rules agree.
 
@@ -137,12 +165,15 @@ def boxes(density: Distribution) -> Boxes:
     height = way.log_prob(seen)
     place = way.back(seen)
     side = 8 if numbers == 1 else 4
-    cut = torch.linspace(-1, 1, side + 1, dtype=torch.float64)
-    low = torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * way.end
-    high = torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * way.end
+    cut = torch.linspace(0, 1, side + 1, dtype=torch.float64)
+    length = way.ends[1] - way.ends[0]
+    low = way.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
+    high = way.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
     parts = _summed(way, low, high, place, height)
+    # float32 does not agree with itself to more digits
+    tolerance = TOLERANCE[numbers] if density.log_prob(density.mode).dtype == torch.float64 else 1e-4
     for _ in range(ROUNDS[numbers]):
-        split = int((parts[3] > TOLERANCE[numbers]).sum(0).max())
+        split = int((parts[3] > tolerance).sum(0).max())
         if split == 0:
             break
         split = min(split, MOST[numbers])
@@ -155,7 +186,9 @@ def boxes(density: Distribution) -> Boxes:
             lows.append(torch.where(upper, middle, low))
             highs.append(torch.where(upper, high, middle))
         fresh = _summed(way, torch.cat(lows), torch.cat(highs), place, height)
-        parts = tuple(torch.cat([_taken(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True))
+        parts = tuple(
+            torch.cat([_taken(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
+        )
     return _gathered(way, *parts[:3])
 
 
@@ -203,4 +236,4 @@ def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
         mass = mass.gather(0, order)
         ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
         border = way.to(ends.unsqueeze(-1))[0][..., 0]
-    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass)
+    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, way)
