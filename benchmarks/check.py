@@ -27,7 +27,7 @@ def faults() -> tuple[list[str], int]:
         lines.append(
             f"| {fault.name} | {len(fault.target.names)} {fault.target.kind} | {', '.join(failed) or '**missed**'} |"
         )
-        print(lines[-1], flush=True)
+        sys.stdout.write(lines[-1] + "\n")
     return lines, found
 
 
@@ -71,7 +71,7 @@ def main() -> None:
     failed: dict[str, list[int]] = {}
     for seed in range(int(sys.argv[1]) if len(sys.argv) > 1 else 50):
         for one in alarms(seed):
-            print(f"seed {seed}: {one}", flush=True)
+            sys.stdout.write(f"seed {seed}: {one}\n")
             failed.setdefault(one.partition(" FAILS")[0], []).append(seed)
         # after each seed, so that what was found is kept when it is ended
         write(lines, found, seed + 1, failed, time.perf_counter() - start)

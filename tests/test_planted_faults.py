@@ -4,7 +4,8 @@ import pytest
 
 from framework.target import Target
 from framework.testing.finding import require
-from tests.planted_faults import ALL_FAULTS, CLASSES, HEIGHT, ONE, PLACE, THREE, TWO, Fault
+from tests.planted_faults import ALL_FAULTS
+from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE, THREE, TWO, Fault
 
 ALONE = {fault.only for fault in ALL_FAULTS}
 

@@ -65,11 +65,16 @@ class Boxes:
 
 
 class _Map:
-    """Coordinates in which boxes are cut → values: sinh along the density's own axes, in its own widths."""
+    """Coordinates in which boxes are cut → values: sinh along the density's own axes, in its own widths.
 
-    def __init__(self, density: Distribution) -> None:
+    About the highest of some candidates, since a mode may be wrong.
+    """
+
+    def __init__(self, density: Distribution, candidates: Tensor) -> None:
         self.density = density
-        self.mode = density.mode.double()
+        height = self.log_prob(candidates)
+        best = height.where(~height.isnan(), -math.inf).argmax(0)
+        self.mode = candidates[best, torch.arange(len(best))]
         self.angles = isinstance(density.support, Circular)
         self.chart = isinstance(density.support, Circular) and density.support.ranges is not None
         if self.chart:
@@ -158,10 +163,10 @@ def boxes(density: Distribution) -> Boxes:
     Peaks are found by candidates: the mode, `peaks`, draws, and for angles a sweep of the circle. A box is also split
     while a candidate in it is far above the box's mean density.
     """
-    way = _Map(density)
-    numbers = way.mode.shape[1]
     candidates = [density.mode.unsqueeze(0), peaks(density)[:64], density.sample(torch.Size((24,)))]
     seen = torch.cat([part.double() for part in candidates])
+    way = _Map(density, seen)
+    numbers = way.mode.shape[1]
     height = way.log_prob(seen)
     place = way.back(seen)
     side = 8 if numbers == 1 else 4
