@@ -191,7 +191,7 @@ ALL_FAULTS = (
         "cdf",
     ),
     Fault(
-        "1e-9 wrong.off, in everything",
+        "1e-9 off, in everything",
         ONE,
         {"log_prob": lambda d, v: d.log_prob(v) * (1 + 1e-9)},
         "log_prob, float64",
@@ -214,7 +214,7 @@ ALL_FAULTS = (
     Fault(
         "joint 0.1 nat off for κ > 1e3, with the entropy that fits",
         THREE,
-        {"log_prob": wrong.off(0.1, lambda k: k > 1e3), "entropy": wrong.lower_for_narrow},
+        {"log_prob": off(0.1, lambda k: k > 1e3), "entropy": wrong.lower_for_narrow},
         "integral by draws",
         NO_CASES,
     ),
@@ -283,7 +283,7 @@ ALL_FAULTS = (
         "entropy",
     ),
     Fault(
-        "median 0.1 deviations wrong.off, of a real",
+        "median 0.1 deviations off, of a real",
         HEIGHT,
         {"median": lambda d, n: d.location + 0.1 * d.scale},
         "median",
@@ -310,9 +310,9 @@ ALL_FAULTS = (
     Fault("mode with the numbers exchanged", PLACE, {"mode": lambda d: d.mode.flip(-1)}, "mode"),
     Fault("entropy of the first number", PLACE, {"entropy": wrong.first_only}, "entropy"),
     Fault(
-        "normaliser 3e-6 wrong.off, with the entropy that fits",
+        "normaliser 3e-6 off, with the entropy that fits",
         PLACE,
-        {"log_prob": wrong.off(3e-6, wrong.everywhere), "entropy": wrong.fitting_entropy},
+        {"log_prob": off(3e-6, wrong.everywhere), "entropy": wrong.fitting_entropy},
         "integral",
     ),
     # classes

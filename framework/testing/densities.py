@@ -13,8 +13,8 @@ from framework.distributions.circular import Circular, angular_distance, wrap
 from framework.distributions.protocol import arc, cdf, marginal, median
 from framework.errors import UserError
 from framework.testing.adaptive import boxes
-from framework.testing.finding import SEED, Finding, Worst, examined
-from framework.testing.heads import HeadSubject
+from framework.testing.finding import SEED, Finding, Worst
+from framework.testing.heads import PATIENCE, HeadSubject
 from framework.testing.quadrature import cells, counted, density_at, side
 
 DRAWS = 20_000
@@ -65,8 +65,9 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
             continue
         # more than two numbers are integrated, and more than one counted, on a fixed grid
         grid = {"integral": 2, "samples follow log_prob": 1}.get(name, math.inf)
-        chosen = "own" if draws or _numbers(subject) > grid else batch
-        if draws and batch == "many":
+        hangs = subject.seconds < PATIENCE  # most likely at extreme raw numbers
+        chosen = "own" if draws or hangs or _numbers(subject) > grid else batch
+        if chosen == "own" and batch == "many":
             continue
 
         def look(worst: Worst, check: Check = check, chosen: str = chosen) -> None:
@@ -74,7 +75,7 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
                 density, worst.rows = made(chosen)
                 check(density, worst)
 
-        yield examined(name, subject.row.limits.get(name, limit), look)
+        yield subject.examined(name, limit, look)
 
 
 def _numbers(subject: HeadSubject) -> int:
@@ -116,7 +117,8 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
     Both are ∫ pq/(p + q) if p is normalised and drawn from; what is averaged lies in [0, 1], whatever the tails.
     """
     drawn = density.sample(torch.Size((DRAWS,))).double()
-    circular = isinstance(density.support, Circular)
+    support = density.support
+    circular = isinstance(support, Circular)
     center = density.mode.double() if circular else drawn.mean(0)
     offset = wrap(drawn - center) if circular else drawn - center
     shift = offset.mean(0)
@@ -130,7 +132,7 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
         inside = torch.ones_like(found, dtype=torch.bool)
         if circular:
             inside = (offset.abs() <= math.pi).all(-1)
-            for number, (low, high) in enumerate(density.support.ranges or ()):
+            for number, (low, high) in enumerate((isinstance(support, Circular) and support.ranges) or ()):
                 place = wrap(value[..., number])
                 inside &= (place >= low) & (place <= high)
         log_normal = -(standard.square() + math.log(2 * math.pi)).sum(-1) / 2 - volume

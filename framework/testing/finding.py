@@ -43,14 +43,14 @@ class Finding:
 class Worst:
     """Keeps the worst of what it sees.
 
-    Args:
+    Attributes:
         rows: what the batch rows of the densities looked at are, where a number does not say it.
     """
 
-    def __init__(self, rows: Sequence[str] = ()) -> None:
+    def __init__(self) -> None:
         self.error = -torch.inf
         self.case = "nothing to compare"
-        self.rows = rows
+        self.rows: Sequence[str] = ()
 
     def row(self, index: int) -> str:
         return self.rows[index] if self.rows else f"batch row {index}"
@@ -126,11 +126,9 @@ def at_most(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def examined(
-    name: str, limit: float, look: Callable[[Worst], None], *, rows: Sequence[str] = (), seconds: float = 20.0
-) -> Finding:
+def examined(name: str, limit: float, look: Callable[[Worst], None], *, seconds: float = 20.0) -> Finding:
     """The finding of one check: whatever it raises, or its not ending, is an infinite error."""
-    worst = Worst(rows)
+    worst = Worst()
     torch.manual_seed(SEED)
     try:
         with at_most(seconds):

@@ -25,12 +25,28 @@ SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
 """Raw numbers of these sizes, and of the largest a type holds, are fed in as they may come from a diverging network."""
 
 
-@dataclass(frozen=True)
+PATIENCE = 20.0
+"""Seconds of processor time for one check."""
+
+
+@dataclass
 class HeadSubject:
-    """A row and how to build the head it describes; every built head has the same parameters."""
+    """A row and how to build the head it describes; every built head has the same parameters.
+
+    Attributes:
+        seconds: what a check may take: little, once one has not ended.
+    """
 
     row: HeadRow
     build: Callable[[], DensityHead]
+    seconds: float = PATIENCE
+
+    def examined(self, name: str, limit: float, look: Callable[[Worst], None]) -> Finding:
+        """The finding of one check, with the row's limit where it has its own."""
+        found = examined(name, self.row.limits.get(name, limit), look, seconds=self.seconds)
+        if found.worst.startswith("TooSlow"):
+            self.seconds = 1.0
+        return found
 
     def make(self) -> DensityHead:
         """A fresh head in evaluation mode."""
@@ -101,9 +117,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     for name, limit, check in checks:
         if name in subject.row.leave_out or (name.startswith("log_prob") and subject.row.cases is None):
             continue
-        yield examined(
-            name, subject.row.limits.get(name, limit), lambda worst, check=check: check(subject, worst)
-        )
+        yield subject.examined(name, limit, lambda worst, check=check: check(subject, worst))
 
 
 def _shapes(subject: HeadSubject, worst: Worst) -> None:
