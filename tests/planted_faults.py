@@ -214,7 +214,7 @@ ALL_FAULTS = (
     Fault(
         "joint 0.1 nat off for κ > 1e3, with the entropy that fits",
         THREE,
-        {"log_prob": off(0.1, lambda k: k > 1e3), "entropy": wrong.lower_for_narrow},
+        {"log_prob": wrong.off(0.1, lambda k: k > 1e3), "entropy": wrong.lower_for_narrow},
         "integral by draws",
         NO_CASES,
     ),
@@ -312,7 +312,7 @@ ALL_FAULTS = (
     Fault(
         "normaliser 3e-6 off, with the entropy that fits",
         PLACE,
-        {"log_prob": off(3e-6, wrong.everywhere), "entropy": wrong.fitting_entropy},
+        {"log_prob": wrong.off(3e-6, wrong.everywhere), "entropy": wrong.fitting_entropy},
         "integral",
     ),
     # classes
