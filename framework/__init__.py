@@ -29,6 +29,10 @@ def __getattr__(name: str) -> object:
     raise AttributeError(f"module 'framework' has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 class _Moved(MetaPathFinder, Loader):
     """Old names of modules that plugins import: each is the module that is at its new place, not a copy of it."""
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from itertools import islice
 
 
 class UserError(Exception):
@@ -24,7 +25,27 @@ class NonFiniteLoss(UserError):
     """The training loss became NaN or infinite; raised before the optimiser steps."""
 
 
+def shown(damage: object, most: int = 200) -> str:
+    """What a file holds, or what a library says of it, for a message: cut, and without what steers a terminal."""
+    text = " ".join(line.strip() for line in str(damage).splitlines())
+    text = text if len(text) <= most else text[: most - 1] + "…"
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
+def quoted(damage: object) -> str:
+    """The same in quotation marks."""
+    return shown(repr(damage))
+
+
+def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str | None:
+    """The name like `word`, if there is one; 'lr' is like learning_rate."""
+    names = list(islice(known, 1000))
+    near = get_close_matches(shown(word), names, n=1, cutoff=likeness)
+    near = near or [name for name in names if "".join(piece[:1] for piece in name.split("_")) == word]
+    return near[0] if near else None
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """' Did you mean ...?' with a leading space, or nothing where nothing is near."""
-    near = get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f" Did you mean {near[0]!r}?" if near else ""
+    near = nearest(word, known)
+    return f" Did you mean {near!r}?" if near else ""

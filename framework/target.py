@@ -45,5 +45,5 @@ class Target:
         if self.kind != kind:
             raise ConfigError(
                 f"{by} describes targets of kind {kind!r}, but this data set's are {self.kind!r} "
-                f"({self.told}). Choose another density_head, or other data."
+                f"({self.told}). Choose another one, or other data."
             )

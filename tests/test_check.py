@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.errors import ConfigError
 from framework.testing import contract as contracts
 from framework.testing.finding import Finding, Worst, examined, require
 from tests.conftest import Framework
@@ -88,6 +89,17 @@ def test_a_plugin_without_rows_is_tried_with_every_target(monkeypatch: pytest.Mo
         rows = contracts.contract("density_head", "von_mises", config).rows
         assert [row.name for row in rows] == [f"{label}, {angles} of kind angle" for angles in (1, 3)]
         assert [row.config.get("concentration") for row in rows] == [config and config["concentration"]] * 2
+
+
+def test_a_further_row_has_the_target_that_its_parts_ask_for() -> None:
+    """A floor under rotations, by name or with keys of its own, and under one angle: never a row that is refused."""
+    for component, kind in (("matrix_fisher", 3), ("von_mises", 1), ("categorical", 3)):
+        config = {"weight": 0.3, "component": {"name": component}}
+        first, *_ = contracts.contract("density_head", "uniform_floor", config).rows
+        assert first.name == "as configured" and len(first.target.names) == kind
+        assert ("mode" in first.leave_out) == (component == "matrix_fisher")
+    with pytest.raises(ConfigError, match="gaussian"):
+        contracts.contract("density_head", "uniform_floor", {"component": {"name": "gaussian"}})
 
 
 def test_nothing_chosen_is_refused(framework: Framework) -> None:

@@ -66,3 +66,10 @@ def test_wrapped_angle_is_the_same_angle_in_range(angle: float) -> None:
 def test_wrap_stays_below_pi_at_the_seam(dtype: torch.dtype) -> None:
     near = torch.tensor([-math.pi, math.pi, math.nextafter(-math.pi, -4), 3 * math.pi, -1e-30], dtype=dtype)
     assert bool((wrap(near) < math.pi).all())
+
+
+def test_the_median_of_what_is_not_finite_is_not_a_number() -> None:
+    for bad in (math.nan, math.inf, -math.inf):
+        samples = torch.tensor([[0.1, 0.1], [bad, 0.2], [0.3, 0.3]])
+        found = circular_median(samples)
+        assert found.isnan().tolist() == [True, False] and found[1] == circular_median(samples[:, 1])

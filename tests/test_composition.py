@@ -1,5 +1,7 @@
 """Composed configs: every experiment composes, and Hydra's errors become sentences."""
 
+import inspect
+import json
 import re
 import subprocess
 import sys
@@ -16,8 +18,15 @@ from framework.configuration.composition import (
     register,
     sentence,
 )
-from framework.configuration.settings import check_trainer_keys, settings
+from framework.configuration.settings import (
+    PRECISIONS,
+    STRATEGIES,
+    TRAINER_OURS,
+    TrainerSettings,
+    settings,
+)
 from framework.errors import ConfigError
+from tests.conftest import Framework
 
 EXPERIMENTS = sorted(
     str(path.relative_to(folder() / "experiment").with_suffix(""))
@@ -41,6 +50,40 @@ def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
     settings(values)
     resolved = resolve_all(values)
     assert resolved["metric"], "an experiment reports something"
+
+
+SMOKE_RUNS = {
+    "idiap": "idiap/von_mises",
+    "towncentre": "towncentre/von_mises",
+    "caviar": "caviar/fixed_kappa",
+    "moons": "moons/vanilla_128",
+    "modelnet40": "modelnet40/bps_extra_trees",
+}
+"""An experiment on each data set that is generated in seconds."""
+NOT_RUN = {"coil20", "dales", "registration", "pascal3d"}
+"""The files of two are the user's; the third first makes a body, which takes minutes; test_ranks.py runs the last."""
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_can_be_shortened(name: str) -> None:
+    """By the preset and by hand; an interval of validation beyond the end becomes the end."""
+    from framework.configuration.assembly import resolve_all
+
+    values = plain(composed(f"experiment={name}", "debug=fast"))
+    resolve_all(values)
+    assert values["data"]["name"] in {*SMOKE_RUNS, *NOT_RUN}
+    for epochs in (values["trainer"]["max_epochs"], 2):
+        trainer = settings({**values, "trainer": {**values["trainer"], "max_epochs": epochs}}).trainer
+        assert 1 <= trainer["check_val_every_n_epoch"] <= epochs
+
+
+@pytest.mark.parametrize("data", SMOKE_RUNS)
+def test_a_smoke_run_goes_through_every_stage(data: str, framework: Framework) -> None:
+    run = ("debug=fast", "logger=none", "pictures=false", "samples=50", "threads=1")
+    done = framework(f"experiment={SMOKE_RUNS[data]}", *run)
+    assert done.code == 0, done.out
+    results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+    assert results["data"] == data, results
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -107,7 +150,21 @@ def test_core_settings_are_checked(overrides: list[str], message: str) -> None:
 
 def test_an_unknown_trainer_argument_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"Did you mean 'max_steps'\?"):
-        check_trainer_keys({"max_step": 3}, {"max_steps", "devices"})
+        settings({"trainer": {"max_step": 3}})
+
+
+def test_the_trainer_takes_what_lightning_takes() -> None:
+    """The core knows Lightning's names without importing it; what it leaves out it sets itself."""
+    import pytorch_lightning as pl
+
+    known = inspect.signature(pl.Trainer.__init__).parameters
+    ours = {"self", "logger", "callbacks", "plugins", "enable_checkpointing", "use_distributed_sampler"}
+    assert TrainerSettings.model_fields.keys() - TRAINER_OURS == known.keys() - ours - {"default_root_dir"}
+    registered = pl.strategies.StrategyRegistry.available_strategies()
+    assert set(registered) - set(STRATEGIES) <= {name for name in registered if name.startswith("ddp_")}
+    assert set(STRATEGIES) - {"auto"} <= set(registered)
+    for name in PRECISIONS:
+        assert str(name) in str(known["precision"].annotation)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from importlib import import_module
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -51,12 +52,12 @@ WARM = torch.tensor(1.7, dtype=torch.float64)
 class Made:
     """One head's densities over a batch of 4, each from raw numbers of its own: the same of the same seed."""
 
-    def __init__(self, name: str, row: HeadRow, seed: int = 0) -> None:
+    def __init__(self, name: str, row: HeadRow, seed: int = 0, spread: float = 1.0) -> None:
         torch.manual_seed(0)
         config = resolve("density_head", {"name": name, **row.config})
         head = ready(build("density_head", config, target=row.target).double(), row.target).eval()
         torch.manual_seed(1)
-        raws = torch.randn(3, BATCH, head.size, dtype=torch.float64)
+        raws = spread * torch.randn(3, BATCH, head.size, dtype=torch.float64)
         torch.manual_seed(100 + seed)
         self.parts = [head(raw) for raw in raws]
         self.target = row.target
@@ -101,6 +102,11 @@ class Made:
         return self.target.kind == "angle" and len(self.target.names) == 1
 
 
+def restricted(name: str, row: HeadRow) -> bool:
+    """Whether the head's densities are spread over a part of the torus."""
+    return Made(name, row).parts[0].support.ranges is not None
+
+
 def with_set(target: Target) -> type:
     """The type of density that the conformal wrapper predicts."""
     wrapper = build(
@@ -114,7 +120,7 @@ def floored(density: Distribution, target: Target) -> Distribution:
     component = "categorical" if target.kind == "class" else "von_mises"
     config = {"name": "uniform_floor", "component": {"name": component}, "weight": 0.1}
     head = build("density_head", resolve("density_head", config), target=target)
-    return type(head(torch.zeros(1, head.size)))(density, head.weight, head.log_uniform)
+    return type(head(torch.zeros(1, head.size)))(density, head.weight)
 
 
 def share(weights: Tensor) -> Tensor:
@@ -170,9 +176,20 @@ def log_mixed(name: str, made: Made, log_prob) -> Tensor | None:
             return (share(made.weights[:2, :2]) * both).sum(-1).log()
         case "floored":
             count = len(made.target.names)
-            uniform = 1 / count if made.target.kind == "class" else (2 * math.pi) ** -len(event(made))
+            uniform = 1 / count if made.target.kind == "class" else everywhere(made.parts[0], made.value)
             return (0.9 * parts[:, 0] + 0.1 * uniform).log()
     return None
+
+
+def everywhere(density: Distribution, value: Tensor, index: int | None = None) -> Tensor | float:
+    """Height of the uniform law over the support, or of one number's marginal of it: of rotations with elevations e
+    within a quarter turn cos e / 8π²."""
+    several = density.event_shape[0]
+    if density.support.ranges is None:
+        return (2 * math.pi) ** -(several if index is None else 1)
+    assert several == 3
+    cosine = value[..., 1].double().cos().abs()
+    return {None: cosine / (8 * math.pi**2), 1: cosine / 2}.get(index, 1 / (2 * math.pi))
 
 
 def event(made: Made) -> range:
@@ -242,7 +259,7 @@ def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> No
         wanted = log_mixed(kind, made, lambda part, at: parts[made.parts.index(part)].log_prob(at))
     else:
         inside = parts[0].log_prob(made.value).exp()
-        wanted = (0.9 * inside + 0.1 * (2 * math.pi) ** -len(event(made))).log()
+        wanted = (0.9 * inside + 0.1 * everywhere(made.parts[0], made.value)).log()
     if wanted is not None:
         close(warm.log_prob(value), wanted)
     assert (warm.batch_shape, warm.event_shape) == (density.batch_shape, density.event_shape)
@@ -260,7 +277,8 @@ def one_number(kind: str, made: Made, density: Distribution, value: Tensor, inde
         assert "marginal" in str(error)
         return
     if kind == "floored":  # the floor of one number
-        close(found, (0.9 * log_prob(made.parts[0], made.value).exp() + 0.1 / (2 * math.pi)).log())
+        uniform = everywhere(made.parts[0], made.value, index)
+        close(found, (0.9 * log_prob(made.parts[0], made.value).exp() + 0.1 * uniform).log())
         return
     if kind == "with a set" and density.event_shape == (1,):
         assert marginal(density, 0) is density
@@ -304,7 +322,9 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
     found = median(density, 20)
     assert found.shape == density.batch_shape + density.event_shape
     torch.manual_seed(3)
-    if kind in ("with a set", "mixture of one", "floored", "itself"):
+    # a floor moves no median where every point is as far from it as any other: not elevations
+    flat = not getattr(density.support, "ranges", None)
+    if kind in ("with a set", "mixture of one", "itself") or (kind == "floored" and flat):
         assert torch.equal(found, median(made.parts[0], 20))
     elif kind == "stacked":
         assert torch.equal(found, torch.stack([median(part, 20) for part in made.parts], 1))
@@ -473,6 +493,47 @@ def test_what_draws_nothing_says_so() -> None:
     assert torch.equal(found.debiased, found.log_mean)
     assert found.standard_error.tolist() == found.samples.tolist() == [0] * 4
     assert not found.unresolved.any()
+
+
+CHARTS = [(name, row) for name, row in ROWS if row.target.kind == "angle" and restricted(name, row)]
+
+
+@pytest.mark.parametrize("name, row", CHARTS, ids=ids(CHARTS))
+def test_every_structure_over_a_chart_is_a_density_there(name: str, row: HeadRow) -> None:
+    """Where the support is a part of the torus every structure integrates to 1 over it, and samples lie inside; so does
+    every marginal. By Gauss and Legendre across a part of a turn, by the trapezium rule around a whole one."""
+    with torch.no_grad():
+        made = Made(name, row, spread=0.3)
+        for kind, density in made.structures().items():
+            ranges = density.support.ranges
+            assert ranges == made.parts[0].support.ranges
+            sides = [nodes(*side) for side in ranges]
+            value = torch.cartesian_prod(*[at for at, _ in sides])
+            weight = torch.cartesian_prod(*[share for _, share in sides]).prod(-1)
+            batch = density.batch_shape
+            value = value.reshape(-1, *(1,) * len(batch), len(ranges)).expand(-1, *batch, -1)
+            mass = torch.einsum("n,n...->...", weight, density.log_prob(value).exp())
+            torch.testing.assert_close(mass, torch.ones_like(mass), rtol=0, atol=1e-4, msg=f"{kind}: {mass}")
+            drawn = density.sample(torch.Size((200,)))
+            for index, (low, high) in enumerate(ranges):
+                assert ((drawn[..., index] >= low) & (drawn[..., index] <= high)).all(), kind
+                one = marginal(density, index)
+                at, share = nodes(low, high)
+                log_prob = one.log_prob(at.reshape(-1, *(1,) * len(batch), 1).expand(-1, *batch, 1))
+                mass = torch.einsum("n,n...->...", share, log_prob.exp())
+                torch.testing.assert_close(
+                    mass, torch.ones_like(mass), rtol=0, atol=1e-4, msg=f"{kind} {index}"
+                )
+
+
+def nodes(low: float, high: float) -> tuple[Tensor, Tensor]:
+    at, share = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(24))
+    if high - low > 6:
+        at, share = (
+            torch.arange(16, dtype=torch.float64) / 8 - 1,
+            torch.full((16,), 1 / 8, dtype=torch.float64),
+        )
+    return (low + high) / 2 + (high - low) / 2 * at, (high - low) / 2 * share
 
 
 OLD_NAMES = {

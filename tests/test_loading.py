@@ -9,7 +9,7 @@ import torch
 from framework.configuration.registry import installed, load
 from framework.configuration.schema import build, resolve
 from framework.density_head import Fitted
-from framework.errors import CheckpointError
+from framework.errors import CheckpointError, UserError
 from framework.model import Model
 from framework.runs import loading
 from framework.runs.description import Description
@@ -41,7 +41,7 @@ def test_a_checkpoint_holds_what_was_fitted(name: str, target: Target, tmp_path:
     assert torch.equal(other(inputs).log_prob(wanted), made(inputs).log_prob(wanted))
 
 
-class Built(Exception):
+class Built(UserError):
     """Ends the loading where the model would be built."""
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import framework.configuration.registry as registry
+from framework.configuration.assembly import entries
 from framework.configuration.registry import GROUPS, config_folders, find, installed, load
 from framework.errors import ConfigError
 from framework.modes.plugins import describe
@@ -132,3 +133,18 @@ def test_every_installed_plugin_describes_itself_without_import(group: str) -> N
 def test_every_installed_plugin_loads_as_its_base(group: str) -> None:
     for name in installed(group):
         assert registry.group_of(load(group, name)) == group
+
+
+def test_a_key_cites_one_thing_and_once() -> None:
+    """Over every installed plugin: two entries of one key say the same, and what a run records has each key once."""
+    texts = [load(group, name).bibtex for group in GROUPS for name in installed(group)]
+    found = entries(text for text in texts if text.strip())
+    for text in texts:
+        for key, entry in entries([text]).items():
+            assert entry.split() == found[key].split(), f"{key} is written in two ways"
+    together = "\n\n".join(found.values())
+    assert len(found) > 20 and all(together.count("{" + key + ",") == 1 for key in found)
+    several = entries(
+        ["@book{one,\n  title = {A, @ B}\n}\n@misc{two,\n}", " @book{one,\n}", "@misc{three, year = 1}"]
+    )
+    assert list(several) == ["one", "two", "three"] and several["one"] == "@book{one,\n  title = {A, @ B}\n}"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import sqlite3
@@ -293,6 +294,24 @@ def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> 
             (f"%{json.loads((first.folder / 'run.json').read_text())['run_id']}%",),
         ).fetchall()
     assert dict(stored) == second.losses()
+
+
+def test_a_log_shows_life_and_a_terminal_a_bar(framework: Framework) -> None:
+    stopping = ("trainer.patience=1", "trainer.max_epochs=9", "optimizer.learning_rate=0.3")
+    log = framework(*QUIET, *stopping, folder="log").out
+    lines = [line for line in log.splitlines() if line.startswith("epoch ")]
+    number = r"-?[\d.e+-]+"
+    for epoch, line in enumerate(lines, 1):
+        assert re.fullmatch(f"epoch {epoch} of 9: loss {number}, validation loss {number}", line), line
+    ended = re.search(r"^stopped early at epoch (\d+), kept (\d+)$", log, re.MULTILINE)
+    assert ended, log
+    assert int(ended[1]) == len(lines) == int(ended[2]) + 1
+    losses = [float(line.rpartition(" ")[2]) for line in lines]
+    assert min(losses) == losses[int(ended[2]) - 1]
+    bar = framework(*QUIET, "trainer.max_epochs=2", folder="bar", more={"FORCE_COLOR": "1"}).out
+    assert "━━━" in bar
+    assert "epoch 2 of 2: loss" in bar
+    assert "ended at epoch" in bar
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -25,17 +25,19 @@ from werkzeug.serving import make_server
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
 from framework.tracking import sender
 from framework.tracking import tracker as tracking
+from framework.tracking.ended import mark_dead, sync
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
     RunInfo,
     Sidecar,
     default_uri,
     read_run_info,
+    require_own_store,
     store_uri,
     without_password,
 )
 from framework.tracking.sender import Record, Sender, Store, batches
-from framework.tracking.tracker import MlflowTracker, NoTracker, mark_dead, sync
+from framework.tracking.tracker import MlflowTracker, NoTracker
 
 
 @contextmanager
@@ -331,6 +333,55 @@ def test_a_file_that_is_gone_holds_up_nothing(folder: Path, caplog: pytest.LogCa
     tracker.close("FINISHED")
     assert status(folder) == "FINISHED"
     assert "missing.png is gone" in caplog.text
+
+
+@pytest.mark.parametrize("path", ["/etc/hostname", "../secret.txt", "link.txt", "folder", "link/secret.txt"])
+def test_a_strangers_journal_gives_away_nothing_but_the_run_folder(
+    path: str, folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder, wait=1e6)
+    tracker.open()
+    log(tracker, range(3))
+    (folder.parent / "secret.txt").write_text("secret")
+    (folder / "link").symlink_to(folder.parent)
+    (folder / "link.txt").symlink_to(folder.parent / "secret.txt")
+    (folder / "folder").mkdir()
+    (folder / "folder" / "link.txt").symlink_to(folder.parent / "secret.txt")
+    tracker._log(artifact=path, folder="")  # pyright: ignore[reportPrivateUsage]
+    tracker.close("FINISHED")
+    info = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(
+        json.dumps({**info, "owed": [[path, ""]], "artifacts": str(tmp_path / "there")})
+    )
+    sync(folder)
+    assert history(folder) == losses(range(3))
+    assert "leads out of the run folder" in caplog.text
+    sent = [
+        file for file in (tmp_path / "there", folder.parents[1] / "artifacts") for file in file.rglob("*.txt")
+    ]
+    assert not sent
+
+
+@pytest.mark.parametrize(
+    ("uri", "given", "allowed"),
+    [
+        ("https://attacker.example/api", None, False),
+        ("postgresql://a:b@attacker.example/db", None, False),
+        ("databricks", None, False),
+        ("https://mine.example", "https://other.example", False),
+        ("https://mine.example", "https://mine.example", True),
+        ("https://me:secret@mine.example", "https://mine.example", True),
+        ("http://localhost:5000", None, True),
+        ("sqlite:////anywhere/mlflow.db", None, True),
+        ("", None, True),
+    ],
+)
+def test_a_store_that_only_a_file_names_needs_a_yes(uri: str, given: str | None, allowed: bool) -> None:
+    with (
+        nullcontext() if allowed else pytest.raises(ConfigError, match=r"say so: add logger\.uri=") as caught
+    ):
+        require_own_store(uri, given, Path("run.json"))
+    assert caught is None or "a:b" not in str(caught.value)
 
 
 # Few calls, in order
@@ -903,7 +954,8 @@ def test_four_processes_begin_at_once_where_there_is_no_store(tmp_path: Path) ->
 import os, sys
 from pathlib import Path
 import framework.tracking.mlflow_store
-from framework.tracking.tracker import MlflowTracker, read_run_info
+from framework.tracking.run_info import read_run_info
+from framework.tracking.tracker import MlflowTracker
 
 children = []
 for number in range(4):
@@ -974,16 +1026,17 @@ def test_nobody_else_touches_a_living_run(folder: Path) -> None:
     program = """
 import sys
 from pathlib import Path
-from framework.tracking import tracker as tracking
+from framework.errors import DataError
+from framework.tracking import ended, tracker as tracking
 
 for act in (
-    tracking.sync,
-    tracking.mark_dead,
+    ended.sync,
+    ended.mark_dead,
     lambda folder: tracking.NoTracker(folder).open(),
 ):
     try:
         act(Path(sys.argv[1]))
-    except tracking.DataError as error:
+    except DataError as error:
         assert "another process" in str(error), error
     else:
         sys.exit("it was allowed")
@@ -1085,10 +1138,10 @@ def test_what_to_type_to_see_a_run(folder: Path) -> None:
 
 def test_damaged_run_json_is_said(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{")
-    with pytest.raises(DataError, match=r"run\.json is damaged"):
+    with pytest.raises(DataError, match=r"run\.json: cannot be read"):
         read_run_info(tmp_path)
     (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(DataError, match=r"run\.json is damaged"):
+    with pytest.raises(DataError, match=r"run\.json: cannot be read"):
         NoTracker(tmp_path).open()
     assert read_run_info(tmp_path / "missing") is None
 

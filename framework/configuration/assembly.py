@@ -1,6 +1,7 @@
 """Builds the parts of the density pipeline from a config: data, predictor, objectives, metrics."""
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from framework.configuration.schema import build, parts, resolve
 from framework.data import Data
 from framework.density_head import DensityHead
 from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.errors import ConfigError, quoted
 from framework.metric import Metric
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.objective import Objective
@@ -38,10 +39,18 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     }
     for group in ("encoder", "uncertainty", "objective", "metric"):
         chosen = config.get(group) or {}
+        if not isinstance(chosen, Mapping):
+            raise ConfigError(
+                f"{group} = {quoted(chosen)}: wanted a mapping, a name of your own for each {group}."
+            )
         resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
     outliers = config.get("outliers")
     resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
     require_outliers(resolved)
+    target = getattr(build_data(resolved), "target", None)
+    if target is not None:  # known without reading: what cannot describe it says so now
+        build("density_head", resolved["density_head"], target=target)
+        build_metrics(resolved, target)
     return resolved
 
 
@@ -163,6 +172,15 @@ def citations(resolved: Resolved) -> dict[str, str]:
             visit(group, part)
     for part in _items(resolved.get("outliers")):
         visit("data", part)
+    return found
+
+
+def entries(bibtex: Iterable[str]) -> dict[str, str]:
+    """The entries of several pieces of BibTeX by their keys, each once, in their order."""
+    found: dict[str, str] = {}
+    for entry in re.split(r"^(?=@)", "\n".join(bibtex), flags=re.MULTILINE):
+        if entry.strip():
+            found.setdefault(entry.partition("{")[2].partition(",")[0].strip(), entry.strip())
     return found
 
 

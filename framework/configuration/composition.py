@@ -1,5 +1,6 @@
 """Composes a config with Hydra, and turns what Hydra says of a mistake into one sentence."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,16 +9,18 @@ import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from framework.configuration.registry import config_folders
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, nearest
 
 PLURAL = ("encoder", "uncertainty", "objective", "metric")
 """Groups of which an experiment may choose several; their configs are keyed by name."""
+FLAGS = ("--cfg=", "--package=", "--config-", "--info=", "--experimental-rerun=")
+"""Of Hydra's, those that take a value."""
 
 
 def folder() -> Path:
@@ -32,14 +35,16 @@ def folder() -> Path:
 class PluginConfigs(SearchPathPlugin):
     """Appends the config folders of installed plugins after the project's own, which therefore win."""
 
+    folders: Mapping[str, Path] = {}
+
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for name, path in config_folders().items():
+        for name, path in self.folders.items():
             search_path.append(provider=name, path=f"file://{path}")
 
 
 def register() -> None:
     """Make plugin configs known to Hydra; call before composing. Twice is harmless."""
-    config_folders()  # a clash is said here, not from inside Hydra
+    PluginConfigs.folders = config_folders()  # a clash is said here, not from inside Hydra
     Plugins.instance().register(PluginConfigs)
     OmegaConf.register_new_resolver("first", lambda *values: next(filter(None, values)), replace=True)
 
@@ -50,6 +55,11 @@ def command_line(arguments: list[str]) -> list[str]:
     Raises:
         ConfigError: one would change Hydra's logging, or names a run to resume that is not there.
     """
+    for argument in arguments:
+        if re.match("--[^=]+=", argument) and not argument.startswith(FLAGS):
+            raise ConfigError(
+                f"{argument}: no such flag. Settings are written without dashes: {argument.lstrip('-')}"
+            )
     _refuse_logging_overrides(arguments)
     return _swept_with_experiment(_in_resumed_folder(arguments))
 
@@ -116,8 +126,14 @@ def plain(config: DictConfig) -> dict[str, Any]:
     """The composed config as plain values, interpolations resolved; leftovers of replaced choices dropped.
 
     An experiment that tunes `encoder.a` and is run with `encoder=b` leaves an `encoder.a` without a name.
+
+    Raises:
+        ConfigError: a value that must be given is not.
     """
-    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    try:
+        values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key} is missing. Give it a value: {error.full_key}=...") from error
     assert isinstance(values, dict)
     for group in PLURAL:
         chosen = values.get(group) or {}
@@ -133,9 +149,12 @@ def help_text() -> str:
     Hydra's own lists the groups in 0.7 s, since it copies its store for each.
     """
     words = yaml.safe_load((folder() / "config.yaml").read_text(encoding="utf-8"))["hydra"]["help"]
-    groups = sorted({path.name for root in _roots() for path in root.iterdir() if path.is_dir()})
-    lines = [f"{group}: {', '.join(_options(group))}" for group in groups]
+    lines = [f"{group}: {', '.join(_options(group))}" for group in _groups()]
     return "\n".join([words["header"], *lines, "", words["footer"].rstrip()])
+
+
+def _groups() -> list[str]:
+    return sorted({path.name for root in _roots() for path in root.iterdir() if path.is_dir()})
 
 
 def _roots() -> list[Path]:
@@ -158,18 +177,47 @@ def sentence(error: BaseException) -> str | None:
         return f"No configuration {wanted!r}.{did_you_mean(name, options)}{available}"
     if isinstance(error, ValueError) and "Config group override must be" in str(error):
         return (
-            "A group cannot be set to null. Take it out with `~`, e.g. `~data@outliers` or `~density_head`."
+            "A group takes a name; it cannot be set to null, true or a number. Take it out with `~`, e.g. "
+            "`~data@outliers` or `~density_head`."
         )
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, OmegaConfBaseException):
         cause = cause.__cause__ or cause.__context__
-    if isinstance(cause, OmegaConfBaseException) and cause.key is not None and cause.parent_node is not None:
-        known = [str(key) for key in cause.parent_node]
-        if "not in" in str(cause):
-            return (
-                f"{cause.full_key}: unknown key.{did_you_mean(str(cause.key), known)} Known keys: "
-                f"{', '.join(known)}. (+{cause.full_key}=... adds one the plugin knows but its yaml does not show.)"
-            )
+    if isinstance(cause, OmegaConfBaseException) and cause.parent_node is not None and "not in" in str(cause):
+        return _unknown(cause)
+    if isinstance(error, OverrideParseException):
+        return (
+            f"{error.override!r} cannot be read; wanted key=value, quoted where it holds commas or brackets."
+        )
     if isinstance(error, HydraException | OmegaConfBaseException):
-        return str(error).split("\n\nSet the environment")[0].split("\nSee https://hydra.cc")[0]
+        said = str(error).split("\n\nSet the environment")[0].split("\nSee https://hydra.cc")[0]
+        return " ".join(said.split())
     return None
+
+
+def _unknown(cause: OmegaConfBaseException) -> str:
+    """Where a key stands that was not found: elsewhere by that name, or near by under one like it."""
+    assert cause.parent_node is not None
+    key, root = str(cause.key), cause.parent_node._get_root()
+    known = [str(name) for name in cause.parent_node if name != "hydra"]
+    elsewhere = {
+        path.rpartition(".")[2]: path for path in _paths(OmegaConf.to_container(root, resolve=False))
+    }
+    beside = [*known, *_groups()] if cause.parent_node is root else known
+    near = key if key in elsewhere else nearest(key, beside) or nearest(key, elsewhere, 0.7)
+    if cause.parent_node is root and key in beside:
+        return f"No {key} is chosen, so {cause.full_key}... sets nothing. Choose one: {key}=<name>, or {key}=[<name>]."
+    hint = f" Did you mean {(near if near in beside else elsewhere[near])!r}?" if near else ""
+    return (
+        f"{cause.full_key}: unknown key.{hint} Known keys: {', '.join(known) or 'none'}. "
+        f"(+{cause.full_key}=... adds one the plugin knows but its yaml does not show.)"
+    )
+
+
+def _paths(values: Any, before: str = "") -> list[str]:
+    """Every key of nested mappings, dotted, but for Hydra's own."""
+    found = []
+    for key, value in values.items() if isinstance(values, Mapping) else ():
+        if before or key != "hydra":
+            found += [f"{before}{key}", *_paths(value, f"{before}{key}.")]
+    return found

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, quoted
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
 
@@ -47,7 +47,7 @@ def find(group: str, name: str) -> Entry:
     names = installed(group)
     if name not in names:
         raise ConfigError(
-            f"No {group} is called {name!r}.{did_you_mean(name, names)} "
+            f"No {group} is called {quoted(name)}.{did_you_mean(name, names)} "
             f"Installed: {', '.join(names) or 'none'}. "
             "A name added to a pyproject.toml counts only after `pip install -e .`."
         )

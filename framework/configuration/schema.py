@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from framework.configuration.registry import group_of, load
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, quoted, shown
 
 
 def forbid_targets(config: Any, path: str = "") -> None:
@@ -34,8 +34,8 @@ def forbid_targets(config: Any, path: str = "") -> None:
             here = f"{path}.{key}" if path else str(key)
             if key == "_target_":
                 raise ConfigError(
-                    f"{here} = {value!r}: `_target_` is refused, since a config must not be able to run code. "
-                    "Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
+                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not be able "
+                    "to run code. Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
                 )
             forbid_targets(value, here)
     elif isinstance(config, list | tuple):
@@ -59,13 +59,16 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
         config = {"name": config}
     if not isinstance(config, Mapping):
         raise ConfigError(
-            f"{path} = {config!r}: wanted the name of a {group}, or a mapping with `name` and its parameters."
+            f"{shown(path)} = {quoted(config)}: wanted the name of a {group}, or a mapping with `name` and "
+            "its parameters."
         )
     forbid_targets(config, path)
     values = dict(config)
     name = values.pop("name", None)
     if not isinstance(name, str):
-        raise ConfigError(f"{path}.name is missing: write the name of a {group} (`mode=plugins` lists them).")
+        raise ConfigError(
+            f"{shown(path)}.name is missing: write the name of a {group} (`mode=plugins` lists them)."
+        )
     cls = load(group, name)
     checked = check(_model(cls), values, path)
     for key, part in parts(cls).items():
@@ -89,11 +92,15 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
     cls = load(group, config["name"])
     values = {key: value for key, value in config.items() if key != "name"}
     for key, part in parts(cls).items():
-        if values.get(key) is not None:
+        if values.get(key) is None:
+            continue
+        try:
             if part.many:
                 values[key] = [build(part.group, item, **context) for item in values[key]]
             else:
                 values[key] = build(part.group, values[key], **context)
+        except ConfigError as error:  # which the user may never have named
+            raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
     given = []
     for parameter in _positional(cls):
         if parameter.name not in context:
@@ -117,7 +124,7 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
         return model.model_validate(dict(values)).model_dump()
     except ValidationError as error:
         fault = error.errors()[0]
-        where = ".".join(filter(None, [path, *(str(item) for item in fault["loc"])]))
+        where = shown(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
         known = list(model.model_fields)
         if fault["type"] == "extra_forbidden":
             key = str(fault["loc"][-1])
@@ -131,7 +138,8 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
             hint = did_you_mean(str(fault["input"]), expected)
         else:
             hint = ""
-        raise ConfigError(f"{where} = {fault['input']!r}: {fault['msg']}.{hint}") from None
+        message = fault["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{where} = {quoted(fault['input'])}: {message}.{hint}") from None
 
 
 class Part(typing.NamedTuple):

@@ -1,16 +1,57 @@
 """The core's own part of the config: types, ranges and defaults; plugins check theirs by their constructors."""
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from framework.configuration.registry import GROUPS
 from framework.configuration.schema import check, forbid_targets
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError
+
+
+def _share(value: Any) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not (value >= 1 if isinstance(value, int) else 0 < value <= 1):
+        raise ValueError("wanted a whole number of batches from 1 on, or a share of them, 0.0 < share <= 1.0")
+    return value
+
+
+def _devices(value: Any) -> Any:
+    listed = value if isinstance(value, list) else [value]
+    numbers = [int(one) for one in listed if not isinstance(one, bool) and re.fullmatch(r"-?\d+", str(one))]
+    if value in (None, "auto", -1) or (listed is value and numbers == value and min(value, default=-1) >= 0):
+        return value
+    if listed is not value and (numbers > [0] or re.fullmatch(r"\d+(,\d+)+", str(value))):
+        return value
+    raise ValueError("wanted how many, from 1 on, a list of their numbers, or auto")
+
 
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Flag = Annotated[bool, Field(strict=True)]
+Share = Annotated[Any, AfterValidator(_share)]
+_UNUSED = ("", "_find_unused_parameters_true", "_find_unused_parameters_false")
+_PLAIN = ("ddp", "ddp_spawn", "ddp_fork", "ddp_notebook")
+STRATEGIES = (
+    *("auto", "single_device", "fsdp", "fsdp_cpu_offload", "xla", "xla_debug", "single_xla", "single_tpu"),
+    *(
+        "deepspeed",
+        "deepspeed_stage_1",
+        "deepspeed_stage_2",
+        "deepspeed_stage_2_offload",
+        "deepspeed_stage_3",
+    ),
+    *("deepspeed_stage_3_offload", "deepspeed_stage_3_offload_nvme"),
+    *(f"{name}{end}" for name in _PLAIN for end in _UNUSED),
+)
+"""Names that Lightning has registered."""
+PRECISIONS = (
+    *("32-true", "bf16-mixed", "16-mixed", "64-true", "bf16-true", "16-true", "transformer-engine"),
+    *("transformer-engine-float16", "32", "16", "64", "bf16", 32, 16, 64),
+)
 
 
 class _Strict(BaseModel):
@@ -45,6 +86,57 @@ class LoggerSettings(_Strict):
     experiment: str | None = None
 
 
+class TrainerSettings(_Strict):
+    """Our own keys of `trainer`, and the arguments of pytorch_lightning.Trainer that a config can hold; checked only:
+    what is not given has Lightning's defaults. It is known here what Lightning takes, since importing it costs seconds.
+    """
+
+    patience: Count | None = None
+    keep: Literal["best", "last"] | None = None
+    checkpoint_every_steps: Count | None = None
+    log_every_steps: Count | None = None
+    max_epochs: Count | None = None
+    min_epochs: Count | None = None
+    max_steps: Annotated[int, Field(strict=True, ge=-1)] | None = None
+    min_steps: Count | None = None
+    max_time: Annotated[str, Field(pattern=r"^\d+:\d{2}:\d{2}:\d{2}$")] | None = None
+    """Days, hours, minutes and seconds."""
+    check_val_every_n_epoch: Count | None = None
+    val_check_interval: Share | None = None
+    limit_train_batches: Share | None = None
+    limit_val_batches: Share | None = None
+    limit_test_batches: Share | None = None
+    limit_predict_batches: Share | None = None
+    overfit_batches: Share | None = None
+    accumulate_grad_batches: Count | None = None
+    gradient_clip_val: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] | None = None
+    gradient_clip_algorithm: Literal["norm", "value"] | None = None
+    accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps", "tpu"] | None = None
+    strategy: Literal[STRATEGIES] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    precision: Literal[PRECISIONS] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    devices: Annotated[Any, AfterValidator(_devices)] = None
+    num_nodes: Count | None = None
+    num_sanity_val_steps: Annotated[int, Field(strict=True, ge=-1)] | None = None
+    log_every_n_steps: Count | None = None
+    reload_dataloaders_every_n_epochs: NotNegative | None = None
+    deterministic: Literal[True, False, "warn"] | None = None
+    benchmark: Flag | None = None
+    fast_dev_run: Flag | None = None
+    enable_progress_bar: Flag | None = None
+    enable_model_summary: Flag | None = None
+    inference_mode: Flag | None = None
+    detect_anomaly: Flag | None = None
+    barebones: Flag | None = None
+    sync_batchnorm: Flag | None = None
+    enable_autolog_hparams: Flag | None = None
+    profiler: Literal["simple", "advanced", "pytorch", "xla"] | None = None
+    model_registry: str | None = None
+
+
+TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
+"""Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
+
+
 class Settings(_Strict):
     """Everything of a composed config that is not a plugin's."""
 
@@ -73,10 +165,6 @@ def store_experiment(config: Mapping[str, Any]) -> str:
     return str(logger.get("experiment") or (name.partition("/")[0] if name else "default"))
 
 
-TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
-"""Keys of `trainer` that the framework reads; the others go to pytorch_lightning.Trainer."""
-
-
 def settings(config: Mapping[str, Any]) -> Settings:
     """The checked core settings of a composed config.
 
@@ -91,48 +179,25 @@ def settings(config: Mapping[str, Any]) -> Settings:
             own[key] = check(model, own[key], key)
     values = check(Settings, own, "")
     checked = Settings.model_validate(values)
-    _check_trainer(checked.trainer)
+    check(TrainerSettings, checked.trainer, "trainer")
+    every, epochs = checked.trainer.get("check_val_every_n_epoch"), checked.trainer.get("max_epochs")
+    if every and epochs:  # a shorter run is validated at its end, too
+        checked.trainer["check_val_every_n_epoch"] = min(every, epochs)
     return checked
 
 
-def _check_trainer(trainer: Mapping[str, Any]) -> None:
-    numbers = {
-        "max_epochs": (int, 1),
-        "check_val_every_n_epoch": (int, 1),
-        "patience": (int, 1),
-        "checkpoint_every_steps": (int, 1),
-        "log_every_steps": (int, 1),
-        "num_nodes": (int, 1),
-        "gradient_clip_val": ((int, float), 0),
-    }
-    for key, (kind, least) in numbers.items():
-        value = trainer.get(key)
-        if value is not None and (
-            isinstance(value, bool) or not isinstance(value, kind) or not value >= least
-        ):
-            raise ConfigError(f"trainer.{key} = {value!r}: wanted a number of at least {least}, or null.")
-    every, epochs = trainer.get("check_val_every_n_epoch") or 1, trainer.get("max_epochs")
-    if epochs is not None and every > epochs:
-        raise ConfigError(
-            f"trainer.check_val_every_n_epoch = {every} exceeds trainer.max_epochs = {epochs}: nothing would ever be "
-            "validated. Lower it."
-        )
-    if trainer.get("keep", "best") not in ("best", "last"):
-        raise ConfigError(
-            f"trainer.keep = {trainer['keep']!r}: wanted `best` (the weights of the lowest validation loss) or `last`."
-        )
-
-
-def check_trainer_keys(trainer: Mapping[str, Any], known: set[str]) -> None:
-    """Refuse a key that neither the framework nor Lightning's Trainer knows.
+def require_device(accelerator: str | None) -> None:
+    """Refuse a device that this machine does not have.
 
     Raises:
-        ConfigError: with the nearest known key.
+        ConfigError: there is none.
     """
-    for key in trainer:
-        if key not in known | TRAINER_OURS:
+    if accelerator in ("gpu", "cuda", "mps"):
+        import torch
+
+        found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not (any(found.values()) if accelerator == "gpu" else found[accelerator]):
             raise ConfigError(
-                f"trainer.{key}: unknown key.{did_you_mean(key, known | TRAINER_OURS)} "
-                "Known: the arguments of pytorch_lightning.Trainer, "
-                f"and {', '.join(sorted(TRAINER_OURS))}."
+                f"trainer.accelerator = {accelerator!r}: PyTorch sees none on this machine. Choose auto or cpu, or "
+                "install the PyTorch that fits your driver."
             )

@@ -1,19 +1,23 @@
 """A table of numbers and words in a CSV file, by columns; what is wrong with it is said by line and column."""
 
 import csv
+import io
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from framework.errors import DataError, did_you_mean
+from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.storage.reading import guarded, opened
 
 MISSING = {"", "na", "n/a", "nan", "null", "none", "?"}
 """What stands in a cell, in small letters, that has no number."""
+MOST_COLUMNS = 100_000
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
@@ -25,6 +29,24 @@ class Columns(NamedTuple):
     lines: list[int]
 
 
+@contextmanager
+def csv_rows(file: Path, missing: str) -> Iterator[Any]:
+    """The rows of a CSV file as lists of cells: UTF-8 (also with a byte-order mark), commas.
+
+    Args:
+        missing: what to say of a file that is not there.
+
+    Raises:
+        DataError: it is missing or unreadable.
+    """
+    with (
+        guarded(file, "a table", "Save it as the wanted UTF-8 text, separated by commas.", missing),
+        opened(file) as stream,
+        io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as text,
+    ):
+        yield csv.reader(text, strict=True)
+
+
 def read_columns(file: Path) -> Columns:
     """Read a CSV file: UTF-8 (also with a byte-order mark), commas, names in its first line; blank lines are left out.
 
@@ -32,29 +54,21 @@ def read_columns(file: Path) -> Columns:
         DataError: it is missing, unreadable, empty, separated by something else, a name is missing or stands twice,
             there is no row, or a row has more or fewer cells than there are names.
     """
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream, strict=True)
-            header = [cell.strip() for cell in next(reader, [])]
-            _check_header(file, header)
-            rows, lines = [], []
-            for cells in reader:
-                # a spreadsheet's `,,,`; in a table of one column an empty cell is a row that misses its number
-                if not cells or (len(cells) > 1 and not any(map(str.strip, cells))):
-                    continue
-                if len(cells) != len(header):
-                    raise DataError(
-                        f"{file} line {reader.line_num}: {len(cells)} cells; wanted {len(header)}, as many as the "
-                        "first line names. Mend that line."
-                    )
-                rows.append(cells)
-                lines.append(reader.line_num)
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file; wanted a CSV table. Mend the path.") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(
-            f"{file}: cannot be read ({error}); wanted UTF-8 text, separated by commas. Save it as such."
-        ) from error
+    with csv_rows(file, "wanted a CSV table. Mend the path.") as reader:
+        header = [cell.strip() for cell in next(reader, [])]
+        _check_header(file, header)
+        rows, lines = [], []
+        for cells in reader:
+            # a spreadsheet's `,,,`; in a table of one column an empty cell is a row that misses its number
+            if not cells or (len(cells) > 1 and not any(map(str.strip, cells))):
+                continue
+            if len(cells) != len(header):
+                raise DataError(
+                    f"{file} line {reader.line_num}: {len(cells)} cells; wanted {len(header)}, as many as the "
+                    "first line names. Mend that line."
+                )
+            rows.append(cells)
+            lines.append(reader.line_num)
     if not rows:
         raise DataError(f"{file} has no row below its first line; wanted one for each sample. Add them.")
     columns = ([*map(str.strip, column)] for column in zip(*rows, strict=True))
@@ -74,7 +88,7 @@ def require(columns: Columns, names: Sequence[str], asked: str) -> None:
         if name not in columns.cells:
             raise DataError(
                 f"{asked} names {name!r}, which {columns.file} does not have.{did_you_mean(name, columns.cells)} "
-                f"Its columns: {', '.join(columns.cells)}."
+                f"Its columns: {shown(', '.join(columns.cells))}."
             )
 
 
@@ -134,8 +148,8 @@ def numbers(columns: Columns, name: str, *, missing: str | None) -> Float[np.nda
             elif value is not None and math.isnan(value) and missing:
                 hint = f" Or {missing}."
             raise DataError(
-                f"{columns.file} line {columns.lines[row]}, column {name!r}: {cell!r}; wanted a finite number. Mend "
-                f"the cell, or take the line out.{hint}"
+                f"{columns.file} line {columns.lines[row]}, column {quoted(name)}: {quoted(cell)}; wanted a finite "
+                f"number. Mend the cell, or take the line out.{hint}"
             )
         found[row] = value
     return found
@@ -151,14 +165,16 @@ def _all_finite(cells: Sequence[str]) -> Float[np.ndarray, "rows"] | None:
 
 
 def _check_header(file: Path, header: Sequence[str]) -> None:
+    if len(header) > MOST_COLUMNS:
+        raise DataError(f"{file} has {len(header)} columns; wanted at most {MOST_COLUMNS}. Leave some out.")
     if not any(header):
         raise DataError(f"{file} is empty or begins with a blank line; wanted names of columns. Write them.")
     if len(header) == 1:
         for sign, word in SEPARATORS.items():
             if sign in header[0]:
                 raise DataError(
-                    f"{file} is separated by {word}: its first line reads {header[0]!r}; wanted commas, and decimals "
-                    "with a point. Save it as such."
+                    f"{file} is separated by {word}: its first line reads {quoted(header[0])}; wanted commas, and "
+                    "decimals with a point. Save it as such."
                 )
     if "" in header:
         raise DataError(
@@ -167,4 +183,4 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
         )
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
-        raise DataError(f"{file} names the column {twice[0]!r} twice; wanted each once. Rename one.")
+        raise DataError(f"{file} names the column {quoted(twice[0])} twice; wanted each once. Rename one.")

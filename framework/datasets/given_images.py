@@ -16,9 +16,9 @@ from framework.errors import DataError
 def inputs(data: Data, given: Any) -> Tensor:
     """`Data.inputs` of a data set of square images, of `input_shape` (channels, side, side).
 
-    Beside files and arrays of that shape it takes Pillow images, and arrays of bytes as Pillow and OpenCV hold them:
-    (height, width), (height, width, channels), or a batch of these. Images of another size are made square by repeating
-    their border pixels, and scaled, as files are. Floats are from 0 to 1.
+    Beside files and arrays of that shape it takes Pillow images, and arrays of bytes as Pillow holds them: (height,
+    width), (height, width, channels), or a batch of either; a batch without channels where the model's images are grey.
+    Images of another size are made square by repeating border pixels, and scaled, as files are. Floats are from 0 to 1.
 
     Raises:
         DataError: it is none of these.
@@ -30,7 +30,12 @@ def inputs(data: Data, given: Any) -> Tensor:
         pixels = given.numpy(force=True) if isinstance(given, Tensor) else given
         if pixels.ndim in (2, 3) and pixels.shape[2:] in ((), (1,), (3,), (4,)):
             pixels = pixels[None]
-        if pixels.dtype != np.uint8 or pixels.shape[3:] not in ((), (1,), (3,), (4,)) or pixels.ndim < 3:
+        known = (
+            ((), (1,), (3,), (4,))
+            if len(given.shape) == 2 or data.input_shape[0] == 1
+            else ((1,), (3,), (4,))
+        )
+        if pixels.dtype != np.uint8 or pixels.ndim < 3 or pixels.shape[3:] not in known:
             raise DataError(
                 f"an array of shape {'×'.join(map(str, given.shape))} and type {given.dtype} is no image; wanted bytes "
                 f"(uint8), (height, width, 3), or inputs {'×'.join(map(str, data.input_shape))}, bytes or 0 to 1."

@@ -2,7 +2,6 @@
 
 import math
 import os
-import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,9 +22,16 @@ from torch.utils.data import Dataset
 from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
+from framework.storage import reading
 
 READERS = min(8, os.cpu_count() or 1)
 """So many threads decode at once."""
+FORMATS = ("AVIF", "BMP", "GIF", "ICO", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
+"""Of Pillow's formats those that decode pixels and do nothing else: EPS starts another program."""
+MOST_PIXELS, LONGEST_SIDE = 2**26 + 2**24, 2**16
+"""Of an image as it is stored; below where Pillow warns."""
+MOST_PADDED = 2**26
+"""Pixels of a square; where one that must be padded has more, it is scaled down before."""
 IN_MEMORY = 2 * 2**30
 """Crops of up to so many bytes are kept in memory."""
 
@@ -93,18 +99,16 @@ def opened(file: Path) -> Iterator[Image.Image]:
     Raises:
         DataError: the file is missing, is no image, or is cut short; names it.
     """
-    try:
-        with Image.open(file) as image:
-            yield image
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file; wanted an image. Mend the path, or restore it.") from None
-    except (OSError, SyntaxError, ValueError, IndexError, TypeError, struct.error, EOFError) as error:
-        # what Pillow's decoders raise on damaged files
-        raise DataError(
-            f"{file}: cannot be read as an image ({error}). Restore it from its source."
-        ) from error
-    except Image.DecompressionBombError as error:
-        raise DataError(f"{file}: {error}. Scale the image down.") from error
+    with (
+        reading.guarded(file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."),
+        reading.opened(file) as stream,
+        Image.open(stream, formats=FORMATS) as image,
+    ):
+        if image.width * image.height > MOST_PIXELS or max(image.size) > LONGEST_SIDE:
+            raise ValueError(
+                f"{image.width} x {image.height} pixels; at most {MOST_PIXELS}, and {LONGEST_SIDE} along a side"
+            )
+        yield image
 
 
 def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
@@ -116,7 +120,9 @@ def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
         whole = Image.fromarray((np.asarray(whole).clip(0, 65535) // 257).astype(np.uint8))
     if "transparency" in whole.info or whole.mode in ("LA", "PA", "RGBA"):
         whole = Image.alpha_composite(Image.new("RGBA", whole.size, "white"), whole.convert("RGBA"))
-    return whole.convert("RGB" if channels == 3 else "L")
+    whole.load()
+    mode = "RGB" if channels == 3 else "L"
+    return whole if whole.mode == mode else whole.convert(mode)
 
 
 def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
@@ -131,14 +137,15 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
     half = (0.5 + margin) * max(right - left, bottom - top)
     x, y = (left + right) / 2, (top + bottom) / 2
     # whole pixels around the square, then those of them that exist, then the square within what was cut
-    first_x, first_y, last_x, last_y = (
-        math.floor(x - half),
-        math.floor(y - half),
-        math.ceil(x + half),
-        math.ceil(y + half),
-    )
+    first_x, first_y = math.floor(x - half), math.floor(y - half)
+    last_x, last_y = math.ceil(x + half), math.ceil(y + half)
     inside = (max(0, first_x), max(0, first_y), min(image.width, last_x), min(image.height, last_y))
-    cut = image.crop(inside)
+    padded = inside != (first_x, first_y, last_x, last_y)
+    if padded and (last_x - first_x) * (last_y - first_y) > MOST_PADDED:  # a strip, say
+        step = math.ceil(max(last_x - first_x, last_y - first_y) / math.isqrt(MOST_PADDED))
+        small = (left / step, top / step, right / step, bottom / step)
+        return square(image.reduce(step), small, margin, side)
+    cut = image if inside == (0, 0, *image.size) else image.crop(inside)
     missing = ((inside[1] - first_y, last_y - inside[3]), (inside[0] - first_x, last_x - inside[2]))
     if any(map(any, missing)):
         pixels = np.asarray(cut)

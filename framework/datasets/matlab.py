@@ -1,103 +1,196 @@
-"""Reads MATLAB 5 files that may be damaged.
+"""Reads MATLAB 5 files, which may be damaged: numbers, text, cells and structs.
 
-SciPy's reader can crash the process on a file with a wrong byte in it (seen with SciPy 1.17). So the file's outline
-is checked first: what MATLAB compressed has a checksum, and of what is not compressed every element must be of a
-known type and lie within the one that holds it. Complex numbers, which labels do not hold, are refused.
+SciPy's reader can crash the process on a file with a wrong byte in it (seen with SciPy 1.17), so none of it is used.
+Every element must lie within the one that holds it and bring the data that its dimensions ask for, before anything is
+allocated. The format: MathWorks, MAT-File Format (R2023b).
 """
 
-import io
+import math
 import struct
-import zlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import scipy.io
+import numpy as np
 
 from framework.errors import DataError
+from framework.storage.reading import RESTORE, guarded, inflated, read_bytes, room
 
 HEADER_BYTES = 128
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 UNSIGNED, MATRIX, COMPRESSED = 6, 14, 15
+"""Types of elements, table 1-1."""
+CELL, STRUCT, CHAR, NUMERIC, OPAQUE = 1, 2, 4, range(6, 16), 17
+"""Classes of arrays, table 1-3."""
 COMPLEX = 0x0800
-PLAIN_TYPES = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}
-"""Element types of the MAT-File Format, table 1-1: integers, floating point and text."""
+NAME_WITHIN = 512
+"""The bytes at the beginning of a variable that hold its flags, at most 32 sides and its name."""
+MOST_ARRAYS, DEEPEST = 300_000, 32
 
 
-def read_variables(file: Path, names: list[str], source: str) -> dict[str, Any]:
-    """Read the named variables of a file, structs as `scipy.io.matlab.mat_struct`, squeezed.
-
-    Args:
-        source: where the file can be had again, for messages: "the release".
+def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:
+    """Read the named variables of a file, or all; see `variables`.
 
     Raises:
-        DataError: there is no such file, or it is damaged or of another version than 5.
+        DataError: there is no such file, it is damaged, or of version 7.3.
     """
-    try:
-        content = file.read_bytes()
-        check(content)
-        return scipy.io.loadmat(
-            io.BytesIO(content), squeeze_me=True, struct_as_record=False, variable_names=names
-        )
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file. Restore it from {source}.") from None
-    except Exception as error:  # nearly any, where the file is damaged
-        raise DataError(
-            f"{file}: cannot be read as a MATLAB file ({error}). Restore it from {source}."
-        ) from error
+    with guarded(file, "a MATLAB file", remedy):
+        content = read_bytes(file)
+        if content[124:HEADER_BYTES] in (b"\x00\x02IM", b"\x02\x00MI"):
+            raise DataError(f"{file}: a MATLAB 7.3 file; wanted version 5. Save it with '-v7'.")
+        return variables(content, names)
 
 
-def check(content: bytes) -> None:
-    """Raise ValueError, or zlib.error, for a file that is damaged or of another version."""
+def variables(content: bytes, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """The named variables of a file's bytes, or all.
+
+    Sides of length 1 are left out, and what is alone comes without an array. Numbers have the type that they are stored
+    in, a struct is a dict, text a string. What labels do not hold (sparse matrices, objects, functions) is None.
+
+    Raises:
+        ValueError, zlib.error: the file is damaged, or what is asked for holds complex numbers.
+    """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:HEADER_BYTES])
     if order is None:
         raise ValueError("no header of a MATLAB 5 file")
     (version,) = struct.unpack_from(f"{order}H", content, 124)
-    if version == 0x0200:
-        raise ValueError("it is a MATLAB 7.3 file; wanted version 5, which `save` writes with '-v7'")
     if version != 0x0100:
         raise ValueError(f"version {version:#06x} instead of 0x0100")
-    position = HEADER_BYTES
+    reader, found = _Reader(order), {}
+    position, left = HEADER_BYTES, room(len(content))
     while position < len(content):
-        kind, start, end = _element(content, position, len(content), order)
-        if kind == COMPRESSED:
-            zlib.decompress(content[start:end])  # its checksum speaks for what is inside
-            position = end  # compressed elements are not padded
-        else:
-            _check_element(content, kind, start, end, order)
-            position = _padded(end)
+        kind, start, position = reader.element(content, position, len(content))
+        packed = content[start:position]
+        whole = (
+            inflated(packed, NAME_WITHIN, part=True) if kind == COMPRESSED else content[start - 8 : position]
+        )
+        name = reader.head(whole, 8, len(whole)).name
+        if name and (names is None or name in names):
+            if kind == COMPRESSED:
+                whole = inflated(packed, left)
+                left -= len(whole)
+            kind, start, end = reader.element(whole, 0, len(whole))
+            if kind != MATRIX:
+                raise ValueError(f"an element of type {kind} for a variable")
+            found[name] = reader.array(whole, start, end, 0)
+    return found
 
 
-def _check_element(content: bytes, kind: int, start: int, end: int, order: str) -> None:
-    if kind != MATRIX:
-        if kind not in PLAIN_TYPES:
-            raise ValueError(f"unknown element type {kind} before byte {start}")
-        return
-    position = start
-    while position < end:
-        inner, first, last = _element(content, position, end, order)
-        if position == start:
-            if inner != UNSIGNED or last - first != 8:
-                raise ValueError(f"a matrix without its flags at byte {start}")
-            (flags,) = struct.unpack_from(f"{order}I", content, first)
-            if flags & COMPLEX:  # SciPy looks for an imaginary part, whether there is one or not
-                raise ValueError(f"complex numbers at byte {start}")
-        _check_element(content, inner, first, last, order)
-        position = _padded(last)
+class _Head(NamedTuple):
+    """What an array begins with; its data follow at `position`."""
+
+    kind: int
+    complex: bool
+    shape: tuple[int, ...]
+    name: str
+    position: int
 
 
-def _element(content: bytes, position: int, limit: int, order: str) -> tuple[int, int, int]:
-    """Read the tag of the element at `position`: its type, and the first byte and end of its data, before `limit`."""
-    if position + 8 > limit:
-        raise ValueError(f"the file ends within an element at byte {position}")
-    kind, size = struct.unpack_from(f"{order}II", content, position)
-    if kind >> 16:  # four bytes at most, in the second half of the tag
-        kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
-        if size > 4:
-            raise ValueError(f"a small element of {size} bytes at byte {position}")
-    else:
+class _Reader:
+    def __init__(self, order: str) -> None:
+        self.order = order
+        self.arrays = 0
+
+    def element(self, content: bytes, position: int, limit: int) -> tuple[int, int, int]:
+        """Read the tag at `position`: the element's type, and the first byte and end of its data, before `limit`."""
+        if position + 8 > limit:
+            raise ValueError(f"the file ends within an element at byte {position}")
+        kind, size = struct.unpack_from(f"{self.order}II", content, position)
         start = position + 8
-    if start + size > limit:
-        raise ValueError(f"an element of {size} bytes at byte {position} reaches beyond what holds it")
-    return kind, start, start + size
+        if kind >> 16:  # four bytes at most, in the second half of the tag
+            kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
+            if size > 4:
+                raise ValueError(f"a small element of {size} bytes at byte {position}")
+        if start + size > limit:
+            raise ValueError(f"an element of {size} bytes at byte {position} reaches beyond what holds it")
+        return kind, start, start + size
+
+    def head(self, content: bytes, start: int, end: int) -> _Head:
+        kind, first, last = self.element(content, start, end)
+        if kind != UNSIGNED or last - first != 8:
+            raise ValueError(f"an array without its flags at byte {start}")
+        (flags,) = struct.unpack_from(f"{self.order}I", content, first)
+        if flags & 0xFF == OPAQUE:
+            return _Head(OPAQUE, False, (), "", end)
+        sides, position = self.numbers(content, last, end)
+        _, first, last = self.element(content, position, end)
+        shape = tuple(map(int, sides))
+        if not 2 <= len(shape) <= 32 or min(shape) < 0:
+            raise ValueError(f"an array of the sides {shape}")
+        name = content[first:last].decode("latin-1")
+        return _Head(flags & 0xFF, bool(flags & COMPLEX), shape, name, _padded(last))
+
+    def numbers(self, content: bytes, position: int, limit: int) -> tuple[np.ndarray, int]:
+        """The numbers of the element at `position`, and where the next begins."""
+        kind, start, end = self.element(content, position, limit)
+        if kind not in NUMBERS:
+            raise ValueError(f"an element of type {kind} at byte {position}; wanted numbers")
+        return np.frombuffer(content[start:end], self.order + NUMBERS[kind]), _padded(end)
+
+    def array(self, content: bytes, start: int, end: int, depth: int) -> Any:
+        """The array that lies between two bytes, and all that it holds."""
+        if start == end:
+            return np.empty(0)
+        head = self.head(content, start, end)
+        if head.complex:
+            raise ValueError(f"complex numbers at byte {start}")
+        count, position = math.prod(head.shape), head.position
+        if head.kind in NUMERIC:
+            values, _ = self.numbers(content, position, end)
+            values = values.astype(values.dtype.newbyteorder("=")).reshape(head.shape, order="F")
+        elif head.kind == CHAR:
+            return self.text(content, position, end, head.shape)
+        elif head.kind in (CELL, STRUCT):
+            fields = [""]
+            if head.kind == STRUCT:
+                fields, position = self.fields(content, position, end)
+            self.arrays += count * max(len(fields), 1)
+            if depth == DEEPEST or self.arrays > MOST_ARRAYS:
+                raise ValueError(
+                    f"more than {MOST_ARRAYS} arrays, or arrays more than {DEEPEST} deep in others"
+                )
+            values = np.empty(count, object)
+            for number in range(count):
+                held = {}
+                for field in fields:
+                    kind, first, last = self.element(content, position, end)
+                    if kind != MATRIX:
+                        raise ValueError(f"an element of type {kind} at byte {position}; wanted an array")
+                    held[field] = self.array(content, first, last, depth + 1)
+                    position = _padded(last)
+                values[number] = held if head.kind == STRUCT else held[""]
+            values = values.reshape(head.shape, order="F")
+        else:
+            return None
+        if not count:
+            return np.empty(0, values.dtype)
+        return values.item() if count == 1 else values.squeeze()
+
+    def text(self, content: bytes, position: int, limit: int, shape: tuple[int, ...]) -> str | np.ndarray:
+        """Text, or an array of its rows."""
+        kind, start, end = self.element(content, position, limit)
+        if kind not in LETTERS or len(shape) != 2:
+            raise ValueError(f"text of type {kind} and shape {shape} at byte {position}")
+        wide = {"<": "-le", ">": "-be"}[self.order] if LETTERS[kind] in ("utf-16", "utf-32") else ""
+        letters = content[start:end].decode(LETTERS[kind] + wide)
+        rows, columns = shape
+        if rows < 2 or not columns:
+            return letters.rstrip("\0")
+        if len(letters) != rows * columns:
+            raise ValueError(f"{len(letters)} letters for text of shape {shape}")
+        return np.array([letters[row::rows] for row in range(rows)])
+
+    def fields(self, content: bytes, position: int, limit: int) -> tuple[list[str], int]:
+        """The names of a struct's fields, each padded to the same length, and where its values begin."""
+        lengths, position = self.numbers(content, position, limit)
+        _, start, end = self.element(content, position, limit)
+        length = int(lengths[0]) if len(lengths) == 1 else 0
+        if length < 1 or (end - start) % length:
+            raise ValueError(f"names of fields at byte {start} that are not of one length")
+        names = content[start:end].decode("latin-1")
+        parts = [names[first : first + length] for first in range(0, len(names), length)]
+        return [part.partition("\0")[0] for part in parts], _padded(end)
 
 
 def _padded(position: int) -> int:

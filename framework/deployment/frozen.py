@@ -103,7 +103,7 @@ class Frozen:
                 return class_probabilities(density).to(self.dtype).numpy()
             return median(density, 1000).numpy()
 
-    @torch.inference_mode()
+    @torch.no_grad()  # not in inference mode: whoever asks the density later is outside of it
     def density(self, inputs: Any) -> Distribution:
         """The density over the target, with batch_shape (batch,); inputs as above."""
         return self._density(*self._features(inputs))
@@ -113,7 +113,7 @@ class Frozen:
         if self.data is not None:
             inputs = self.data.inputs(inputs)
         if self.preceded is not None:
-            with torch.inference_mode():
+            with torch.no_grad():
                 inputs = self.preceded.features(_tensor(inputs))
         if self.shape is None:
             self.shape = tuple(inputs.shape[1:])

@@ -10,6 +10,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    about,
     arc,
     cdf,
     estimate,
@@ -19,6 +20,7 @@ from framework.distributions.protocol import (
     normals,
     peaks,
     pick,
+    scales,
     tempered,
 )
 
@@ -226,15 +228,48 @@ def _(density: Reshaped) -> Normals | None:
 
 @peaks.register
 def _(density: Stacked) -> Tensor:
-    found = [peaks(one) for one in density.densities]
-    most = max(len(one) for one in found)
-    same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
-    return torch.stack(same, -1 - len(density.event_shape))
+    return _beside([peaks(one) for one in density.densities], -1 - len(density.event_shape))
 
 
 @peaks.register
 def _(density: Reshaped) -> Tensor:
     return peaks(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
+
+
+@scales.register
+def _(density: Stacked) -> Tensor:
+    return _beside([scales(one) for one in density.densities], -1)
+
+
+@scales.register
+def _(density: Reshaped) -> Tensor:
+    return scales(density.density).reshape(-1, *density.batch_shape)
+
+
+def _beside(found: list[Tensor], axis: int) -> Tensor:
+    """(peak, …) of each density; where one has fewer than others, its first stands for the rest."""
+    most = max(len(one) for one in found)
+    same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
+    return torch.stack(same, axis)
+
+
+@about.register
+def _(density: Stacked, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+    *item, number = index
+    every = torch.arange(len(density.densities), device=number.device)
+    if number.shape != every.shape or any(part.shape[-1:] != (1,) for part in (*item, place[..., 0])):
+        return about.dispatch(Distribution)(density, index, place)
+    item = tuple(part.squeeze(-1) for part in item)
+    return Stacked([about(one, item, place.squeeze(-2)) for one in density.densities])
+
+
+@about.register
+def _(density: Reshaped, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+    item = torch.zeros((), dtype=torch.int64, device=place.device)
+    for part, size in zip(index, density.batch_shape, strict=True):
+        item = item * size + part
+    inner = density.density
+    return about(inner, torch.unravel_index(item, inner.batch_shape), place)
 
 
 def _stacked(parts: list[Tensor | None]) -> Tensor | None:

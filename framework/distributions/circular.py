@@ -54,7 +54,8 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
     F(θ) = Σ_k Δ(θ, φ_k) is piecewise linear with convex kinks at samples and concave kinks at their antipodes, so
     its minimum over the whole circle lies at a sample: this is the exact circular median. With the samples sorted,
     those within half a turn ahead of φ_j are a run that starts at j; prefix sums over two turns give their summed
-    distance, and the summed distance to the rest likewise. Ties go to the smallest angle in [-π, π).
+    distance, and the summed distance to the rest likewise. Ties go to the smallest angle in [-π, π). Of samples
+    that are not all finite it is NaN.
     """
     count = samples.shape[0]
     if count == 0:
@@ -72,7 +73,9 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
     near = prefix.gather(-1, end) - prefix.gather(-1, start)
     behind = count - ahead
     cost = (near - ahead * angle) + (behind * (angle + turn) - (total - near))
-    best = cost.argmin(-1, keepdim=True)
+    best = torch.where(
+        angle[..., -1:].isnan(), count - 1, cost.argmin(-1, keepdim=True)
+    )  # NaN is sorted last
     return angle.gather(-1, best).squeeze(-1).to(samples.dtype)
 
 

@@ -9,6 +9,7 @@ from torch.distributions import Categorical, Distribution, Independent, Multivar
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    about,
     estimate,
     exactly,
     mahalanobis,
@@ -82,6 +83,15 @@ def _(density: Independent, index: Tensor) -> Distribution:
         return pick.dispatch(Distribution)(density, index)
     loc, scale = (take(parameter, index) for parameter in (base.loc, base.scale))
     return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+
+@about.register
+def _(density: Independent, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+    base = density.base_dist
+    if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
+        return about.dispatch(Distribution)(density, index, place)
+    loc, scale = (parameter.double()[index] for parameter in (base.loc, base.scale))
+    return Independent(Normal(loc - place, scale, validate_args=False), 1, validate_args=False)
 
 
 @tempered.register

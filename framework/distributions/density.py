@@ -9,9 +9,11 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, circular, grid
+from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    about,
     arc,
     cdf,
     estimate,
@@ -21,6 +23,7 @@ from framework.distributions.protocol import (
     normals,
     peaks,
     pick,
+    scales,
     take,
     with_error,
 )
@@ -39,6 +42,7 @@ __all__ = [
     "take",
 ]  # among them what this file held before the questions had a page of their own
 
+circular_entropy = entropy_of_one
 CHUNK = 2**20
 """Component densities evaluated at once without gradient, when one density is asked at many points."""
 
@@ -119,24 +123,27 @@ class Mixture(Distribution):
         return modes.gather(0, index.expand(1, *best.shape, *self.event_shape)).squeeze(0)
 
     def entropy(self) -> Tensor:
-        """Nats. Exact for classes, by quadrature for one angle.
+        """Nats. Exact for classes, by quadrature for one number.
 
-        Otherwise the mean of -log_prob over about 1000 samples in all, as many of each component, so that only their
-        spread within components is left to chance.
+        For several numbers Σ_k w_k (H_k - E_k log f/p_k), each component's own entropy H_k and a mean over about 1000
+        samples in all, as many of each: only where components overlap anything is left to chance.
         """
         count = self.log_weights.shape[-1]
         if count == 1:
             return self.components.entropy().squeeze(-1)
-        if self.event_shape == (1,) and isinstance(self.support, Circular):
-            return circular_entropy(self)
         if self.has_enumerate_support:
             log_prob = self.log_prob(self.enumerate_support())
             return -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
+        if has_range(self):
+            return entropy_of_one(self)
         each = max(2, 1024 // count)
         drawn = self.components.sample(torch.Size((each,)))
         values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
-        surprise = -self.log_prob(values).unflatten(0, (each, count)).mean(0).movedim(0, -1)
-        return (self.log_weights.exp() * surprise).sum(-1)
+        surprise = -self.log_prob(values).unflatten(0, (each, count)).movedim(
+            1, -1
+        ) + self.components.log_prob(drawn)
+        found = self.components.entropy() + surprise.mean(0)
+        return (self.log_weights.exp() * found).sum(-1)
 
 
 def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
@@ -236,6 +243,20 @@ def _(density: Mixture) -> Tensor:
     return found.flatten(0, 1)
 
 
+@scales.register
+def _(density: Mixture) -> Tensor:
+    return scales(density.components).movedim(-1, 0).flatten(0, 1)
+
+
+@about.register
+def _(density: Mixture, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+    every = torch.arange(density.log_weights.shape[-1], device=place.device)
+    components = about(
+        density.components, (*(part.unsqueeze(-1) for part in index), every), place.unsqueeze(-2)
+    )
+    return Mixture(density.log_weights.double()[index].expand(components.batch_shape), components)
+
+
 def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Tensor]:
     """Angles (points,) in [-π, π) and the log-density there (points, *batch) of a density of one angle.
 
@@ -253,10 +274,3 @@ def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Ten
         points, *density.batch_shape, 1
     )
     return angles, density.log_prob(value)
-
-
-def circular_entropy(density: Distribution, points: int = 720) -> Tensor:
-    """Entropy of a density of one angle, nats, by the trapezium rule (spectrally exact for smooth densities)."""
-    _, log_density = circular_grid(density, points)
-    mass = log_density.exp() * (2 * math.pi / points)
-    return -(mass * log_density.clamp(min=-1e4)).sum(0) / mass.sum(0)

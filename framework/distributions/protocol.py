@@ -102,6 +102,53 @@ class _Picked(Distribution):
 
 
 @singledispatch
+def about(density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+    """X - place, where X has the density at `index` of the batch: float64, however near the place values are asked.
+
+    Only `log_prob` is asked of the answer. Default: values are rounded where the place is added. A density that knows
+    where it lies registers one that takes the place from its location: then no rounding limits how narrow it may be.
+
+    Args:
+        index: int64, one for each batch dimension; together of shape (*items) where they broadcast.
+        place: (*items, 1), of densities of one number.
+    """
+    return _About(density, index, place)
+
+
+class _About(Distribution):
+    """Items of a batch, any of them any number of times, by asking for the whole batch as often as the commonest."""
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> None:
+        self.density = density
+        self.place = place
+        self.like = density.sample(torch.Size((0,)))
+        shape = torch.broadcast_shapes(place.shape[:-1], *(part.shape for part in index))
+        flat = torch.zeros(shape, dtype=torch.int64, device=place.device)
+        for part, size in zip(index, density.batch_shape, strict=True):
+            flat = flat * size + part
+        self.item = flat.flatten()
+        order = self.item.argsort(stable=True)
+        count = torch.bincount(self.item, minlength=density.batch_shape.numel())
+        first = (count.cumsum(0) - count)[self.item[order]]
+        self.turn = torch.empty_like(order)
+        self.turn[order] = torch.arange(len(order), device=order.device) - first
+        super().__init__(shape, density.event_shape, validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        value = (value + self.place).to(self.like.dtype)
+        lead = value.shape[: value.dim() - len(self.batch_shape) - 1]
+        value = value.expand(*lead, *self.batch_shape, 1).reshape(*lead, -1, 1)
+        turns = int(self.turn.amax()) + 1
+        whole = value.new_zeros(*lead, turns, self.density.batch_shape.numel(), 1)
+        whole[..., self.turn, self.item, :] = value
+        found = self.density.log_prob(whole.reshape(*lead, turns, *self.density.batch_shape, 1))
+        found = found.reshape(*lead, turns, -1)[..., self.turn, self.item]
+        return found.reshape(*lead, *self.batch_shape)
+
+
+@singledispatch
 def tempered(density: Distribution, temperature: Tensor) -> Distribution:
     """The density proportional to p^(1/T), T > 0 a scalar; same shapes and number type, differentiable in T.
 
@@ -231,6 +278,16 @@ def peaks(density: Distribution) -> Tensor:
     Default: its mode alone. A density with several humps registers a candidate for each.
     """
     return density.mode.unsqueeze(0)
+
+
+@singledispatch
+def scales(density: Distribution) -> Tensor:
+    """How wide each of the `peaks` of a density of one number is, (peak, *batch), in the number's unit.
+
+    Default: the standard deviation of the normal density that is as high.
+    """
+    places = peaks(density)
+    return (-density.log_prob(places).double()).exp() / math.sqrt(2 * math.pi)
 
 
 class ValueSet(ABC):

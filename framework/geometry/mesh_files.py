@@ -5,7 +5,6 @@ Every parser takes the bytes of a file and raises a ValueError that says what ca
 system, polygons are cut into fans of triangles (right where they are convex).
 """
 
-import io
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,6 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from framework.errors import shown
+from framework.storage import arrays
+
 XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
@@ -21,6 +23,8 @@ OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "n
 """What files call the columns that have a name of their own here."""
 MOST = 2**31
 """Vertices or faces that a header may announce; more is damage."""
+MOST_COLUMNS = 1000
+"""Numbers that a vertex may have."""
 
 
 class Parsed(NamedTuple):
@@ -224,18 +228,15 @@ def xyz(content: bytes) -> Parsed:
 
 def npy(content: bytes) -> Parsed:
     """A NumPy array of (points, 3 or more) numbers."""
-    return _table(_points(np.load(io.BytesIO(content))), None)
+    return _table(_points(arrays.array(content)), None)
 
 
 def npz(content: bytes) -> Parsed:
     """A NumPy archive: `points`, or the only array; `normals`, `colors` and other columns by their names; `faces`."""
-    archive = np.load(io.BytesIO(content))
-    if isinstance(archive, np.ndarray):
-        raise ValueError("it is a single array; name it .npy")
-    held = {name: archive[name] for name in archive.files}
+    held = arrays.archive(content)
     key = "points" if "points" in held or len(held) != 1 else next(iter(held))
     if key not in held:
-        raise ValueError(f"wanted an array named points, got {', '.join(held) or 'nothing'}")
+        raise ValueError(f"wanted an array named points, got {shown(', '.join(held)) or 'nothing'}")
     points = _points(held.pop(key))
     faces = held.pop("faces", np.empty((0, 3), np.int64))
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
@@ -261,6 +262,8 @@ def _points(array: NDArray) -> Float[np.ndarray, "points columns"]:
 
 
 def _table(values: NDArray, names: tuple[str, ...] | None) -> Parsed:
+    if values.shape[1] > MOST_COLUMNS:
+        raise ValueError(f"each point has {values.shape[1]} numbers; wanted at most {MOST_COLUMNS}")
     more = max(values.shape[1] - 3, 0)
     columns = names or tuple(f"column_{number}" for number in range(4, 4 + more))
     vertices = values[:, :3].reshape(-1, 3)

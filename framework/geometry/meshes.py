@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from framework.errors import DataError, did_you_mean
+from framework.errors import DataError, did_you_mean, shown
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import COLOURS, Parsed
 from framework.geometry.ply import ply
+from framework.storage.reading import guarded, read_bytes
 
 READERS: dict[str, Callable[[bytes], Parsed]] = {
     ".off": mesh_files.off,
@@ -56,7 +57,7 @@ class Mesh:
         if missing:
             raise DataError(
                 f"{self.source} has no column {missing[0]!r}.{did_you_mean(missing[0], self.columns)} Its columns "
-                f"beside x, y, z: {', '.join(self.columns) or 'none'}. Leave it out, or add it to the file."
+                f"beside x, y, z: {shown(', '.join(self.columns)) or 'none'}. Leave it out, or add it to the file."
             )
         if not names or self.attributes is None:
             return np.empty((len(self.vertices), 0))
@@ -92,13 +93,9 @@ def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
     parse = READERS.get(file.suffix.lower())
     if parse is None:
         raise DataError(f"{file}: cannot be read; wanted a file whose name ends in {', '.join(READERS)}.")
-    try:
-        found = parse(file.read_bytes())
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file; wanted a mesh or point cloud. Mend the path.") from None
-    except Exception as error:  # NumPy's archives raise whatever damage leads them to
-        kind = file.suffix[1:].upper()
-        raise DataError(f"{file}: cannot be read as {kind}: {error}. Restore it from its source.") from error
+    missing = "wanted a mesh or point cloud. Mend the path."
+    with guarded(file, file.suffix[1:].upper(), missing=missing):
+        found = parse(read_bytes(file))
     if not len(found.vertices):
         raise DataError(f"{file}: it has no vertices; wanted at least one. Leave it out, or restore it.")
     _check_faces(file, found)

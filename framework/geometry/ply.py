@@ -7,7 +7,18 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from framework.geometry.mesh_files import COLOURS, MOST, XYZ, Parsed, column_names, fans, polygons, rows
+from framework.errors import quoted, shown
+from framework.geometry.mesh_files import (
+    COLOURS,
+    MOST,
+    MOST_COLUMNS,
+    XYZ,
+    Parsed,
+    column_names,
+    fans,
+    polygons,
+    rows,
+)
 
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -55,7 +66,7 @@ def ply(content: bytes) -> Parsed:
     if "tristrips" in names:
         raise ValueError("its faces are strips of triangles; save it with single faces")
     if "vertex" not in names:
-        raise ValueError(f"wanted an element vertex, got {', '.join(sorted(names)) or 'none'}")
+        raise ValueError(f"wanted an element vertex, got {shown(', '.join(sorted(names))) or 'none'}")
     body = content[end.end() :]
     vertices, faces = _text(body, elements) if order == "" else _binary(body, elements, order)
     return _parsed(next(element for element in elements if element.name == "vertex"), vertices, faces)
@@ -65,6 +76,8 @@ def _header(text: str) -> tuple[str, list[Element]]:
     order: str | None = None
     elements: list[Element] = []
     for line in text.splitlines()[1:]:
+        if max(len(elements), len(elements[-1].properties) if elements else 0) > MOST_COLUMNS:
+            raise ValueError(f"its header has more than {MOST_COLUMNS} elements, or properties of one")
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):
             continue
@@ -87,7 +100,7 @@ def _header(text: str) -> tuple[str, list[Element]]:
             else:
                 raise ValueError
         except (KeyError, IndexError, ValueError):
-            raise ValueError(f"its header has the line {line.strip()!r}, which is not PLY's") from None
+            raise ValueError(f"its header has the line {quoted(line.strip())}, which is not PLY's") from None
     if order is None:
         raise ValueError("its header has no line format")
     return order, elements
@@ -148,6 +161,8 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
                 return empty, end
             corners = table[f"value{element.properties.index(wanted)}"]
             return fans(np.full(len(corners), corners.shape[1]), corners.astype(np.int64).ravel()), end
+    least = sum(int((entry.length or entry.kind)[1]) for entry in element.properties)
+    _require(body, start + element.count * least)
     counts, corners = [], []
     for _ in range(element.count):
         for entry in element.properties:
@@ -203,14 +218,16 @@ def _corners(element: Element) -> Property:
 def _no_list(element: Element) -> None:
     lists = [entry.name for entry in element.properties if entry.length is not None]
     if lists:
-        raise ValueError(f"its vertices have lists ({', '.join(lists)}); wanted single numbers")
+        raise ValueError(f"its vertices have lists ({shown(', '.join(lists))}); wanted single numbers")
 
 
 def _parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
     names = column_names([entry.name for entry in vertex.properties])
     missing = [name for name in XYZ if name not in names]
     if missing:
-        raise ValueError(f"its vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
+        raise ValueError(
+            f"its vertices have no {', '.join(missing)}, only {shown(', '.join(names)) or 'nothing'}"
+        )
     if not len(values):
         values = np.empty((0, len(names)))
     for number, entry in enumerate(vertex.properties):

@@ -20,11 +20,15 @@ def geodesic_distance(
 ) -> Float[Tensor, "*batch"]:
     """Angle of the rotation between two rotations, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
 
-    Exact near 0, where the arc cosine of the trace loses half the digits, and near π.
+    Exact near 0, where the arc cosine of the trace loses half the digits, and near π, where the trace's cos(angle / 2)
+    does: there that is sin(angle) / (2 sin(angle / 2)), from the part of R₁ᵀR₂ that is not symmetric.
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5  # sin(angle / 2)
     trace = (first * second).sum((-2, -1))
-    cosine = ((1 + trace).clamp(min=0) / 4).sqrt()  # cos(angle / 2)
+    wide = trace < 0
+    between = first.mT @ second
+    sine = torch.linalg.matrix_norm(between - between.mT) / 8**0.5
+    cosine = torch.where(wide, sine / (2 * chord.clamp(min=0.5)), ((1 + trace.where(~wide, 0)) / 4).sqrt())
     return 2 * torch.atan2(chord, cosine)
 
 

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from framework.configuration.config import Config
+from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
 
 MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
+
+READING = ("test", "predict", "work_precision")
+"""Modes that read `checkpoint`."""
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
@@ -24,12 +28,21 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         raise ConfigError(
             f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}."
         )
-    return import_module(f"framework.modes.{name}").run(Config.of(values, folder, overrides))
+    config = Config.of(values, folder, overrides)
+    if config.settings.checkpoint is not None and name not in READING:
+        raise ConfigError(
+            f"checkpoint={config.settings.checkpoint}: mode={name} reads none, {', '.join(READING)} do. To go "
+            "on with a run that was stopped: resume=<run folder>."
+        )
+    if name == "train":  # what is wrong is found before Lightning is imported, which takes seconds
+        require_device(config.settings.trainer.get("accelerator"))
+        _ = config.parts
+    return import_module(f"framework.modes.{name}").run(config)
 
 
 def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
     """The config and overrides the run in `folder` was started with: resuming changes neither."""
-    from framework.runs.run import stored_config, stored_overrides
+    from framework.storage.plain_values import read_yaml
     from framework.tracking.run_info import read_run_info
 
     others = [item for item in overrides if not item.startswith("resume=")]
@@ -43,7 +56,14 @@ def _stored(folder: Path, overrides: Sequence[str]) -> tuple[dict[str, Any], lis
         raise ConfigError(
             f"resume={folder}: that run has finished; there is nothing to go on with. Start a new run."
         )
-    values = stored_config(folder)
-    if not isinstance(values, dict):
+    values, changed = (
+        read_yaml(folder / name, "a config that a run has left", "Start a new run.", ConfigError)
+        for name in ("config.yaml", "overrides.yaml")
+    )
+    if (
+        not isinstance(values, dict)
+        or not isinstance(changed, list)
+        or not all(isinstance(item, str) for item in (*values, *changed))
+    ):
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
-    return values, stored_overrides(folder)
+    return values, changed

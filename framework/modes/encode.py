@@ -22,6 +22,7 @@ from framework.errors import ConfigError, DataError
 from framework.runs.run import opened
 from framework.runs.session import begin, record_citations
 from framework.storage.files import write_whole
+from framework.storage.plain_values import read_json
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
@@ -150,7 +151,7 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
     collection.into.mkdir(parents=True, exist_ok=True)
     path = collection.into / DESCRIPTION
     if path.is_file():
-        there = json.loads(path.read_text(encoding="utf-8"))
+        there = read_json(path, "the description of encoded files", "Delete it, or give another mode.into.")
         for key, value in said.items():
             if there.get(key) != value:
                 raise ConfigError(

@@ -12,7 +12,7 @@ from torch.utils.data import Subset
 from framework.data import Data
 from framework.distributions.circular import angular_distance
 from framework.distributions.class_probabilities import class_probabilities
-from framework.distributions.density import circular_entropy, circular_grid
+from framework.distributions.density import circular_grid
 from framework.distributions.noise import Draw
 from framework.evaluation.splits import on_device, predicted
 from framework.reports.class_picture import choose_classified, classified
@@ -49,7 +49,7 @@ def _densities(session: Session) -> Figure:
         prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
         first = prediction.marginal(0)
         angles, log_density = circular_grid(first)
-        entropy, truth, point = circular_entropy(first), batch["target"][:, 0], prediction.point[:, 0]
+        entropy, truth, point = first.entropy(), batch["target"][:, 0], prediction.point[:, 0]
         symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
         columns.append((log_density, entropy, angular_distance(truth, point), truth, point, symmetry))
         inputs.extend(batch["input"].cpu())

@@ -1,17 +1,20 @@
 """What a checkpoint says of its model beside the weights: enough to build it again, to feed it and to name it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import Any, get_args
 
 from framework.configuration.assembly import Resolved
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.errors import CheckpointError
-from framework.target import Target
+from framework.target import Kind, Target
 
+LONGEST_NAME = 1000
+"""Letters of a target's name."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
 """Settings that a later test of the model repeats, so that it gives the numbers of the model's own run."""
 
@@ -75,8 +78,9 @@ class Description:
         """Out of a checkpoint's contents; the config is checked again: it can only choose among installed plugins.
 
         Raises:
-            CheckpointError: it is missing or lacks something.
+            CheckpointError: there is none.
             ConfigError: a part of the config is unknown here.
+            LookupError, TypeError, ValueError: it is not whole.
         """
         stored = content.get("framework")
         if not isinstance(stored, Mapping) or stored.get("format") != 1:
@@ -84,27 +88,35 @@ class Description:
                 f"{path} was not written by this framework (it holds no model description of format 1). "
                 "Give a run folder, or a checkpoint from its checkpoints/."
             )
-        try:
-            target = {
-                key: tuple(value) if isinstance(value, list | tuple) else value
-                for key, value in stored["target"].items()
-            }
-            return cls(
-                checked(stored["config"]),
-                Target(**target),  # pyright: ignore[reportArgumentType]  # checked by Target's readers
-                tuple(map(int, stored["input_shape"])),
-                tuple(map(str, stored.get("columns", ()))),
-                bool(stored.get("synthetic", False)),
-                str(stored.get("method", "")),
-                {key: value for key, value in dict(stored.get("settings", {})).items() if key in INHERITED},
-                dict(stored.get("data_state", {})),
-                path,
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise CheckpointError(
-                f"The description of the model in {path} is not whole ({type(error).__name__}: {str(error)[:200]}). "
-                "Restore the file, or train anew."
-            ) from error
+        return cls(
+            checked(stored["config"]),
+            stored_target(stored["target"]),
+            tuple(map(int, stored["input_shape"])),
+            tuple(map(str, stored.get("columns", ()))),
+            bool(stored.get("synthetic", False)),
+            str(stored.get("method", "")),
+            {key: value for key, value in dict(stored.get("settings", {})).items() if key in INHERITED},
+            dict(stored.get("data_state", {})),
+            path,
+        )
+
+
+def stored_target(stored: Mapping[str, Any]) -> Target:
+    """What is predicted; a ValueError where that is no target."""
+    kind, names = stored["kind"], tuple(map(str, stored["names"]))
+    location, scale = (tuple(map(float, stored.get(key, ()))) for key in ("location", "scale"))
+    sizes = {len(location), len(scale)}
+    if kind not in get_args(Kind) or any(len(name) > LONGEST_NAME for name in names):
+        raise ValueError(f"a target of kind {kind!r} with the names {names}")
+    if (
+        sizes not in ({0}, {len(names)})
+        or not all(map(math.isfinite, location + scale))
+        or min(scale, default=1) <= 0
+    ):
+        raise ValueError(
+            "a target's location and scale are no finite numbers of which the scales are above 0"
+        )
+    return Target(kind, names, location, scale)
 
 
 def checked(config: Mapping[str, Any]) -> Resolved:

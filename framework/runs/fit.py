@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 import pytorch_lightning as pl
-from pytorch_lightning.callbacks import EarlyStopping, RichProgressBar
+from pytorch_lightning.callbacks import EarlyStopping
 from rich.console import Console
 from torch import distributed as dist
 
@@ -18,6 +18,7 @@ from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import WholeCheckpoints, latest_good, read
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
+from framework.training.progress import Progress
 
 TRAINED = {"last.ckpt", "previous.ckpt", "best.ckpt"}
 """Checkpoints that training can go on from; model.ckpt holds weights alone."""
@@ -64,12 +65,16 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
         settings.trainer.get("checkpoint_every_steps"),
         settings.trainer.get("keep") or "best",
     )
-    trainer = _trainer(run, keep)
+    trainer = _trainer(run, keep, session.console)
     batches = session.batches(fed)
     batches.attach(trainer)
     resume = _resumed_from(session, run)
     trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
     _part()
+    early = any(isinstance(one, EarlyStopping) and one.stopped_epoch for one in trainer.callbacks)  # type: ignore[attr-defined]
+    session.console.print(
+        f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
+    )
     if first_rank():
         fill(session.predictor, weights(read(keep.kept)), str(keep.kept))
     session.device = trainer.strategy.root_device
@@ -112,7 +117,7 @@ def _cached(session: Session) -> Data:
     return cached
 
 
-def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
+def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     chosen = dict(run.settings.trainer)
     patience = chosen.get("patience")
     callbacks: list[pl.Callback] = [
@@ -122,11 +127,12 @@ def _trainer(run: Run, keep: KeepCheckpoints) -> pl.Trainer:
     ]
     if patience:
         callbacks.append(EarlyStopping("validation/loss", patience=patience, check_finite=True))
-    terminal = Console(stderr=True).is_terminal
-    if terminal:
-        callbacks.append(RichProgressBar())
+    if chosen.get("enable_progress_bar", True):
+        terminal = Console(stderr=True, quiet=console.quiet)
+        callbacks.append(Progress(terminal if terminal.is_terminal else console))
     arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
-    defaults = {"enable_progress_bar": terminal, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    arguments |= {"enable_progress_bar": False}  # Lightning's own
+    defaults = {"enable_model_summary": False, "num_sanity_val_steps": 0}
     return pl.Trainer(
         **{**defaults, **arguments},
         logger=False,

@@ -15,8 +15,10 @@ from framework.density_head import Fitted
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
 from framework.runs.description import Description
+from framework.storage.reading import guarded
 from framework.training.checkpoint import latest_good, read
 
+FOREIGN = "This framework did not write it: do not use it."
 PREFIX = "predictor."
 """What Lightning's checkpoints put before the predictor's own parameter names."""
 
@@ -51,10 +53,11 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
 
 def reader(description: Description) -> Data:
     """The data set of a model, not prepared: it makes inputs of what a user gives."""
-    data = build_data({"data": resolve("data", description.config["data"])})
-    data.target, data.input_shape = description.target, description.input_shape
-    data.columns, data.synthetic = description.columns, description.synthetic
-    data.load_state_dict(description.data_state)
+    with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+        data = build_data({"data": resolve("data", description.config["data"])})
+        data.target, data.input_shape = description.target, description.input_shape
+        data.columns, data.synthetic = description.columns, description.synthetic
+        data.load_state_dict(description.data_state)
     return data
 
 
@@ -64,13 +67,15 @@ def load_with_description(
     """The trained predictor, as `load`, with what the checkpoint says of itself."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
-    description = Description.read(content, str(path))
-    parts = description.config
-    for part in parts["encoder"]:
-        # the checkpoint holds the weights now; the file they were started from may be gone
-        part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
-    predictor = build_predictor(parts, description.target, description.input_shape, 0, description.columns)
-    fill(predictor, weights(content), str(path))
+    with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+        description = Description.read(content, str(path))
+        parts = description.config
+        for part in parts["encoder"]:
+            # the checkpoint holds the weights now; the file they were started from may be gone
+            part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
+        shape, columns = description.input_shape, description.columns
+        predictor = build_predictor(parts, description.target, shape, 0, columns)
+        fill(predictor, weights(content), str(path))
     return predictor.eval(), description
 
 

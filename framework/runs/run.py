@@ -18,6 +18,7 @@ from framework.errors import UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
 from framework.storage.files import write_whole
+from framework.storage.plain_values import read_yaml
 from framework.tracking.run_info import read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
@@ -75,13 +76,13 @@ def first_rank() -> bool:
 def stored_config(folder: Path) -> dict[str, Any] | None:
     """The config a run folder was made with; None where there is none yet."""
     path = folder / "config.yaml"
-    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else None
+    return read_yaml(path, "the config of a run") if path.is_file() else None
 
 
 def stored_overrides(folder: Path) -> list[str]:
     """The overrides a run folder was made with."""
     path = folder / "overrides.yaml"
-    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else []
+    return read_yaml(path, "the overrides of a run") if path.is_file() else []
 
 
 @contextmanager

@@ -1,7 +1,6 @@
 """A session: threads, device, and all parts of a command, built and matched before a step is trained."""
 
 import ctypes
-import inspect
 import logging
 import platform
 import warnings
@@ -9,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import pytorch_lightning as pl
 import torch
 from rich.console import Console
 
@@ -21,11 +19,12 @@ from framework.configuration.assembly import (
     build_outliers,
     build_predictor,
     citations,
+    entries,
     require_outliers,
 )
 from framework.configuration.config import Config
 from framework.configuration.schema import resolve
-from framework.configuration.settings import Settings, check_trainer_keys
+from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
 from framework.distributions.noise import seed_step
@@ -118,7 +117,7 @@ def record_citations(run: Run, parts: Resolved) -> None:
     """Write what to cite into the run folder and the store."""
     path = run.folder / "citations.bib"
     if first_rank():
-        path.write_text("\n\n".join(dict.fromkeys(citations(parts).values())) + "\n", encoding="utf-8")
+        path.write_text("\n\n".join(entries(citations(parts).values()).values()) + "\n", encoding="utf-8")
     run.tracker.log_artifact(path)
 
 
@@ -139,8 +138,6 @@ def for_training(config: Config) -> Session:
         DataError: as `Data.prepare`.
     """
     console = begin(config.settings)
-    known = set(inspect.signature(pl.Trainer.__init__).parameters) - {"self"}
-    check_trainer_keys(config.settings.trainer, known)
     parts = config.parts
     data = build_data(parts)
     data.prepare()

@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from framework.errors import DataError
 from framework.storage.files import alone
+from framework.storage.plain_values import read_json
 
 MARK = "synthetic.json"
 PAINTERS = 2
@@ -52,14 +53,9 @@ def read_mark(root: Path) -> dict[str, Any] | None:
     Raises:
         DataError: the file cannot be read.
     """
-    try:
-        return json.loads((root / MARK).read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not (root / MARK).exists():
         return None
-    except (OSError, ValueError) as error:
-        raise DataError(
-            f"{root / MARK}: cannot be read ({error}). Delete {root}: it is made anew."
-        ) from error
+    return read_json(root / MARK, "the mark of generated data", f"Delete {root}: it is made anew.")
 
 
 def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:

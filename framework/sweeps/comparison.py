@@ -13,9 +13,12 @@ from framework.configuration.settings import store_experiment
 from framework.errors import ConfigError, did_you_mean
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
 from framework.runs.job import RECORD
-from framework.tracking.tracker import MlflowTracker, mark_dead
+from framework.storage.plain_values import read_json
+from framework.tracking.ended import mark_dead
+from framework.tracking.tracker import MlflowTracker
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
+PARENT_OF = "what a sweep keeps of its parent run"
 RETURNED = "best validation loss (nats)"
 """What a training returns to its sweep."""
 
@@ -44,7 +47,7 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
     if logger.get("name") != "mlflow":
         return None
     earlier = folder / "parent.json"  # of the sweep that is being resumed
-    known = json.loads(earlier.read_text(encoding="utf-8"))["run_id"] if earlier.is_file() else None
+    known = read_json(earlier, PARENT_OF).get("run_id") if earlier.is_file() else None
     logger = {**logger, "experiment": store_experiment(config)}
     tracker = _parent(folder, logger, known)
     tracker.open()
@@ -156,7 +159,7 @@ def close_ranking(folder: Path) -> None:
 
 def _results(trial: Trial) -> dict[str, Any]:
     path = trial.folder / "results.json"
-    return json.loads(path.read_text(encoding="utf-8")) if trial.completed and path.is_file() else {}
+    return read_json(path, "the results of a job") if trial.completed and path.is_file() else {}
 
 
 def _trial_row(
@@ -209,14 +212,14 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def _status(folder: Path) -> str:
-    return json.loads((folder / RECORD).read_text(encoding="utf-8")).get("status", "")
+    return read_json(folder / RECORD, "the record of a job").get("status", "")
 
 
 def _row(path: Path) -> dict[str, Any] | None:
     if _status(path.parent) != "completed":
         return None
-    results = json.loads(path.read_text(encoding="utf-8"))
-    record = json.loads((path.parent / RECORD).read_text(encoding="utf-8"))
+    results = read_json(path, "the results of a job")
+    record = read_json(path.parent / RECORD, "the record of a job")
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
     return {**swept, **results, "overrides": record["overrides"]}
 
@@ -278,7 +281,7 @@ def _close_parent(folder: Path, files: Sequence[Path], rows: Sequence[Mapping[st
     path = folder / "parent.json"
     if not path.is_file():
         return
-    stored = json.loads(path.read_text(encoding="utf-8"))
+    stored = read_json(path, PARENT_OF)
     tracker = _parent(folder, stored["logger"], stored["run_id"])
     tracker.open()
     for row in rows:

@@ -21,6 +21,8 @@ from typing import Any
 from framework.errors import ConfigError, UserError
 from framework.runs.job import PARENT, RECORD, VALUE
 from framework.storage.files import write_whole
+from framework.storage.plain_values import read_json
+from framework.storage.reading import guarded, read_bytes
 from framework.tracking.signals import Stopped
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
@@ -68,7 +70,8 @@ class Job:
     def value(self) -> float | None:
         """What the job left for the sweeper to minimise (`leave_value`)."""
         path = self.folder / VALUE
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        with guarded(path, "a number", "Delete it, and the job runs anew."):
+            return float(json.loads(read_bytes(path))) if path.is_file() else None
 
 
 def hashed(*parts: str) -> str:
@@ -80,8 +83,8 @@ def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
     """Folder and record of every job an earlier sweep in `folder` knew, by key (overrides may repeat)."""
     found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
     for path in sorted(folder.rglob(RECORD)):
-        record = json.loads(path.read_text(encoding="utf-8"))
-        found.setdefault(record["key"], []).append((path.parent, record))
+        record = read_json(path, "the record of a job", "Delete it, and the job runs anew.")
+        found.setdefault(str(record.get("key")), []).append((path.parent, record))
     return found
 
 
@@ -153,7 +156,7 @@ def run(
                 if lock is None:
                     queue.append(job)
                     continue
-                job.record = json.loads((job.folder / RECORD).read_text(encoding="utf-8"))
+                job.record = read_json(job.folder / RECORD, "the record of a job")
                 if job.completed:  # by another sweep, while this one waited for the folder
                     os.close(lock)
                 else:
@@ -173,7 +176,7 @@ def run(
 
 def _sync(folder: Path) -> None:
     """Send what a job left unsent; one that died is closed and sent by the comparison."""
-    from framework.tracking.tracker import sync  # Hydra imports this module at every start
+    from framework.tracking.ended import sync  # Hydra imports this module at every start
 
     try:
         sync(folder)

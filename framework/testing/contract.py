@@ -64,8 +64,8 @@ class Contract:
 def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> Contract:
     """The contract of the plugin `name`; `config`, where it is neither a row already nor the defaults, is one more.
 
-    Where the plugin ships rows, the further one is the first of them with other parameters: it keeps the target, and
-    what is left out, but no reference.
+    Where the plugin ships rows, the further one is that of the same parts, else the first whose target suits it, with
+    other parameters: it keeps the target, and what is left out, but no reference.
 
     Raises:
         ConfigError: no such plugin, a group without a contract, a config out of range, or no row fits.
@@ -87,10 +87,31 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
         usual = resolve(group, {"name": name})
         further = configured(shipped[0], {key: plain[key] for key in plain if plain[key] != usual[key]})
         return Contract(group, name, (further, *shipped))
-    further = replace(shipped[0], name="as configured", config=plain)
+    further = replace(_nearest(group, chosen, shipped), name="as configured", config=plain)
     if isinstance(further, HeadRow):
         further = replace(further, cases=None)
     return Contract(group, name, (further, *shipped))
+
+
+def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) -> Row:
+    """The row whose parts have the names of the chosen ones', or the first whose target accepts them."""
+
+    def same_parts(row: Row) -> bool:
+        theirs = resolve(group, {"name": chosen["name"], **row.config})
+        return [part_name(theirs[key]) for key in chosen] == [part_name(value) for value in chosen.values()]
+
+    def part_name(value: Any) -> Any:
+        return value.get("name") if isinstance(value, Mapping) else None
+
+    refused: list[ConfigError] = []
+    for row in sorted(shipped, key=same_parts, reverse=True):
+        try:
+            if target := getattr(row, "target", None):
+                _tried(group, chosen, target)
+            return row
+        except ConfigError as error:
+            refused.append(error)
+    raise refused[0]
 
 
 def _shipped(group: str, name: str) -> tuple[Row, ...]:

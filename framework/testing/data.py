@@ -23,6 +23,7 @@ from framework.testing.data_files import (
     left_out,
     missing_root,
     own_files,
+    raw_input,
     read_back,
 )
 from framework.testing.data_folders import Build, Workbench, cache_in
@@ -66,6 +67,7 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "damaged files are named": (0.0, damaged_files),
             "files left out are counted": (0.0, left_out),
             "own files": (0.0, own_files),
+            "raw input": (0.0, raw_input),
             "damaged own files are named": (0.0, damaged_own_files),
         }
         for name, (limit, check) in checks.items():

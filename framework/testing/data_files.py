@@ -1,9 +1,12 @@
 """What the contract asks of a data set's files: roots that are missing, files that are damaged, a user's own files."""
 
+import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from pickle import UnpicklingError
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -96,6 +99,37 @@ def own_files(bench: Workbench, worst: Worst) -> None:
         worst.same(f"{what}: samples", len(found), len(wanted))
         for number, (one, other) in enumerate(zip(found, wanted, strict=False)):
             worst.same_bits(f"{what}: sample {number}", one, other)
+
+
+def raw_input(bench: Workbench, worst: Worst) -> None:
+    """With its config and what travels with a model alone it makes of files what the prepared data set makes."""
+    files = list(bench.row.files(bench.folder())) if bench.row.files else []
+    nowhere = {key: str(bench.folder() / "nowhere") for key in bench.says_where}
+    data, trained = bench.built(bench.first, **nowhere), bench.data
+    data.target, data.input_shape, data.columns = trained.target, trained.input_shape, trained.columns
+    stored = io.BytesIO()
+    torch.save(dict(trained.state_dict()), stored)
+    stored.seek(0)
+    try:
+        data.load_state_dict(torch.load(stored, weights_only=True))
+    except UnpicklingError as error:
+        worst.count(True, f"state_dict holds more than plain values and tensors: {str(error)[:200]}")
+        return
+    for file in files:
+        with cache_in(bench.first.cache):
+            found, wanted = (
+                data.inputs(file),
+                [sample["input"] for _, sample in samples(trained.read([file]))],
+            )
+        worst.same(f"{file.name}: samples", len(found), len(wanted))
+        for number, (one, other) in enumerate(zip(found, wanted, strict=False)):
+            worst.same_bits(f"{file.name}: sample {number}", trimmed(one), trimmed(other))
+    for what, given in {
+        "an object": object(),
+        "words": [["a"]],
+        "99991 numbers": np.zeros((2, 99991)),
+    }.items():
+        refused(lambda given=given: data.inputs(given), [], what, worst)
 
 
 def damaged_own_files(bench: Workbench, worst: Worst) -> None:

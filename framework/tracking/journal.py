@@ -14,10 +14,12 @@ from typing import Any, BinaryIO
 
 from framework.errors import DataError
 from framework.storage.files import write_whole
+from framework.storage.reading import guarded, opened
 
 _log = logging.getLogger(__name__)
 # json.dumps with options builds its encoder anew at each call; this one is built once.
 _encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+_NO_NUMBERS = ("nan", "inf", "-inf")
 _BLOCK = 1 << 20  # bytes read at a time: bounds the memory of a reader that is far behind
 
 
@@ -101,7 +103,8 @@ class Journal:
             rewritten = self._rewritten
             if not self.path.exists():
                 return []
-            file = self.path.open("rb")  # stays the file it is, should drop_after replace it now
+            with guarded(self.path, "a journal"):
+                file = opened(self.path)  # stays the file it is, should drop_after replace it now
         records: list[dict[str, Any]] = []
         with file:
             file.seek(offset)
@@ -284,15 +287,17 @@ class Journal:
         return 0
 
     def _parse(self, block: bytes, after: int) -> list[dict[str, Any]]:
-        records = []
+        records, damaged = [], []
         for line in block.splitlines():
             if _number(line) <= after:
                 continue
             record = _record(line)
             if record is None:
-                _log.warning("Skipped a damaged line of %s: %r.", self.path, line[:80])
+                damaged.append(line)
             elif record["n"] > after:
                 records.append(record)
+        if damaged:
+            _log.warning("Skipped damaged lines of %s, %d: %r.", self.path, len(damaged), damaged[0][:80])
         return records
 
 
@@ -334,15 +339,25 @@ def _whole_lines(file: BinaryIO) -> bytes:
 def _number(line: bytes) -> int:
     """A line's number without parsing the rest; a large one where it has none."""
     digits = line[5 : line.find(b",", 5)] if line.startswith(b'{"n":') else b""
-    return int(digits) if digits.isdigit() else 1 << 62
+    return int(digits) if digits.isdigit() and len(digits) < 19 else 1 << 62
 
 
 def _record(line: bytes) -> dict[str, Any] | None:
+    if not line.startswith(b"{"):
+        return None
     try:
         record = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
-    return record if isinstance(record, dict) and isinstance(record.get("n"), int) else None
+    if not isinstance(record, dict) or not isinstance(record.get("n"), int):
+        return None
+    values = record.get("values", {})
+    whole = isinstance(values, dict) and all(
+        value in _NO_NUMBERS if isinstance(value, str) else isinstance(value, int | float)
+        for value in values.values()
+    )
+    placed = all(isinstance(record.get(key), int | float) for key in ("time", "step", "epoch"))
+    return record if whole and (placed or not values) else None
 
 
 @cache

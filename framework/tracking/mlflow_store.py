@@ -94,9 +94,13 @@ class MlflowStore(Store):
             self._params |= {param.key: param.value for param in params}
 
     def send_file(self, path: str, place: str) -> None:
-        """As in `Store`; a file that is gone is said and passed over."""
-        file = self._folder / path
-        if file.is_dir():
+        """As in `Store`; a file that is gone, or leads out of the run folder, is said and passed over."""
+        file, home = self._folder / path, self._folder.resolve()
+        # a journal may be a stranger's: what lies elsewhere is not the run's to give away
+        held = [file, *file.rglob("*")] if file.is_dir() else [file]
+        if not all(item.resolve().is_relative_to(home) for item in held):
+            _log.warning("%s leads out of the run folder %s: it is not sent.", file, home)
+        elif file.is_dir():
             self._client.log_artifacts(
                 self._run_id, str(file), f"{place}/{file.name}" if place else file.name
             )

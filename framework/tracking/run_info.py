@@ -2,14 +2,19 @@
 
 import json
 import logging
+import os
 import re
 import threading
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
-from framework.errors import ConfigError, DataError
+from pydantic import TypeAdapter
+
+from framework.errors import ConfigError
 from framework.storage.files import write_whole
+from framework.storage.reading import guarded, read_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -55,16 +60,10 @@ def read_run_info(folder: Path) -> RunInfo | None:
         DataError: it is not what a tracker wrote.
     """
     path = folder / SIDECAR
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        known = {item.name: stored[item.name] for item in fields(RunInfo) if item.name in stored}
-        return RunInfo(**{**known, "owed": tuple((file, place) for file, place in stored["owed"])})
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (ValueError, TypeError, KeyError) as error:
-        raise DataError(
-            f"{path} is damaged ({type(error).__name__}: {error}). Remove it, and the run begins anew."
-        ) from error
+    with guarded(path, "what a tracker wrote", "Remove it, and the run begins anew."):
+        return TypeAdapter(RunInfo).validate_json(read_bytes(path))
 
 
 class Sidecar:
@@ -85,6 +84,24 @@ class Sidecar:
                 OSError
             ) as error:  # an old one costs only that lines are sent again, which the store ignores
                 _log.warning("%s could not be written: %s.", self._path, error.strerror)
+
+
+def require_own_store(uri: str, given: str | None, source: Path) -> None:
+    """Refuse to send to a server that only a file names: a run folder may be a stranger's.
+
+    Args:
+        given: the store that the user names.
+
+    Raises:
+        ConfigError: it is neither a local file, nor on this machine, nor named by `given` or MLFLOW_TRACKING_URI.
+    """
+    own = [without_password(name) for name in (given, os.environ.get("MLFLOW_TRACKING_URI")) if name]
+    here = not uri or uri.startswith(_SQLITE) or urlsplit(uri).hostname in ("localhost", "127.0.0.1", "::1")
+    if not here and without_password(uri) not in own:
+        raise ConfigError(
+            f"{source} says that the run goes to {without_password(uri)}. If that is where you keep runs, say so: add "
+            f"logger.uri={without_password(uri)}"
+        )
 
 
 def default_uri(folder: Path) -> str:

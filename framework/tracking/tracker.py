@@ -4,6 +4,7 @@ import importlib
 import json
 import logging
 import shlex
+import shutil
 import time
 import uuid
 from abc import ABC, abstractmethod
@@ -12,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, final
 
-from framework.errors import DataError, UserError
 from framework.storage.files import write_whole
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
@@ -25,15 +25,14 @@ from framework.tracking.run_info import (
     store_uri,
     without_password,
 )
-from framework.tracking.sender import OpenStore, Sender, send_all
-
-__all__ = ["MlflowTracker", "NoTracker", "RunInfo", "Tracker", "mark_dead", "read_run_info", "sync"]
+from framework.tracking.sender import OpenStore, Sender
 
 _log = logging.getLogger(__name__)
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 JOURNAL = "journal.jsonl"
+ELSEWHERE = "elsewhere"  # copies of files that were logged from outside of the run folder
 LONGEST_PARAMETER = 250  # characters; some servers cut off the rest without a word
 
 
@@ -218,7 +217,7 @@ class MlflowTracker(Tracker):
 
     def _start_sending(self, sidecar: Sidecar) -> None:
         # Imported here and not in the sender's thread: imports of two threads can get into each other's way.
-        sender = Sender(self.folder, self.journal, sidecar, _mlflow_store())
+        sender = Sender(self.folder, self.journal, sidecar, mlflow_store())
         sender.start()
         if not sender.tried.wait(self._opening_patience):
             sender.warn("no answer yet")
@@ -241,9 +240,14 @@ class MlflowTracker(Tracker):
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
         path = path.absolute()
-        # Relative where it can be: a run folder may be moved before it is synced.
-        inside = path.is_relative_to(self.folder)
-        self._log(artifact=str(path.relative_to(self.folder) if inside else path), folder=folder)
+        if not path.is_relative_to(
+            self.folder
+        ):  # a run folder may be moved, and gives away nothing but its own
+            copy = self.folder / ELSEWHERE / path.name
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copytree(path, copy, dirs_exist_ok=True) if path.is_dir() else shutil.copy2(path, copy)
+            path = copy
+        self._log(artifact=str(path.relative_to(self.folder)), folder=folder)
 
     def drop_after(self, step: int) -> None:
         self.journal.drop_after(step)
@@ -304,53 +308,6 @@ class MlflowTracker(Tracker):
         return f"{base}/#/experiments/{info.experiment_id}/runs/{info.run_id}" if info.run_id else base
 
 
-def sync(folder: Path) -> int:
-    """Send what the store lacks of a run whose process has ended; how many lines of its journal that were.
-
-    Raises:
-        DataError: no run with a store is there, or its process is alive.
-        UserError: the store did not take everything; what it took is not sent again.
-    """
-    folder = folder.absolute()
-    info = read_run_info(folder)
-    if info is None or not info.uri:
-        raise DataError(f"{folder} holds no run that goes to a store: it has no {SIDECAR}, or logger=none.")
-    journal = Journal(folder / JOURNAL)
-    journal.open(after=info.sent)  # and so nobody else sends
-    try:
-        return send_all(folder, journal, Sidecar(folder, info), _mlflow_store())
-    finally:
-        journal.close()
-
-
-def mark_dead(folder: Path, status: Status = "KILLED") -> bool:
-    """Close a run whose process died without closing it; False where there is nothing to close.
-
-    Sends what the store lacks, too. Where the store is away, the journal and `run.json` hold the status, and
-    a later `sync` tells the store.
-
-    Raises:
-        DataError: the process is alive.
-    """
-    folder = folder.absolute()
-    info = read_run_info(folder)
-    if info is None or info.status != "RUNNING":
-        return False
-    journal = Journal(folder / JOURNAL)
-    journal.open(after=info.sent)
-    sidecar = Sidecar(folder, info)
-    journal.append(status=status)
-    sidecar.update(status=status)
-    try:
-        if info.uri:
-            send_all(folder, journal, sidecar, _mlflow_store())
-    except UserError as error:
-        _log.warning("%s", error)
-    finally:
-        journal.close()
-    return True
-
-
 def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None) -> Sidecar:
     """Take hold of a run folder: go on with the run in it, or set that aside."""
     earlier = read_run_info(folder)
@@ -391,6 +348,6 @@ def _continues(earlier: RunInfo, wanted: RunInfo, resumed: bool | None) -> bool:
     return earlier.run_id is None and earlier.status != "FINISHED"
 
 
-def _mlflow_store() -> OpenStore:
+def mlflow_store() -> OpenStore:
     """What opens a run in MLflow; MLflow is imported here and nowhere else."""
     return importlib.import_module("framework.tracking.mlflow_store").MlflowStore

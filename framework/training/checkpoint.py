@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import shutil
+import zipfile
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from pickle import UnpicklingError
@@ -14,8 +15,9 @@ from pytorch_lightning.plugins.io import CheckpointIO
 from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
-from framework.errors import CheckpointError
+from framework.errors import CheckpointError, shown
 from framework.storage.files import remove_leftovers, replacing
+from framework.storage.plain_values import require_flat
 
 # A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
 # all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
@@ -83,12 +85,33 @@ def read(path: Path) -> dict[str, Any]:
             raise CheckpointError(f"The checkpoint {path} cannot be used: {fault}. {_remedy(path)}")
         file.seek(0)
         try:
-            return torch.load(file, weights_only=True, map_location="cpu")
+            _require_unfolded(file)
+            content = torch.load(file, weights_only=True, map_location="cpu")
+            if not isinstance(content, dict):
+                raise ValueError(f"it holds {type(content).__name__}")
+            return content
         except UnpicklingError:
             raise CheckpointError(
                 f"The checkpoint {path} holds more than dicts, lists, numbers, strings and tensors, which "
                 "could run code. This framework did not write it: do not use it."
             ) from None
+        except Exception as error:  # its checksum is right and its content is not: torch raises a dozen kinds
+            raise CheckpointError(
+                f"The checkpoint {path} cannot be used: {shown(error)}. {_remedy(path)}"
+            ) from error
+
+
+def _require_unfolded(file: BinaryIO) -> None:
+    """Refuse what torch does not write and a small file could take any memory or time by."""
+    with zipfile.ZipFile(file) as archive:
+        parts = archive.infolist()
+        size = os.fstat(file.fileno()).st_size
+        if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
+            raise ValueError("its parts unfold to more than the file")
+        for part in parts:
+            if part.filename.endswith("data.pkl"):
+                require_flat(archive.read(part))
+    file.seek(0)
 
 
 def verify(path: Path) -> str | None:

@@ -20,7 +20,9 @@ def nearest_of(
 ) -> tuple[Float[Tensor, "batch query"], Int[Tensor, "batch query"]]:
     """Distance and index as `framework.geometry.nearest.Nearest` has them, of finite coordinates.
 
-    Differences are taken before they are squared: |p|² - 2 p·q + |q|² would lose the digits of what is near.
+    Differences are taken before they are squared: |p|² - 2 p·q + |q|² would lose the digits of what is near. Each
+    square is rounded before it is added, while the processor's search adds it unrounded (fused multiply-add): distances
+    differ from its by a unit in the last place, and of two points nearer to equally far it may choose the other.
     """
     batch, points, _ = clouds.shape
     asked = queries.shape[-2]

@@ -6,24 +6,24 @@ The layout of the published body models with linear blend skinning: `v_template`
 plugins.data.bodies.restricted_pickle: nothing that a file names is run.
 """
 
-import zipfile
-import zlib
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
-from framework.errors import DataError
+from framework.errors import DataError, shown
+from framework.storage.arrays import archive
 from framework.storage.files import replacing
+from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies import restricted_pickle
 from plugins.data.bodies.body import Body
 
 NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
-LARGEST = 2**27
-"""Numbers that a sparse matrix may have when it is written out."""
+LARGEST = 2**24
+"""Numbers of the joints' displacements, joints x 3 x coefficients; published bodies have below 2**17."""
 WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
 
 
@@ -34,17 +34,11 @@ def read(file: Path) -> Body:
         DataError: no such file, another format, something in it that is neither arrays nor plain values, an array
             missing or of another shape. Says which.
     """
-    try:
+    with guarded(file, "a body model", missing="wanted a body model. Mend the path."):
         if file.suffix == ".npz":
-            # a stream of our own: NumPy leaves a damaged file open
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                return _body(file, {name: _member(file, stored, name) for name in _named(stored)})
+            return _body(file, archive(read_bytes(file), (*NEEDED, "posedirs")))
         if file.suffix == ".pkl":
             return _body(file, _unpickled(file))
-    except FileNotFoundError:
-        raise DataError(f"{file}: no such file; wanted a body model. Mend the path.") from None
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{file}: cannot be read ({error}). Restore it from its source.") from error
     raise DataError(f"{file}: wanted a body model whose name ends in .npz or .pkl.")
 
 
@@ -64,32 +58,16 @@ def load(file: Path) -> Body:
     Raises:
         DataError: the file is missing or damaged.
     """
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+    with guarded(file, "a body", "Delete it: it is made anew."):
+        arrays = archive(read_bytes(file))
         parents = tuple(int(parent) for parent in arrays.pop("parents"))
         names = tuple(str(name) for name in arrays.pop("names"))
         return Body(source=str(arrays.pop("source")), parents=parents, names=names, **arrays)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{file}: cannot be read as a body ({error}). Delete it: it is made anew.") from error
-
-
-def _named(stored: Any) -> list[str]:
-    return [name for name in (*NEEDED, "posedirs") if name in stored.files]
-
-
-def _member(file: Path, stored: Any, name: str) -> np.ndarray:
-    try:
-        return stored[name]
-    except ValueError as error:
-        raise DataError(
-            f"{file}: {name} cannot be read as plain numbers ({error}). Save it as an array of numbers. {WANTED}"
-        ) from error
 
 
 def _unpickled(file: Path) -> Mapping[str, Any]:
     try:
-        found = restricted_pickle.load(file.read_bytes())
+        found = restricted_pickle.load(read_bytes(file))
     except restricted_pickle.PickleRefused as error:
         raise DataError(
             f"{file}: refused as a pickle: {error}. Only arrays are read from pickles; nothing in this file was run. "
@@ -103,7 +81,7 @@ def _unpickled(file: Path) -> Mapping[str, Any]:
 def _body(file: Path, found: Mapping[str, Any]) -> Body:
     missing = [name for name in NEEDED if name not in found]
     if missing:
-        names = ", ".join(map(str, found)) or "nothing"
+        names = shown(", ".join(map(str, found))) or "nothing"
         raise DataError(f"{file}: {', '.join(missing)} not in it; it holds {names}. {WANTED}")
     posedirs = found.get("posedirs")
     arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}
@@ -116,9 +94,11 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
         or shapes.shape[:2] != template.shape
         or table.ndim != 2
         or regressor.shape != (table.shape[1], len(template))
+        or not template.size
+        or len(regressor) * math.prod(shapes.shape[1:]) > LARGEST
     ):
-        shown = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise DataError(f"{file}: {shown} do not fit together. {WANTED}")
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise DataError(f"{file}: {shapes} do not fit together. {WANTED}")
     wanted = template.dtype
     return Body(
         source=str(file),
@@ -138,11 +118,10 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
 
 
 def _numbers(file: Path, name: str, value: Any) -> np.ndarray:
-    if sparse.issparse(value) and value.shape[0] * value.shape[1] > LARGEST:
-        raise DataError(
-            f"{file}: {name} is a sparse matrix of {value.shape}, too large to be a body's. {WANTED}"
-        )
-    array = value.toarray() if sparse.issparse(value) else np.asarray(value)
+    # no lists: of nested ones that hold each other twice an array would be without end
+    if not isinstance(value, np.ndarray | np.generic | int | float | str):
+        raise DataError(f"{file}: {name} is {type(value).__name__}; wanted an array. {WANTED}")
+    array = np.asarray(value)
     if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
         raise DataError(
             f"{file}: {name} is {array.dtype} {array.shape} with numbers that are not finite, or no numbers. {WANTED}"

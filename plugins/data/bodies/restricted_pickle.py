@@ -1,20 +1,25 @@
 """Arrays out of pickles, without running anything that a pickle names.
 
-A pickle is a program: it names functions of any installed module and calls them. Here a name becomes an inert record of
-itself and of what it was given; afterwards those few records that mean an array, a sparse matrix or a wrapped array are
-turned into one, and any other name has already been refused. Pickles of Python 2 (text as latin-1) and of every
-protocol are read.
+A pickle is a program: it names functions of any installed module and calls them. Here the standard library only takes
+it apart into its instructions, and a machine of our own obeys the few that arrays need. A name becomes an inert record
+of itself and of what it was given; afterwards those records that mean an array, a sparse matrix or a wrapped array
+are turned into a plain array, and any other name has already been refused. Pickles of Python 2 (text as latin-1) and
+of every protocol are read.
+
+What a file may cost is bounded by its size: so many instructions, so much nesting, and arrays no larger than what the
+file brings, but for sparse matrices, which are written out and counted. Keys are words and small numbers, since what is
+hashed (a tuple of the same tuple twice, thirty deep, say) could take for ever.
 """
 
-import io
-import pickle
+import math
 import pickletools
 import re
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
-from scipy import sparse
+
+from framework.errors import shown
 
 MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 ALLOWED = {
@@ -38,129 +43,273 @@ ALLOWED = {
 SPARSE = re.compile(r"(csc|csr|coo)_(matrix|array)")
 DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c(8|16)|[SU]\d{1,4})")
 DEEPEST = 40
-MEMO = {"PUT", "BINPUT", "LONG_BINPUT"}
+MOST_INSTRUCTIONS = 200_000
+"""Published bodies take a few thousand."""
+LARGEST = 2**24
+"""Numbers of all sparse matrices of a file when they are written out."""
+CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+FRESH = {"EMPTY_LIST": list, "EMPTY_DICT": dict}
+VALUES = re.compile(
+    r"(BIN)?INT[12]?|LONG[14]?|(SHORT_)?(BIN)?(STRING|UNICODE|BYTES)8?|BYTEARRAY8|(BIN)?FLOAT"
+)
+"""Instructions that hold a number, text or bytes."""
+TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+MARK = object()
+MOST_SIDES, LONGEST_SIDE = 32, 2**31
+"""Of an array; numbers of thousands of digits would take long to multiply."""
 
 
 class PickleRefused(ValueError):
     """A pickle that holds more than arrays, or is damaged; says what was found."""
 
 
-class _Named:
-    """Something a pickle names; a class of its own for every name, so that nothing outlives the reading."""
+class _Record:
+    """Something a pickle names, and what it was given; `made`: whether it was called, else it is the bare name."""
 
-    kind = ""
-    arguments: tuple[Any, ...] = ()
-    state: Any = None
-
-    def __new__(cls, *arguments: Any) -> "_Named":
-        found = object.__new__(cls)
-        found.arguments = arguments
-        return found
-
-    def __init__(self, *arguments: Any) -> None:
-        pass
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-
-class _Reader(pickle.Unpickler):
-    def find_class(self, module_name: str, global_name: str) -> Any:
-        kind = ALLOWED.get((module_name, global_name))
-        if kind is None and module_name.startswith("scipy.sparse") and SPARSE.fullmatch(global_name):
-            kind = global_name[:3]
-        if kind is None:
-            _refuse(f"it names {module_name}.{global_name}, which could run code or is no array")
-        return type("_" + kind.strip("_"), (_Named,), {"kind": kind})
+    def __init__(self, kind: str, arguments: tuple[Any, ...] = (), *, made: bool = False) -> None:
+        self.kind = kind
+        self.arguments = arguments
+        self.made = made
+        self.state: Any = None
 
 
 def load(content: bytes) -> Any:
-    """What a pickle holds: None, numbers, text, bytes, lists, tuples, dictionaries, arrays, SciPy's sparse matrices.
+    """What a pickle holds: None, numbers, text, bytes, lists, tuples, dictionaries, arrays; sparse matrices as arrays.
 
     Raises:
         PickleRefused: it names anything else, holds arrays of objects, or is damaged.
     """
     try:
-        _check_memo(content)
-        found = _Reader(io.BytesIO(content), encoding="latin1").load()
-        return _plain(found, {}, 0)
+        return _Plain(len(content)).of(_obeyed(content), 0)
     except PickleRefused:
         raise
-    except Exception as error:  # a damaged pickle leads the reader to whatever error it likes
-        raise PickleRefused(f"it is damaged ({type(error).__name__}: {error})") from error
+    except Exception as error:  # damage leads to whatever error it likes
+        raise PickleRefused(f"it is damaged ({type(error).__name__}: {shown(error)})") from error
 
 
-def _check_memo(content: bytes) -> None:
-    """Walk over a pickle without obeying it; refuse memo numbers that would make the reader reserve memory for them."""
-    put = 0
-    for opcode, argument, _ in pickletools.genops(content):
-        if opcode.name in MEMO:
-            put += 1
-            if not 0 <= int(argument or 0) <= 2 * put + 1000:
-                _refuse(f"its memo jumps to number {argument}")
+def _obeyed(content: bytes) -> Any:
+    """What the instructions build, of records."""
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
+        if count == MOST_INSTRUCTIONS:
+            _refuse(f"it has more than {MOST_INSTRUCTIONS} instructions")
+        name = opcode.name
+        if VALUES.fullmatch(name):
+            stack.append(argument)
+        elif name in CONSTANTS:
+            stack.append(CONSTANTS[name])
+        elif name in FRESH:
+            stack.append(FRESH[name]())
+        elif name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
+            number = len(memo) if name == "MEMOIZE" else int(argument or 0)
+            if not 0 <= number <= MOST_INSTRUCTIONS:
+                _refuse(f"its memo jumps to number {number}")
+            memo[number] = stack[-1]
+        elif name in ("GET", "BINGET", "LONG_BINGET"):
+            stack.append(memo[int(argument or 0)])
+        elif name == "STOP":
+            return stack.pop()
+        elif name not in ("PROTO", "FRAME"):
+            _obey(name, argument, stack)
+    return _refuse("it has no end")
+
+
+def _obey(name: str, argument: Any, stack: list[Any]) -> None:
+    """One instruction that changes the stack alone."""
+    match name:
+        case "MARK":
+            stack.append(MARK)
+        case "POP":
+            stack.pop()
+        case "POP_MARK":
+            _since_mark(stack)
+        case "DUP":
+            stack.append(stack[-1])
+        case "TUPLE":
+            stack.append(tuple(_since_mark(stack)))
+        case "TUPLE1" | "TUPLE2" | "TUPLE3":
+            items = [stack.pop() for _ in range(TUPLES[name])]
+            stack.append(tuple(items[::-1]))
+        case "LIST":
+            stack.append(_since_mark(stack))
+        case "DICT":
+            items = _since_mark(stack)
+            stack.append({})
+            _set(stack[-1], items)
+        case "APPEND" | "APPENDS":
+            items = [stack.pop()] if name == "APPEND" else _since_mark(stack)
+            if type(stack[-1]) is not list:
+                _refuse("it appends to what is no list")
+            stack[-1].extend(items)
+        case "SETITEM" | "SETITEMS":
+            items = [stack.pop(), stack.pop()][::-1] if name == "SETITEM" else _since_mark(stack)
+            _set(stack[-1], items)
+        case "GLOBAL":
+            stack.append(_named(*argument.split(" ", 1)))
+        case "STACK_GLOBAL":
+            word, module = stack.pop(), stack.pop()
+            stack.append(_named(module, word))
+        case "REDUCE" | "NEWOBJ":
+            arguments, called = stack.pop(), stack.pop()
+            if not isinstance(called, _Record) or called.made or type(arguments) is not tuple:
+                _refuse("it calls what is no name")
+            if called.kind == "_reconstructor":
+                called, arguments = arguments[0], ()
+                if not isinstance(called, _Record) or called.made:
+                    _refuse("it rebuilds an object of no class")
+            stack.append(_Record(called.kind, arguments, made=True))
+        case "BUILD":
+            state = stack.pop()
+            if not isinstance(stack[-1], _Record) or not stack[-1].made:
+                _refuse("it sets attributes of what is no object")
+            stack[-1].state = state
+        case _:
+            _refuse(f"it has the instruction {name}, which arrays do not need")
+
+
+def _since_mark(stack: list[Any]) -> list[Any]:
+    place = len(stack) - 1
+    while stack[place] is not MARK:  # an IndexError where there is none
+        place -= 1
+    items = stack[place + 1 :]
+    del stack[place:]
+    return items
+
+
+def _set(target: Any, items: list[Any]) -> None:
+    if type(target) is not dict:
+        _refuse("it sets an item of what is no dictionary")
+    for key, value in zip(items[::2], items[1::2], strict=True):
+        if not (isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < 2**31)):
+            _refuse(f"a dictionary with {type(key).__name__} for a key; wanted words or small numbers")
+        target[key] = value
+
+
+def _named(module: Any, word: Any) -> _Record:
+    kind = ALLOWED.get((module, word))
+    if kind is None and str(module).startswith("scipy.sparse") and SPARSE.fullmatch(str(word)):
+        kind = word[:3]
+    if kind is None:
+        _refuse(f"it names {module}.{word}, which could run code or is no array")
+    return _Record(kind)
 
 
 def _refuse(why: str) -> NoReturn:
-    raise PickleRefused(why)
+    raise PickleRefused(shown(why))
 
 
-def _plain(item: Any, done: dict[int, Any], depth: int) -> Any:
-    """Without records: what was read twice is made once, so that nesting cannot multiply it."""
-    if depth > DEEPEST:
-        _refuse(f"it is nested more than {DEEPEST} deep, or within itself")
-    if item is None or isinstance(item, str | bytes | int | float | complex):
-        return item
-    if isinstance(item, bytearray):
-        return bytes(item)
-    if id(item) not in done:
-        done[id(item)] = _made(item, done, depth + 1)
-    return done[id(item)]
+class _Plain:
+    """Turns records into arrays: what was read twice is made once, so that nesting cannot multiply it.
 
+    Args:
+        size: of the file, bytes: what is made of it may not be much larger.
+    """
 
-def _made(item: Any, done: dict[int, Any], depth: int) -> Any:
-    if isinstance(item, dict):
-        return {_plain(key, done, depth): _plain(value, done, depth) for key, value in item.items()}
-    if isinstance(item, list | tuple):
-        return type(item)(_plain(value, done, depth) for value in item)
-    if not isinstance(item, _Named):
-        what = f"a bare {item.kind}" if isinstance(item, type) and issubclass(item, _Named) else type(item)
-        _refuse(f"it holds {what}")
-    if item.kind == "_reconstructor":
-        cls = item.arguments[0]
-        if not (isinstance(cls, type) and issubclass(cls, _Named)):
-            _refuse("it rebuilds an object of no class")
-        made = cls()
-        made.__setstate__(item.state)
-        item = made
-    given = [_argument(value, done, depth) for value in item.arguments]
-    state = _plain(item.state, done, depth)
-    match item.kind:
-        case "_reconstruct":
-            return _array(*_exactly(state, 5)[1:])
-        case "_frombuffer":
-            raw, dtype, shape, order = given[:4]
-            return _array(shape, dtype, order == "F", raw)
-        case "dtype":
-            return _dtype(given[0], state)
-        case "scalar":
-            return _array((), given[0], False, given[1])[()]
-        case "encode":
-            return given[0].encode("latin1")
-        case "bytes":
-            return b"" if not given else bytes(_only_bytes(given[0]))
-        case "csc" | "csr" | "coo":
-            return _sparse(item.kind, state)
-        case "Ch":
-            return _wrapped(state, "x")
-        case "Select":
-            flat = np.ravel(_wrapped(state, "a"))[_wrapped(state, "idxs")]
-            return flat.reshape(state.get("preferred_shape", flat.shape))
-    return _refuse(f"it holds a bare {item.kind}")
+    def __init__(self, size: int) -> None:
+        self.done: dict[int, Any] = {}
+        self.bytes_left = (
+            4 * size
+        )  # an array is its text, that in bytes, the array, and what is selected of it
+        self.sparse_left = LARGEST
 
+    def of(self, item: Any, depth: int) -> Any:
+        if depth > DEEPEST:
+            _refuse(f"it is nested more than {DEEPEST} deep, or within itself")
+        if item is None or isinstance(item, str | bytes | int | float):
+            return item
+        if id(item) not in self.done:
+            self.done[id(item)] = self._made(item, depth + 1)
+        return self.done[id(item)]
 
-def _argument(value: Any, done: dict[int, Any], depth: int) -> Any:
-    """Classes may be arguments: which one an array once was is no matter."""
-    return None if isinstance(value, type) and issubclass(value, _Named) else _plain(value, done, depth)
+    def _made(self, item: Any, depth: int) -> Any:
+        if isinstance(item, dict):
+            return {key: self.of(value, depth) for key, value in item.items()}
+        if isinstance(item, list | tuple):
+            return type(item)(self.of(value, depth) for value in item)
+        if isinstance(item, bytearray):
+            return bytes(item)
+        if not isinstance(item, _Record) or not item.made:
+            _refuse(f"it holds a bare {item.kind if isinstance(item, _Record) else type(item).__name__}")
+        # names may be arguments: which class an array once was is no matter
+        bare = [isinstance(value, _Record) and not value.made for value in item.arguments]
+        given: list[Any] = [
+            None if name else self.of(value, depth) for name, value in zip(bare, item.arguments, strict=True)
+        ]
+        state = self.of(item.state, depth)
+        match item.kind:
+            case "_reconstruct":
+                return self._array(*_exactly(state, 5)[1:])
+            case "_frombuffer":
+                raw, dtype, shape, order = given[:4]
+                return self._array(shape, dtype, order == "F", raw)
+            case "dtype":
+                return _dtype(given[0], state)
+            case "scalar":
+                return self._array((), given[0], False, given[1])[()]
+            case "encode":
+                self._spend(len(given[0]))
+                return given[0].encode("latin1")
+            case "bytes":
+                return b"" if not given else _only_bytes(given[0])
+            case "csc" | "csr" | "coo":
+                return self._sparse(item.kind, _mapping(state))
+            case "Ch":
+                return _wrapped(state, "x")
+            case "Select":
+                flat, places = np.ravel(_wrapped(state, "a")), _wrapped(state, "idxs")
+                self._spend(places.size * flat.itemsize)
+                return flat[places].reshape(state.get("preferred_shape", places.shape))
+        _refuse(f"it holds a bare {item.kind}")
+
+    def _array(self, shape: Any, dtype: Any, fortran: Any, raw: Any) -> np.ndarray:
+        if not isinstance(dtype, np.dtype):
+            _refuse("an array without a type")
+        raw = raw.encode("latin1") if isinstance(raw, str) else raw  # as Python 2 wrote it
+        sides = tuple(shape) if isinstance(shape, list | tuple) else ()
+        if not isinstance(raw, bytes) or len(sides) > MOST_SIDES or not all(map(_side, sides)):
+            _refuse("an array of Python objects")
+        size = dtype.itemsize * math.prod(sides)
+        if size != len(raw):
+            _refuse(
+                f"an array of shape {sides} and type {dtype} with {len(raw)} bytes of data instead of {size}"
+            )
+        self._spend(size)
+        return np.frombuffer(raw, dtype).reshape(sides, order="F" if fortran else "C").copy()
+
+    def _spend(self, size: int) -> None:
+        self.bytes_left -= size
+        if self.bytes_left < 0:
+            _refuse("it makes much more of itself than it holds")
+
+    def _sparse(self, kind: str, state: Mapping[str, Any]) -> np.ndarray:
+        """The matrix with its zeros; entries of one place add up."""
+        rows, columns = state.get("_shape", state.get("shape"))
+        if not _side(rows) or not _side(columns) or rows * columns > self.sparse_left:
+            _refuse(f"a sparse matrix of {rows} x {columns}, too large to be a body's")
+        self.sparse_left -= rows * columns
+        data = _line(state["data"], "biuf")
+        if kind == "coo":
+            row, column = (
+                _line(part, "iu") for part in state.get("coords", (state.get("row"), state.get("col")))
+            )
+        else:
+            starts, inner = _line(state["indptr"], "iu").astype(np.int64), _line(state["indices"], "iu")
+            lines = columns if kind == "csc" else rows
+            counts = np.diff(starts)
+            if len(starts) != lines + 1 or starts[0] != 0 or starts[-1] != len(data) or (counts < 0).any():
+                _refuse(
+                    f"a sparse matrix of {lines} lines whose beginnings do not rise from 0 to {len(data)}"
+                )
+            outer = np.repeat(np.arange(lines), counts)
+            row, column = (inner, outer) if kind == "csc" else (outer, inner)
+        dense = np.zeros((rows, columns), data.dtype)
+        if not len(data) == len(row) == len(column) or (
+            len(data) and (min(row.min(), column.min()) < 0 or row.max() >= rows or column.max() >= columns)
+        ):
+            _refuse(f"a sparse matrix of {rows} x {columns} with entries that are not in it")
+        np.add.at(dense, (row, column), data)
+        return dense
 
 
 def _exactly(state: Any, count: int) -> tuple[Any, ...]:
@@ -182,33 +331,15 @@ def _dtype(text: Any, state: Any) -> np.dtype:
     return found.newbyteorder(order) if order in ("<", ">") else found
 
 
-def _array(shape: Any, dtype: Any, fortran: Any, raw: Any) -> np.ndarray:
-    if not isinstance(dtype, np.dtype):
-        _refuse("an array without a type")
-    raw = raw.encode("latin1") if isinstance(raw, str) else raw  # as Python 2 wrote it
-    sides = tuple(shape) if isinstance(shape, list | tuple) else ()
-    if not isinstance(raw, bytes) or not all(isinstance(side, int) and side >= 0 for side in sides):
-        _refuse("an array of Python objects")
-    size = dtype.itemsize
-    for side in sides:
-        size *= side  # whole numbers of Python: nothing overflows
-    if size != len(raw):
-        _refuse(f"an array of shape {sides} and type {dtype} with {len(raw)} bytes of data instead of {size}")
-    return np.frombuffer(raw, dtype).reshape(sides, order="F" if fortran else "C").copy()
+def _side(value: Any) -> bool:
+    return isinstance(value, int) and 0 <= value < LONGEST_SIDE
 
 
-def _sparse(kind: str, state: Any) -> Any:
-    state = _mapping(state)
-    rows, columns = (int(side) for side in state.get("_shape", state.get("shape")))
-    data = state["data"]
-    if kind == "coo":
-        places = state["coords"] if "coords" in state else (state["row"], state["col"])
-        found = sparse.coo_matrix((data, tuple(places)), shape=(rows, columns))
-    else:
-        made = sparse.csc_matrix if kind == "csc" else sparse.csr_matrix
-        found = made((data, state["indices"], state["indptr"]), shape=(rows, columns))
-        found.check_format(full_check=True)
-    return found
+def _line(values: Any, kinds: str) -> np.ndarray:
+    """Numbers in a row, of a sparse matrix."""
+    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in kinds:
+        _refuse("a sparse matrix without its numbers")
+    return values
 
 
 def _wrapped(state: Any, key: str) -> np.ndarray:
@@ -225,4 +356,4 @@ def _mapping(state: Any) -> Mapping[str, Any]:
 
 
 def _only_bytes(value: Any) -> bytes:
-    return value if isinstance(value, bytes) else _refuse("bytes made of something else")
+    return bytes(value) if isinstance(value, bytes) else _refuse("bytes made of something else")

@@ -91,6 +91,11 @@ def test_our_own_layout_keeps_every_bit(tmp_path):
     assert [file.name for file in tmp_path.glob(".*")] == []
 
 
+NESTED = [0.0, 1.0, 2.0]
+for _ in range(30):
+    NESTED = [NESTED, NESTED]  # as an array without end
+
+
 def changed(**changes):
     return {name: value for name, value in {**arrays(), **changes}.items() if value is not None}
 
@@ -108,6 +113,9 @@ def changed(**changes):
         (changed(f=np.full((2, 3), VERTICES)), "vertices 12 to 12, but there are 0 to 11"),
         (changed(v_template="text"), "v_template is <U4"),
         (changed(J_regressor=sparse.csc_matrix((10**6, 10**6))), "too large to be a body's"),
+        (changed(v_template=NESTED), "v_template is list; wanted an array"),
+        (changed(f=(0, 1, 2)), "f is tuple; wanted an array"),
+        (changed(v_template=np.zeros((0, 3)), shapedirs=np.zeros((0, 3, 10**9))), "do not fit together"),
         ([1, 2], "holds list"),
         (
             print,

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from scipy.io import loadmat
 from torch import Tensor
 
 from framework.datasets.images import Crop
-from framework.errors import DataError
+from framework.datasets.matlab import read_variables
+from framework.errors import DataError, shown
 
 OBJECTS, VIEWS, STEP_DEG = 20, 72, 5
 FILE = "COIL20.mat"
@@ -41,13 +41,9 @@ def read_views(root: str | None, side: int) -> UInt8[Tensor, "object view 1 side
 
 
 def _matlab(file: Path, side: int) -> Tensor:
-    try:
-        found = loadmat(file)
-    except Exception as error:  # SciPy raises whatever a damaged file leads it to
-        raise DataError(f"{file} cannot be read as a MATLAB file ({error}). {WANTED}") from error
+    found = read_variables(file, remedy=WANTED)
     if "X" not in found or "Y" not in found:
-        names = [name for name in found if not name.startswith("__")]
-        raise DataError(f"{file} holds {', '.join(names) or 'nothing'}. {WANTED}")
+        raise DataError(f"{file} holds {shown(', '.join(found)) or 'nothing'}. {WANTED}")
     pixels, labels = np.asarray(found["X"]), np.asarray(found["Y"]).ravel()
     if (
         pixels.shape != (OBJECTS * VIEWS, 1024)
@@ -55,7 +51,8 @@ def _matlab(file: Path, side: int) -> Tensor:
         or labels.shape != (OBJECTS * VIEWS,)
     ):
         raise DataError(f"{file}: X came as {pixels.dtype} {pixels.shape}, Y as {labels.shape}. {WANTED}")
-    if (np.bincount(labels, minlength=OBJECTS + 1)[1:] != VIEWS).any():
+    names, counts = np.unique(labels, return_counts=True)
+    if names.tolist() != [*range(1, OBJECTS + 1)] or (counts != VIEWS).any():
         raise DataError(f"{file}: Y does not name {OBJECTS} objects with {VIEWS} views each. {WANTED}")
     order = np.argsort(labels, kind="stable")
     square = pixels[order].reshape(OBJECTS, VIEWS, 1, 32, 32).swapaxes(-1, -2)  # MATLAB stores columns

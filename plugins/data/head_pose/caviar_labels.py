@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.io
-from scipy.io.matlab import mat_struct
 
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError
+from framework.errors import DataError, shown
 from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label.mat"
@@ -36,7 +35,7 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
         DataError: the file cannot be read, lacks a struct array, or one of its elements is no label.
     """
     names = [f"or_label_{split}" for split in TRAIN_AND_TEST]
-    content = read_variables(file, names, "its source")
+    content = read_variables(file, names)
     missing = [name for name in names if name not in content]
     if missing:
         raise DataError(f"{file}: holds no {' and no '.join(missing)}. Restore it from its source.")
@@ -50,14 +49,13 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
 
 
 def _label(file: Path, where: str, entry: Any) -> Label:
-    fields = vars(entry) if isinstance(entry, mat_struct) else {"_fieldnames": []}
-    values = [fields[name] for name in fields["_fieldnames"]]
+    values = list(entry.values()) if isinstance(entry, dict) else [entry]
     if len(values) == len(FIELDS) and isinstance(values[-1], str) and values[-1]:
         gaze = np.asarray(values[0])
         if gaze.size == 1 and gaze.dtype.kind in "iuf":
             return Label(values[-1], float(gaze.item()))
     raise DataError(
-        f"{file}: {where} holds {values}; wanted a struct of {', '.join(FIELDS)}, gaze a number of degrees. "
+        f"{file}: {where} holds {shown(values)}; wanted a struct of {', '.join(FIELDS)}, gaze a number of degrees. "
         "Restore it from its source."
     )
 

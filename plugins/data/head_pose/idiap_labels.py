@@ -13,12 +13,15 @@ import h5py
 import numpy as np
 
 from framework.errors import DataError
+from framework.storage.reading import guarded, opened
 from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label_full.mat"
 ANGLES = ("pan", "tilt", "roll")
 ENOUGH = 20
 """With more labels than this, none beyond ±2π is taken for radians."""
+MOST_LABELS, MOST_VALUES = 2**20, 2**12
+"""Labels of a split, and letters of a name."""
 HEADER = b"MATLAB 7.3 MAT-file, synthetic labels".ljust(116) + bytes(8) + b"\x00\x02IM"
 
 
@@ -35,14 +38,12 @@ def read_labels(file: Path, angles_in: Literal["radians", "degrees"]) -> dict[st
     Raises:
         DataError: it is no such file, a field is missing or of another length, or the angles are not `angles_in`.
     """
-    try:
-        with h5py.File(file, "r") as content:
-            labels = {split: _read_struct(content, f"or_label_{split}") for split in TRAIN_AND_TEST}
-    except Exception as error:  # nearly any, where the file is damaged
-        raise DataError(
-            f"{file}: cannot be read as the MATLAB 7.3 (HDF5) file of structs or_label_train and or_label_test "
-            f"with the fields pan, tilt, roll and name ({error}). Restore it from its source."
-        ) from error
+    wanted = (
+        "the MATLAB 7.3 (HDF5) file of structs or_label_train and or_label_test with the fields pan, tilt, roll "
+        "and name"
+    )
+    with guarded(file, wanted), opened(file), h5py.File(file, "r") as content:
+        labels = {split: _read_struct(content, f"or_label_{split}") for split in TRAIN_AND_TEST}
     _refuse_unit(file, labels, angles_in)
     if angles_in == "degrees":
         labels = {split: [_in_radians(label) for label in found] for split, found in labels.items()}
@@ -60,7 +61,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
     lengths = {field: len(cells) for field, cells in fields.items()}
     if len(set(lengths.values())) != 1:
         raise ValueError(f"{name} holds fields of different lengths: {lengths}")
-    texts = ["".join(map(chr, cell.ravel())) for cell in fields["name"]]
+    texts = [cell.astype("<u2").tobytes().decode("utf-16-le") for cell in fields["name"]]
     pan, tilt, roll = ([float(cell.item()) for cell in fields[angle]] for angle in ANGLES)
     return [
         Label(text, angles) for text, angles in zip(texts, zip(pan, tilt, roll, strict=True), strict=True)
@@ -69,10 +70,23 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
     """Read what a field's references lead to; a struct of one element holds its value itself."""
-    values = field[()]
     if field.dtype != h5py.ref_dtype:
-        return [values]
-    return [content[reference][()] for reference in values.ravel()]
+        return [_values(content, field, MOST_VALUES)]
+    return [
+        _values(content, content[reference], MOST_VALUES)
+        for reference in _values(content, field, MOST_LABELS).ravel()
+    ]
+
+
+def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
+    """All of a small dataset, which must lie in the file itself: HDF5's library would read other files too."""
+    chunk = math.prod(dataset.chunks or ())
+    plain = dataset.dtype.kind in "iuf" or dataset.dtype == h5py.ref_dtype
+    if not plain or max(dataset.size, chunk) > most:
+        raise ValueError(f"a dataset of {dataset.dtype}, shape {dataset.shape} in chunks of {dataset.chunks}")
+    if dataset.external or dataset.is_virtual or dataset.file.filename != content.filename:
+        raise ValueError("a dataset that lies in another file")
+    return dataset[()]
 
 
 def _refuse_unit(

@@ -38,10 +38,11 @@ class TownCentre(Heads):
   year = {2009}
 }
 @inproceedings{beyer2015biternion,
-  author = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
-  title = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
+  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
+  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
   booktitle = {German Conference on Pattern Recognition},
-  year = {2015}
+  pages     = {157--168},
+  year      = {2015}
 }"""
     groups = ("towncentre",)
     target = Target("angle", ("pan",))

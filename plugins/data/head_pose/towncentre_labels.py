@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.errors import DataError
+from framework.errors import DataError, quoted, shown
+from framework.storage.reading import guarded, read_bytes
 from plugins.data.head_pose.archive import wrong_layout
 from plugins.data.head_pose.labelled_images import SPLIT_SEED, Labelled
 
@@ -69,17 +70,15 @@ def read_label(file: Path) -> tuple[float, bool]:
     Raises:
         DataError: the file cannot be read, or its lines are others.
     """
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{file}: cannot be read ({error}). Restore it from its source.") from error
+    with guarded(file, "a label"):
+        text = read_bytes(file).decode("utf-8")
     entries = [line.partition("=") for line in text.splitlines()]
     fields = {name.strip(): value.strip() for name, _, value in entries}
     try:
         return float(fields["pan"]), {"0": False, "1": True}[fields["valid"]]
     except (KeyError, ValueError):
         raise DataError(
-            f"{file}: {text[:80]!r}; wanted two lines, `pan = ` with degrees and `valid = ` with 0 or 1. "
+            f"{file}: {quoted(text)}; wanted two lines, `pan = ` with degrees and `valid = ` with 0 or 1. "
             "Restore it from its source."
         ) from None
 
@@ -90,8 +89,8 @@ def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
     names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:
         raise DataError(
-            f"{folder / text}: {len(names)} images have names that start with {stem!r}"
-            f"{': ' if names else ''}{', '.join(names[:3])}; wanted one. Restore it, or take the label out."
+            f"{folder / text}: {len(names)} images have names that start with {quoted(stem)}"
+            f"{': ' if names else ''}{shown(', '.join(names[:3]))}; wanted one. Restore it, or take the label out."
         )
     return folder / names[0]
 

@@ -1,6 +1,5 @@
 """Reads the table beside the images: a line for each file, with its angles and perhaps its split."""
 
-import csv
 import hashlib
 import math
 from collections import Counter
@@ -8,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, cast
 
-from framework.errors import DataError, did_you_mean
+from framework.datasets.csv_columns import csv_rows
+from framework.errors import DataError, did_you_mean, quoted, shown
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -56,7 +56,7 @@ def read_table(
             raise DataError(f"{file} line {number}: no `{FILE}`; wanted the name of an image.")
         if name in first_line:
             raise DataError(
-                f"{file} line {number}: {name!r} stands already in line {first_line[name]}; wanted each "
+                f"{file} line {number}: {quoted(name)} stands already in line {first_line[name]}; wanted each "
                 "image once. Take one of the lines out."
             )
         first_line[name] = number
@@ -77,31 +77,24 @@ def split_of(name: str) -> Split:
 
 def _read(file: Path) -> tuple[list[str], dict[int, dict[str, str]]]:
     """Read the header, and the cells of every line by its number."""
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream, strict=True)
-            header = [cell.strip() for cell in next(reader, [])]
-            lines: dict[int, list[str]] = {}
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    lines[reader.line_num] = cells
-    except FileNotFoundError:
-        raise DataError(
-            f"{file}: no such file; wanted a table with a column `{FILE}` and a column for each angle. "
-            "Write it, or name another with data.csv."
-        ) from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(
-            f"{file}: cannot be read ({error}); wanted UTF-8 text, separated by commas."
-        ) from error
+    missing = (
+        f"wanted a table with a column `{FILE}` and a column for each angle. Write it, or name another with "
+        "data.csv."
+    )
+    with csv_rows(file, missing) as reader:
+        header = [cell.strip() for cell in next(reader, [])]
+        lines: dict[int, list[str]] = {}
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                lines[reader.line_num] = cells
     if FILE not in header:
         raise DataError(
             f"{file} has no column `{FILE}`.{did_you_mean(FILE, header)} Its first line names: "
-            f"{', '.join(header) or 'nothing'}. Wanted names separated by commas, one of them `{FILE}`."
+            f"{shown(', '.join(header)) or 'nothing'}. Wanted names separated by commas, one of them `{FILE}`."
         )
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
-        raise DataError(f"{file} names the column {twice[0]!r} twice; wanted each once. Rename one.")
+        raise DataError(f"{file} names the column {quoted(twice[0])} twice; wanted each once. Rename one.")
     for number, cells in lines.items():
         if len(cells) != len(header):
             raise DataError(
@@ -133,7 +126,7 @@ def _angle_columns(
         if name not in header:
             raise DataError(
                 f"data.angle_columns names {name!r}, which {file} does not have."
-                f"{did_you_mean(name, header)} Its columns: {', '.join(header)}."
+                f"{did_you_mean(name, header)} Its columns: {shown(', '.join(header))}."
             )
     if not asked:
         raise DataError(
@@ -156,7 +149,7 @@ def _numbers(file: Path, column: str, lines: Mapping[int, Mapping[str, str]]) ->
         cell = cells[column]
         if not _is_number(cell) or not math.isfinite(float(cell)):
             raise DataError(
-                f"{file} line {number}, column {column!r}: {cell!r}; wanted a finite number of degrees. "
+                f"{file} line {number}, column {quoted(column)}: {quoted(cell)}; wanted a finite number of degrees. "
                 "Mend the cell, or take the line out."
             )
         numbers.append(float(cell))
@@ -167,7 +160,7 @@ def _refuse_radians(file: Path, column: str, numbers: Sequence[float]) -> None:
     largest = max(map(abs, numbers))
     if len(numbers) > ENOUGH_ROWS and 0 < largest <= 2 * math.pi:
         raise DataError(
-            f"{file}, column {column!r}: none of {len(numbers)} values exceeds {largest:.4g}: this looks "
+            f"{file}, column {quoted(column)}: none of {len(numbers)} values exceeds {largest:.4g}: this looks "
             "like radians; wanted degrees. Set angles_in: radians, or angles_in: degrees if degrees they are."
         )
 
@@ -176,7 +169,7 @@ def _split(file: Path, number: int, cell: str) -> Split:
     word = cell.strip()
     if word not in SPLITS:
         raise DataError(
-            f"{file} line {number}, column `{SPLIT}`: {word!r}; wanted one of {', '.join(SPLITS)}."
+            f"{file} line {number}, column `{SPLIT}`: {quoted(word)}; wanted one of {', '.join(SPLITS)}."
             f"{did_you_mean(word, SPLITS)}"
         )
     return cast(Split, word)

@@ -1,13 +1,14 @@
 """Clouds of many sizes in one NumPy archive: `points`, `offset`, `label`, `object_id`, `classes`."""
 
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from framework.errors import DataError
+from framework.errors import DataError, shown
+from framework.storage.arrays import archive
+from framework.storage.reading import guarded, read_bytes
 
 SOURCE = "github.com/ATRM-Raphael/geo5017_A2"
 WANTED = (
@@ -39,27 +40,20 @@ def read_archive(root: str | None) -> Archive:
             f"extract of 499 of them is at {SOURCE}. {WANTED}"
         )
     file = Path(root).expanduser()
-    if not file.is_file():
-        raise DataError(f"data.root = {file}: no such file. {WANTED}")
-    try:
-        with file.open("rb") as stream:
-            loaded = np.load(stream)
-            held = {} if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"{file} cannot be read as a NumPy archive ({error}). {WANTED}") from error
-    missing = [name for name in ("points", "offset", "label", "classes") if name not in held]
-    if missing:
-        raise DataError(f"{file} holds {', '.join(held) or 'nothing'}, but no {missing[0]}. {WANTED}")
-    return _checked(file, held)
+    with guarded(file, "a NumPy archive", WANTED, WANTED):
+        return _checked(file, archive(read_bytes(file)))
 
 
 def _checked(file: Path, held: dict[str, np.ndarray]) -> Archive:
+    missing = [name for name in ("points", "offset", "label", "classes") if name not in held]
+    if missing:
+        raise DataError(f"{file} holds {shown(', '.join(held)) or 'nothing'}, but no {missing[0]}. {WANTED}")
     points, offset, label = held["points"], held["offset"], held["label"]
     identity = held.get("object_id", np.arange(len(label)))
     whole = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (offset, label, identity))
     if points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3 or not whole:
-        shown = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in held.items())
-        raise DataError(f"{file}: its arrays came as {shown}. {WANTED}")
+        shapes = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in held.items())
+        raise DataError(f"{file}: its arrays came as {shown(shapes)}. {WANTED}")
     offset, label = offset.astype(np.int64), label.astype(np.int64)
     ends = len(offset) == len(label) + 1 == len(identity) + 1 and offset[0] == 0 and offset[-1] == len(points)
     if not ends or (np.diff(offset) < 1).any():

@@ -7,7 +7,6 @@ depends on, so that a second run starts at once.
 import hashlib
 import json
 import sys
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,9 @@ from framework.geometry import meshes
 from framework.geometry.clouds import pad
 from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.storage import cache
+from framework.storage.arrays import archive
 from framework.storage.files import replacing
+from framework.storage.reading import guarded, read_bytes
 
 VERSION = 1
 """Of what `cloud` makes of a file; a change takes a new number, and with it a new place in the cache."""
@@ -169,10 +170,11 @@ def load(files: Sequence[Path], root: Path, how: Reading, place: str) -> Loaded:
     """
     kept = cache.folder(place) / f"{_key(files, root, how)}.npz"
     try:
-        with kept.open("rb") as stream, np.load(stream) as found:
+        with guarded(kept, "clouds"):
+            found = archive(read_bytes(kept))
             packed = Packed(torch.from_numpy(found["points"]), torch.from_numpy(found["offset"]))
             faults = {int(number): text for number, text in json.loads(str(found["faults"])).items()}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # not there, or damaged: read anew
+    except DataError:  # not there, or damaged: read anew
         packed, faults = _read_all(files, how)
         try:
             with replacing(kept) as part, part.open("wb") as stream:

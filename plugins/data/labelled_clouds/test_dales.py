@@ -115,7 +115,7 @@ def test_other_archives_are_refused(data, prepared, tmp_path):
     with pytest.raises(DataError, match=r"data\.root is not set: .* github\.com/ATRM-Raphael/geo5017_A2"):
         data().prepare()
     np.save(tmp_path / "one.npy", np.zeros(3))
-    with pytest.raises(DataError, match="holds nothing, but no points"):
+    with pytest.raises(DataError, match="it is a single array"):
         prepared(root=tmp_path / "one.npy")
 
 

@@ -5,23 +5,24 @@ Image_sets/<class>_imagenet_{train,val}.txt, PASCAL/VOCdevkit/VOC2012/ImageSets/
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io.matlab import mat_struct
 
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError
+from framework.errors import DataError, quoted
+from framework.storage.reading import guarded, read_bytes
 
 CLASSES = (
     "aeroplane", "bicycle", "boat", "bottle", "bus", "car",
     "chair", "diningtable", "motorbike", "sofa", "train", "tvmonitor",
 )  # fmt: skip
 VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
+Struct = Mapping[str, Any]
 SUFFIXES = {"pascal": (".jpg", ".JPEG"), "imagenet": (".JPEG", ".jpg")}
 
 
@@ -93,12 +94,8 @@ def read_list(file: Path) -> list[str]:
         DataError: a line is neither a name nor a name and one of the flags -1, 0, 1.
     """
     names = []
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"{file}: cannot be read ({error}); wanted a list of image names. Restore it."
-        ) from error
+    with guarded(file, "a list of image names", "Restore it from the release."):
+        lines = read_bytes(file).decode("utf-8").splitlines()
     for number, line in enumerate(lines, start=1):
         match line.split():
             case []:
@@ -109,7 +106,7 @@ def read_list(file: Path) -> list[str]:
                 continue
             case _:
                 raise DataError(
-                    f"{file} line {number}: {line!r}; wanted an image name, or a name and one of -1, 0, 1. "
+                    f"{file} line {number}: {quoted(line)}; wanted an image name, or a name and one of -1, 0, 1. "
                     "Restore the list from the release."
                 )
     return list(dict.fromkeys(names))
@@ -121,12 +118,15 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     Raises:
         DataError: the file is missing, is no MATLAB file, or is not built like an annotation.
     """
-    folder = f"{category}_{source}"
-    file = root / "Annotations" / folder / f"{name}.mat"
-    record = _load(file)
-    image = _image(root / "Images" / folder, name, source, _text(record, "filename"))
+    file = root / "Annotations" / f"{category}_{source}" / f"{name}.mat"
+    with guarded(file, "a PASCAL3D+ annotation", "Restore it from the release."):
+        return _objects(file, _load(file), root / "Images" / file.parent.name, category, source)
+
+
+def _objects(file: Path, record: Struct, images: Path, category: str, source: str) -> list[Annotation]:
+    image = _image(images, file.stem, source, _text(record, "filename"))
     found = []
-    for number, entry in enumerate(_structs(getattr(record, "objects", None)), start=1):
+    for number, entry in enumerate(_structs(record.get("objects")), start=1):
         if _text(entry, "class") != category:
             continue
         corners = _numbers(entry, "bbox")
@@ -142,7 +142,7 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
                 file=file,
                 image=image,
                 box=(x1 - 1, y1 - 1, x2, y2),  # counted from 1, both ends included
-                angles=_angles(getattr(entry, "viewpoint", None)),
+                angles=_angles(entry.get("viewpoint")),
                 truncated=bool(_number(entry, "truncated")),
                 occluded=bool(_number(entry, "occluded")),
                 difficult=bool(_number(entry, "difficult")),
@@ -153,9 +153,11 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     return found
 
 
-def _load(file: Path) -> mat_struct:
-    record = read_variables(file, ["record"], "the release").get("record")
-    if not isinstance(record, mat_struct):
+def _load(file: Path) -> Struct:
+    if not file.exists():
+        raise DataError(f"{file}: no such file, though a list names it. Restore it from the release.")
+    record = read_variables(file, ["record"], "Restore it from the release.").get("record")
+    if not isinstance(record, dict):
         raise DataError(
             f"{file}: holds no struct `record`; wanted a PASCAL3D+ annotation. Restore it from the release."
         )
@@ -170,27 +172,27 @@ def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
     return next((path for path in candidates if path.is_file()), candidates[0])
 
 
-def _structs(value: Any) -> Iterator[mat_struct]:
+def _structs(value: Any) -> Iterator[Struct]:
     """The structs of a struct array or cell array of any length; one struct alone comes without the array."""
     for item in np.atleast_1d(np.asarray(value, dtype=object)).ravel():
-        if isinstance(item, mat_struct):
+        if isinstance(item, dict):
             yield item
 
 
-def _text(entry: mat_struct, name: str) -> str:
+def _text(entry: Struct, name: str) -> str:
     """A field's text; nothing where it is missing, empty or no text."""
-    value = getattr(entry, name, None)
+    value = entry.get(name)
     return value.strip() if isinstance(value, str) else ""
 
 
-def _numbers(entry: mat_struct, name: str) -> list[float]:
-    """A field's numbers; none where it is missing, empty or holds something else."""
-    value = np.asarray(getattr(entry, name, None))
+def _numbers(entry: Struct, name: str) -> list[float]:
+    """A field's numbers, at most five; none where it is missing, empty or holds something else."""
+    value = np.asarray(entry.get(name))
     real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
-    return value.astype(np.float64).ravel().tolist() if real else []
+    return value.ravel()[:5].astype(np.float64).tolist() if real else []
 
 
-def _number(entry: mat_struct, name: str) -> float | None:
+def _number(entry: Struct, name: str) -> float | None:
     """A field's first number; None where there is none."""
     return next(iter(_numbers(entry, name)), None)
 
@@ -200,7 +202,7 @@ def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
 
     An object is finely annotated where the fields are filled and its distance is not 0.
     """
-    if not isinstance(viewpoint, mat_struct) or _number(viewpoint, "distance") == 0:
+    if not isinstance(viewpoint, dict) or _number(viewpoint, "distance") == 0:
         return None
     azimuth, elevation, tilt = (_number(viewpoint, name) for name in ("azimuth", "elevation", "theta"))
     if azimuth is None or elevation is None or tilt is None:

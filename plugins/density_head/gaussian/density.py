@@ -10,6 +10,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.protocol import (
     Normals,
+    about,
     estimate,
     exactly,
     mahalanobis,
@@ -65,21 +66,46 @@ class Gaussian(Distribution):
     @property
     def variance(self) -> Tensor:
         """Of each number, (*batch, number)."""
+        return self.stddev.square()
+
+    @property
+    def stddev(self) -> Tensor:
+        """Of each number, (*batch, number)."""
         if self.coefficients is None:
-            return self.scale.square()
-        return (self._mixing * self.scale.unsqueeze(-2)).square().sum(-1)
+            return self.scale
+        parts = self._representable(self._mixing * self.scale.unsqueeze(-2))
+        largest = parts.abs().amax(-1, keepdim=True)  # whose square may overflow
+        return self._representable(
+            ((parts / largest).square().sum(-1, keepdim=True).sqrt() * largest).squeeze(-1)
+        )
 
     @cached_property
     def _mixing(self) -> Tensor:
         """(I - φ)⁻¹, unit lower triangular: d = (I - φ)⁻¹ e."""
         assert self.coefficients is not None
         identity = torch.eye(self.event_shape[0], dtype=self.scale.dtype, device=self.scale.device)
-        return torch.linalg.solve_triangular(
+        found = torch.linalg.solve_triangular(
             identity - self.coefficients,
             identity.expand_as(self.coefficients),
             upper=False,
             unitriangular=True,
         )
+        return self._representable(found)
+
+    def _representable(self, numbers: Tensor) -> Tensor:
+        """The numbers themselves.
+
+        Raises:
+            ValueError: the coefficients multiply to more than the number type holds.
+        """
+        assert self.coefficients is not None
+        if not bool(numbers.isfinite().all()) and bool(self.coefficients.isfinite().all()):
+            raise ValueError(
+                f"the covariance of {self.event_shape[0]} numbers whose regression coefficients reach "
+                f"{self.coefficients.abs().amax().item():.3g} is beyond {self.scale.dtype}: its density is known, but "
+                "neither draws nor marginals are. Choose covariance=diagonal, standardise the targets, or use float64."
+            )
+        return numbers
 
     def log_prob(self, value: Tensor) -> Tensor:
         residual = value - self.location
@@ -105,7 +131,7 @@ estimate.register(Gaussian, exactly)
 @marginal.register
 def _(density: Gaussian, index: int) -> Gaussian:
     here = slice(index, index + 1)
-    return Gaussian(density.location[..., here], density.variance[..., here].sqrt())
+    return Gaussian(density.location[..., here], density.stddev[..., here])
 
 
 @pick.register
@@ -115,6 +141,12 @@ def _(density: Gaussian, index: Tensor) -> Gaussian:
         size = coefficients.shape[-1]
         coefficients = take(coefficients.flatten(-2), index).unflatten(-1, (size, size))
     return Gaussian(take(density.location, index), take(density.scale, index), coefficients)
+
+
+@about.register
+def _(density: Gaussian, index: tuple[Tensor, ...], place: Tensor) -> Gaussian:
+    location = density.location.double()[index] - place
+    return Gaussian(location, density.scale.double()[index].expand_as(location))
 
 
 @median.register

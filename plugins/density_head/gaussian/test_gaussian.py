@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -125,3 +127,32 @@ def test_other_targets_are_refused(kind):
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"density_head\."):
         head(config)
+
+
+@pytest.mark.parametrize("numbers", [2, 3, 20, 100])
+def test_a_covariance_is_a_number_or_refused(numbers):
+    """At raw numbers of any size: never an infinite or missing standard deviation, draw or marginal in silence."""
+    target = Target("real", tuple(f"x{i}" for i in range(numbers)))
+    made = build(
+        "density_head", resolve("density_head", {"name": "gaussian", "covariance": "full"}), target=target
+    )
+    for dtype in (torch.float32, torch.float64):
+        for size in (0.1, 1.0, 30.0, 1e3):
+            density = made.to(dtype)(torch.full((1, made.size), size, dtype=dtype))
+            assert (
+                density.log_prob(torch.zeros(1, numbers, dtype=dtype)).isfinite()
+                and density.entropy().isfinite()
+            )
+            # the largest: σ (1 + φ)^(n - 1) of equal coefficients
+            log_largest = math.log10(density.scale.max()) + (numbers - 1) * math.log10(
+                1 + density.coefficients.max()
+            )
+            if log_largest < math.log10(torch.finfo(dtype).max) - 1:
+                assert density.stddev.isfinite().all() and density.rsample().isfinite().all()
+                assert marginal(density, numbers - 1).scale.log10().item() == pytest.approx(
+                    log_largest, abs=1
+                )
+            else:
+                for ask in (lambda d: d.stddev, lambda d: d.rsample(), lambda d: marginal(d, numbers - 1)):
+                    with pytest.raises(ValueError, match="covariance=diagonal"):
+                        ask(density)

@@ -11,12 +11,14 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.protocol import Estimate, estimate, marginal, median, tempered
+from framework.distributions.uniform import uniform
 from plugins.density_head.latent.monte_carlo import (
     Effort,
     NormalPoints,
     SampledMixture,
     estimate_log_mean,
     rows_of,
+    stretched,
 )
 
 CHUNK = 2**22
@@ -145,7 +147,12 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
     latent = density.latent
 
     def log_weights(rows: Tensor, start: int, count: int) -> Tensor:
-        return latent.log_weights(values[rows], items[rows], density.points(items[rows], start, count))
+        noise = density.points(items[rows], start, count)
+        if not density.effort.tolerance:
+            return latent.log_weights(values[rows], items[rows], noise)
+        noise, log_share = stretched(noise)
+        found = latent.log_weights(values[rows], items[rows], noise)
+        return torch.stack([found + log_share, log_share.expand_as(found)])
 
     at_once = CHUNK // latent.width
     found = estimate_log_mean(
@@ -157,6 +164,11 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
 @marginal.register
 def _(density: LatentDensity, index: int) -> Distribution:
     return marginal(density.mixture, index)
+
+
+@uniform.register
+def _(density: LatentDensity) -> Distribution:
+    return uniform(density._example)
 
 
 @median.register

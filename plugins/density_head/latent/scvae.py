@@ -79,10 +79,11 @@ class SCVAEHead(DensityHead):
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
     bibtex = """@inproceedings{prokudin2018deep,
-  title = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  author = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
   booktitle = {European Conference on Computer Vision (ECCV)},
-  year = {2018}
+  pages     = {534--551},
+  year      = {2018}
 }"""
 
     def __init__(

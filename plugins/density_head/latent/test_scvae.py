@@ -110,7 +110,7 @@ def test_memory_is_bounded_and_the_bound_changes_nothing(monkeypatch):
     made.decoder.body[1].register_forward_hook(lambda layer, arguments, output: held.append(output.numel()))
     found = []
     with torch.no_grad():
-        for chunk in (module.CHUNK, 500):
+        for chunk in (module.CHUNK, 600):  # one sample of each of 32 replicates holds 512
             monkeypatch.setattr(module, "CHUNK", chunk)
             torch.manual_seed(0)
             made.tolerance = None
@@ -121,7 +121,7 @@ def test_memory_is_bounded_and_the_bound_changes_nothing(monkeypatch):
             found.append(several)
             most.append(max(held))
             held.clear()
-    assert most[1] <= 500 < most[0]
+    assert most[1] <= 600 < most[0]
     for first, second in zip(*found, strict=True):
         torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-4)
 

@@ -10,7 +10,9 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid
+from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exactly, marginal, pick, take, tempered
+from framework.distributions.uniform import uniform
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
 VOLUME = 8 * math.pi**2
@@ -131,7 +133,7 @@ class Angle(Distribution):
 
     def entropy(self) -> Tensor:
         """Nats, by quadrature."""
-        return -self.expectation(self._log_density).to(self.joint.dtype)
+        return entropy_of_one(self)
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*batch"]:
         """E function(angle), float64; `function` takes and gives (*batch, point), radians in."""
@@ -156,6 +158,17 @@ estimate.register(Angle, exactly)  # by quadrature, which draws nothing
 @marginal.register
 def _(density: MatrixFisher, index: int) -> Angle:
     return Angle(density, index)
+
+
+@uniform.register
+def _(density: MatrixFisher) -> MatrixFisher:
+    """Of rotations: that of Haar's measure, cos e / 8π² on the chart."""
+    return MatrixFisher(torch.zeros_like(density.parameter), density.dtype)
+
+
+@uniform.register
+def _(density: Angle) -> Angle:
+    return Angle(uniform(density.joint), density.index)  # pyright: ignore[reportArgumentType]
 
 
 @pick.register

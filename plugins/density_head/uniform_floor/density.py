@@ -7,19 +7,22 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular
-from framework.distributions.density import circular_entropy, merged
+from framework.distributions.density import merged
+from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
+    about,
     arc,
     estimate,
     marginal,
     median,
     peaks,
     pick,
+    scales,
     tempered,
-    turn,
 )
 from framework.distributions.tempering import tempered_classes
+from framework.distributions.uniform import uniform
 
 
 class Floored(Distribution):
@@ -28,16 +31,16 @@ class Floored(Distribution):
     Args:
         density: p, over classes or angles.
         weight: γ in (0, 1).
-        log_uniform: log u, nats.
+        floor: u, the uniform law over p's support unless it is given.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
 
-    def __init__(self, density: Distribution, weight: float, log_uniform: float) -> None:
+    def __init__(self, density: Distribution, weight: float, floor: Distribution | None = None) -> None:
         self.density = density
         self.weight = weight
-        self.log_uniform = log_uniform
+        self.floor = uniform(density) if floor is None else floor
         self.has_enumerate_support = density.has_enumerate_support
         super().__init__(density.batch_shape, density.event_shape, validate_args=False)
 
@@ -53,55 +56,55 @@ class Floored(Distribution):
         return self.density.enumerate_support(expand)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return self.floored(self.density.log_prob(value))[0]
+        return self.floored(value, self.density.log_prob(value))[0]
 
-    def floored(self, log_prob: Tensor) -> tuple[Tensor, Tensor]:
+    def floored(self, value: Tensor, log_prob: Tensor) -> tuple[Tensor, Tensor]:
         """log_prob where that of p is `log_prob`, and the part of it that is p's: log (1 - γ) p."""
         above = log_prob + math.log1p(-self.weight)
-        return torch.logaddexp(above, torch.full_like(above, math.log(self.weight) + self.log_uniform)), above
+        below = self.floor.log_prob(value).double() + math.log(self.weight)
+        return torch.logaddexp(above, below.to(above.dtype)), above
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         drawn = self.density.sample(torch.Size(sample_shape))
-        if self.event_shape:
-            uniform = (2 * torch.rand_like(drawn) - 1) * math.pi
-        else:
-            uniform = torch.randint_like(drawn, round(math.exp(-self.log_uniform)))
-        floor = (
-            torch.rand(drawn.shape[: drawn.dim() - len(self.event_shape)], device=drawn.device) < self.weight
-        )
-        return torch.where(floor[(..., *(None,) * len(self.event_shape))], uniform, drawn)
+        below = self.floor.sample(torch.Size(sample_shape)).to(drawn.dtype)
+        chance = torch.rand(drawn.shape[: drawn.dim() - len(self.event_shape)], device=drawn.device)
+        return torch.where((chance < self.weight)[(..., *(None,) * len(self.event_shape))], below, drawn)
 
     def entropy(self) -> Tensor:
         """Nats: exact for classes, by quadrature for one angle; otherwise the mean of -log_prob over 1000 samples."""
         if self.event_shape == ():
             log_prob = self.log_prob(self.enumerate_support())
             return -(log_prob.exp() * log_prob).sum(0)
-        if self.event_shape == (1,) and isinstance(self.support, Circular):
-            return circular_entropy(self)
+        if has_range(self):
+            return entropy_of_one(self)
         return -self.log_prob(self.sample(torch.Size((1000,)))).mean(0)
 
 
 @marginal.register
 def _(density: Floored, index: int) -> Floored:
-    share = density.log_uniform / density.event_shape[0]
-    return Floored(marginal(density.density, index), density.weight, share)
+    return Floored(marginal(density.density, index), density.weight, marginal(density.floor, index))
+
+
+@uniform.register
+def _(density: Floored) -> Distribution:
+    return density.floor
 
 
 @estimate.register
 def _(density: Floored, value: Tensor) -> Estimate:
     found = estimate(density.density, value)
-    log_sum, above = density.floored(found.log_mean)
+    log_sum, above = density.floored(value, found.log_mean)
     # the floor is exact
     return merged(found.each(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
 
 
 @arc.register
 def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
-    inside = arc(density.density, start, end)
-    if inside is None:
+    inside, below = arc(density.density, start, end), arc(density.floor, start, end)
+    if inside is None or below is None:
         return None
-    return (1 - density.weight) * inside + density.weight * turn(start, end).squeeze(-1) / (2 * math.pi)
+    return (1 - density.weight) * inside + density.weight * below
 
 
 @peaks.register
@@ -109,15 +112,27 @@ def _(density: Floored) -> Tensor:
     return peaks(density.density)
 
 
+@scales.register
+def _(density: Floored) -> Tensor:
+    return scales(density.density)
+
+
+@about.register
+def _(density: Floored, index: tuple[Tensor, ...], place: Tensor) -> Floored:
+    return Floored(about(density.density, index, place), density.weight, about(density.floor, index, place))
+
+
 @median.register
 def _(density: Floored, samples: int) -> Tensor:
+    if isinstance(density.support, Circular) and density.support.ranges is not None:
+        return median.dispatch(Distribution)(density, samples)
     # every angle is as far from the uniform density as any other, and every label as wrong
     return median(density.density, samples)
 
 
 @pick.register
 def _(density: Floored, index: Tensor) -> Floored:
-    return Floored(pick(density.density, index), density.weight, density.log_uniform)
+    return Floored(pick(density.density, index), density.weight, pick(density.floor, index))
 
 
 @tempered.register
@@ -125,4 +140,4 @@ def _(density: Floored, temperature: Tensor) -> Distribution:
     """As of any mixture: of classes the whole; of angles p is tempered and the floor, whose power it is, stays."""
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
-    return Floored(tempered(density.density, temperature), density.weight, density.log_uniform)
+    return Floored(tempered(density.density, temperature), density.weight, density.floor)

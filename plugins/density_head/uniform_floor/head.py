@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
+from framework.distributions.uniform import uniform
 from framework.errors import ConfigError
 from framework.heads.parameters import require_trained
 from framework.target import Target
@@ -33,10 +34,11 @@ class UniformFloorHead(DensityHead):
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = """@inproceedings{prokudin2018deep,
-  title = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  author = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
   booktitle = {European Conference on Computer Vision (ECCV)},
-  year = {2018}
+  pages     = {534--551},
+  year      = {2018}
 }"""
 
     def __init__(
@@ -55,22 +57,24 @@ class UniformFloorHead(DensityHead):
         self.weight = weight
         self.component = require_trained(component)
         self.size = component.size
-        # nats; the density of the uniform distribution over classes, or over angles
-        count = len(target.names)
-        self.log_uniform = -math.log(count) if target.kind == "class" else -count * math.log(2 * math.pi)
+        self._law(torch.zeros(1, self.size))  # refused here where there is none
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         density = self.component(raw)
-        return Floored(density, self.weight, self.log_uniform) if self.weight > 0 else density
+        return Floored(density, self.weight) if self.weight > 0 else density
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         if self.weight == 0:
             return self.component.loss(raw, target)
         # a variational component's loss is a bound, under which the floor lies as under a density
-        return -torch.logaddexp(
-            math.log1p(-self.weight) - self.component.loss(raw, target),
-            torch.full((), math.log(self.weight) + self.log_uniform, dtype=raw.dtype, device=raw.device),
-        )
+        above = math.log1p(-self.weight) - self.component.loss(raw, target)
+        below = self._law(raw).log_prob(target).double() + math.log(self.weight)
+        return -torch.logaddexp(above, below.to(above.dtype))
+
+    def _law(self, raw: Tensor) -> Distribution:
+        """The uniform one over the component's support; what a component draws for its density is not missed later."""
+        with torch.no_grad(), torch.random.fork_rng([raw.device] if raw.is_cuda else []):
+            return uniform(self.component(raw))
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         pass  # everything is trained

@@ -26,6 +26,14 @@ ROWS = {
     "uniform_floor": (
         HeadRow("one angle", ONE, {"weight": 0.125}, cases=outlier),
         HeadRow("three angles", THREE, {"weight": 0.01}),
+        HeadRow(
+            "rotations",
+            THREE,
+            {"weight": 0.5, "component": {"name": "matrix_fisher"}},
+            leave_out={
+                "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles"
+            },
+        ),
         HeadRow("classes", CLASSES, {"weight": 0.01, "component": {"name": "categorical"}}),
         HeadRow("no floor", ONE, {"weight": 0.0}),
     )

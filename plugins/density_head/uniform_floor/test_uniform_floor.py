@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError
+from framework.distributions.circular import Circular
+from framework.distributions.uniform import uniform
+from framework.errors import ConfigError, UserError
 from framework.target import Target
 from plugins.density_head.uniform_floor.rows import CLASSES, ONE, THREE
 
@@ -22,6 +24,38 @@ def test_log_prob_is_the_weighted_sum(target, volume):
     wanted = (0.8 * made.component(raw).log_prob(value).exp() + 0.2 / volume).log()
     torch.testing.assert_close(made(raw).log_prob(value), wanted)
     torch.testing.assert_close(made.loss(raw, value), -wanted)
+
+
+@pytest.mark.parametrize(
+    "component", ["matrix_fisher", {"name": "mixture", "component": {"name": "matrix_fisher"}}]
+)
+def test_under_rotations_lies_their_own_uniform_law(component):
+    """cos e / 8π², in the density, in the loss, and under draws, of which half are uniform."""
+    config = {"weight": 0.5, "component": component if isinstance(component, dict) else {"name": component}}
+    made = head(config, THREE).double()
+    torch.manual_seed(0)
+    raw, value = torch.randn(50, made.size).double(), made(torch.randn(50, made.size).double()).sample()
+    haar = value[:, 1].cos() / (8 * math.pi**2)
+    wanted = (0.5 * made.component(raw).log_prob(value).exp() + 0.5 * haar).log()
+    torch.testing.assert_close(made(raw).log_prob(value), wanted)
+    torch.testing.assert_close(made.loss(raw, value), -wanted)
+    elevation = made(torch.zeros_like(raw[:1]) if component == "matrix_fisher" else raw[:1]).sample(
+        (20_000,)
+    )[..., 1]
+    assert elevation.abs().max() <= math.pi / 2
+    if component == "matrix_fisher":  # all uniform: sin e is, with variance 1/3
+        assert elevation.sin().square().mean().item() == pytest.approx(1 / 3, abs=0.01)
+
+
+def test_a_support_without_a_uniform_law_is_refused():
+    class Part(torch.distributions.Uniform):
+        support = Circular(((0.0, 1.0),))
+
+    with pytest.raises(UserError, match=r"no uniform law.*uniform\.register"):
+        uniform(torch.distributions.Independent(Part(torch.zeros(2, 1), torch.ones(2, 1)), 1))
+    real = torch.distributions.Independent(torch.distributions.Normal(torch.zeros(2, 1), torch.ones(2, 1)), 1)
+    with pytest.raises(UserError, match="no uniform law"):
+        uniform(real)
 
 
 def test_without_weight_it_is_its_component_to_the_last_bit():

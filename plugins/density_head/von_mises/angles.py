@@ -49,8 +49,12 @@ def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor
     high = value - mean
     with torch.no_grad():
         low = _lost(value, mean, high) / 2
-        square = low * low  # below 2^-10 for angles up to 2e6 rad
+        square = low * low  # below 2^-10 for angles up to 1e6 rad
         small_sine, small_cosine = low - low * square / 6, 1 - square / 2
+        far = square > 2**-10
+        if far.device.type != "cpu" or bool(far.any()):  # no device waits for an answer
+            small_sine = torch.where(far, torch.sin(low), small_sine)
+            small_cosine = torch.where(far, torch.cos(low), small_cosine)
     half = high / 2
     return torch.sin(half), torch.cos(half), small_sine, small_cosine
 
@@ -80,9 +84,10 @@ def _reduced(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _sine_and_cosine(angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Of an angle in [-π/4, π/4]."""
+    """Of an angle in [-π/4, π/4], or one that says nothing: of numbers so large that they are a turn apart."""
     if not torch.compiler.is_compiling():
         return torch.sin(angle), torch.cos(angle)
+    angle = angle.clamp(-0.8, 0.8)
     # Taylor's series, to 1e-17 and 2e-9: what the compiler calls instead reduces the angle once more
     square = angle * angle
     count = 8 if angle.dtype == torch.float64 else 4

@@ -7,6 +7,7 @@ from torch.distributions import Distribution, constraints, register_kl
 
 from framework.distributions.circular import circular
 from framework.distributions.protocol import (
+    about,
     arc,
     estimate,
     exactly,
@@ -19,13 +20,19 @@ from framework.distributions.protocol import (
 )
 from plugins.density_head.von_mises import functions, integrals
 
+LARGEST = {torch.float32: torch.finfo(torch.float32).max, torch.float64: 1e300}
+"""κ beyond, a point mass in all but its height, is read as this: what is computed from it stays a number."""
+
 
 class VonMises(Distribution):
     """Angles, each von Mises, independent of one another given their parameters (thesis eq. 3.3).
 
     Args:
         mean: (*batch, angle), radians, read modulo 2π.
-        concentration: (*batch, angle), κ ≥ 0; 0 is the uniform density.
+        concentration: (*batch, angle), κ ≥ 0; 0 is the uniform density, and infinity is read as LARGEST.
+
+    Raises:
+        ValueError: a negative concentration.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -34,8 +41,14 @@ class VonMises(Distribution):
     def __init__(
         self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]
     ) -> None:
+        negative = concentration.detach() < 0
+        if bool(negative.any()):
+            raise ValueError(
+                f"{int(negative.sum())} of {negative.numel()} concentrations are negative, the first "
+                f"{concentration.detach()[negative][0].item():g}; wanted κ ≥ 0. Turn the mean by π instead."
+            )
         self.location = mean
-        self.concentration = concentration
+        self.concentration = concentration.clamp(max=LARGEST[concentration.dtype])
         super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
 
     @property
@@ -74,6 +87,12 @@ def _(density: VonMises, index: int) -> VonMises:
 @pick.register
 def _(density: VonMises, index: Tensor) -> VonMises:
     return VonMises(take(density.location, index), take(density.concentration, index))
+
+
+@about.register
+def _(density: VonMises, index: tuple[Tensor, ...], place: Tensor) -> VonMises:
+    location = density.location.double()[index] - place
+    return VonMises(location, density.concentration.double()[index].expand_as(location))
 
 
 @median.register

@@ -2,7 +2,7 @@
 
 Nothing here subtracts two large numbers that nearly agree: the density is written as its height at the mean
 times exp(-2κ sin²((φ-μ)/2)), and the Bessel functions come from polynomials (coefficients.py) of what stays
-smooth from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0.
+smooth from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0 is finite.
 
 The density's value and slopes come from one pass, also under torch.compile; without a compiler the pass runs in
 blocks that fit a processor's cache. The difference of the angles is in angles.py, the Bessel functions in bessel.py,
@@ -27,8 +27,8 @@ SAMPLING_ROUNDS = 64
 def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     """Log-density, nats, with accurate gradients in all three arguments, also the second ones.
 
-    The difference φ-μ is never rounded: angles of up to 4e8 radians are read modulo 2π exactly, beyond that to one
-    unit of their rounding.
+    The difference φ-μ is never rounded: float32 angles of any size are read modulo 2π exactly (compiled: up to 4e8
+    radians), float64 ones up to 4e8 radians, and beyond that to one unit of their rounding.
     """
     dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
     value, mean, concentration = value.to(dtype), mean.to(dtype), concentration.to(dtype)
@@ -150,13 +150,14 @@ def _value(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor]:
         square = (sine * small_cosine + cosine * small_sine).square()
     else:
         square, _ = half_products(value, mean)
-    return (log_height(concentration) - 2 * concentration * square,)
+    # 2κ may overflow
+    return (log_height(concentration) - concentration * (2 * square),)
 
 
 def _value_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     square, product = half_products(value, mean)
     height, deviation = height_and_deviation(concentration)
-    return height - 2 * concentration * square, 2 * concentration * product, deviation - 2 * square
+    return height - concentration * (2 * square), concentration * (2 * product), deviation - 2 * square
 
 
 def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:

@@ -37,10 +37,11 @@ class VonMisesHead(DensityHead):
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = """@inproceedings{prokudin2018deep,
-  title = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  author = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
+  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
   booktitle = {European Conference on Computer Vision (ECCV)},
-  year = {2018}
+  pages     = {534--551},
+  year      = {2018}
 }"""
 
     concentration: Tensor

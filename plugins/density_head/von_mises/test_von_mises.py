@@ -13,14 +13,14 @@ from scipy import optimize, stats
 from torch.distributions import kl_divergence
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.protocol import marginal, median, pick
+from framework.distributions.protocol import arc, marginal, median, pick
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.heads import values
 from plugins.density_head.von_mises import blocks, fit_coefficients, functions, integrals
 from plugins.density_head.von_mises.bessel import polynomial
 from plugins.density_head.von_mises.coefficients import NODES, TABLES
-from plugins.density_head.von_mises.density import VonMises
+from plugins.density_head.von_mises.density import LARGEST, VonMises
 
 mpmath.mp.dps = 90
 DTYPES = (torch.float32, torch.float64)
@@ -479,3 +479,56 @@ def test_concentration_reaches_a_million_and_more():
 def test_other_targets_are_refused(kind):
     with pytest.raises(ConfigError, match=f"von_mises.*'{kind}'"):
         head(target=Target(kind, ("a", "b")))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, monkeypatch):
+    """float32 exactly; float64 beyond 4e8 radians to one unit of their rounding; under gradient and compiled too."""
+    value = torch.logspace(6, 38, 129, dtype=torch.float64).to(dtype)
+    value = torch.cat([value, -value])
+    mean, kappa = torch.full_like(value, 0.7), torch.full_like(value, 2.0)
+    with mpmath.workdps(100):
+        difference = [
+            mpmath.mpf(v) - mpmath.mpf(m) for v, m in zip(value.tolist(), mean.tolist(), strict=True)
+        ]
+        height = -mpmath.log(2 * mpmath.pi * mpmath.besseli(0, 2))
+        wanted = torch.tensor([float(2 * mpmath.cos(d) + height) for d in difference], dtype=torch.float64)
+        slope = torch.tensor([float(2 * mpmath.sin(d)) for d in difference], dtype=torch.float64)
+    unit = (torch.nextafter(value.abs(), torch.tensor(torch.inf, dtype=dtype)) - value.abs()).double()
+    limit = (
+        2e-6 if dtype == torch.float32 else (2e-15 + 2.1 * unit.where(value.abs() > 4e8, 0)).clamp(max=4.01)
+    )
+    assert ((functions.log_prob(value, mean, kappa).double() - wanted).abs() <= limit).all()
+    found = functions.log_prob(value, mean.requires_grad_(), kappa)
+    (by_mean,) = torch.autograd.grad(found.sum(), mean)
+    assert ((found.double() - wanted).abs() <= limit).all() and (
+        (by_mean.double() - slope).abs() <= limit
+    ).all()
+    # what is compiled, step by step: as exact up to 4e8 radians, beyond them never above or below the density's range
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    found = functions.log_prob(value, mean, kappa).detach().double()
+    near = value.abs() < 4e8
+    assert ((found - wanted).abs() <= 2e-6)[near].all()
+    assert (found >= -2.1 + float(height)).all() and (found <= 2.1 + float(height)).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_concentration_at_its_ends_is_a_number_or_refused(dtype):
+    """Up to infinity every answer is a number and the density's limit, a point mass; below 0 there is none."""
+    mean = torch.tensor([[0.5], [3.0]], dtype=dtype)
+    for kappa in (1e38, 3e38, math.inf, torch.finfo(dtype).max):
+        density = VonMises(mean, torch.full_like(mean, kappa))
+        here, there = density.log_prob(mean), density.log_prob(mean + 1)
+        size = min(kappa, LARGEST[dtype])
+        assert here.tolist() == pytest.approx([math.log(size / (2 * math.pi)) / 2] * 2, rel=1e-6)
+        assert (there < -1e37).all() and not there.isnan().any()
+        assert density.entropy().tolist() == pytest.approx([0.5 - here[0].item()] * 2, rel=1e-6)
+        assert torch.equal(density.sample(), mean)
+        assert arc(density, mean - 0.1, mean + 0.1).tolist() == [1, 1]
+        assert arc(density, mean + 0.1, mean - 0.1).tolist() == [0, 0]
+        kappa = torch.full_like(mean, kappa).requires_grad_()
+        (slope,) = torch.autograd.grad(VonMises(mean, kappa).log_prob(mean).sum(), kappa)
+        assert not slope.isnan().any()
+    for kappa in (-1e-30, -1.0, -math.inf):
+        with pytest.raises(ValueError, match=r"1 of 2 concentrations are negative.*wanted κ ≥ 0"):
+            VonMises(mean, torch.tensor([[1.0], [kappa]], dtype=dtype))

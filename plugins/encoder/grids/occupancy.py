@@ -30,10 +30,11 @@ class Occupancy(Encoder):
 
     fixed = True
     bibtex = """@inproceedings{maturana2015voxnet,
-  title = {VoxNet: A 3D Convolutional Neural Network for Real-Time Object Recognition},
-  author = {Maturana, Daniel and Scherer, Sebastian},
+  author    = {Maturana, Daniel and Scherer, Sebastian},
+  title     = {{VoxNet}: A {3D} Convolutional Neural Network for Real-Time Object Recognition},
   booktitle = {IEEE/RSJ International Conference on Intelligent Robots and Systems (IROS)},
-  year = {2015}
+  pages     = {922--928},
+  year      = {2015}
 }"""
 
     def __init__(

@@ -13,8 +13,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from framework.errors import CheckpointError, ConfigError
+from framework.errors import CheckpointError, ConfigError, shown
 from framework.model import describe_mismatch
+from framework.storage.plain_values import require_flat
+from framework.storage.reading import room
 
 _log = logging.getLogger(__name__)
 
@@ -86,7 +88,13 @@ def _torch(path: Path) -> Any:
             with zipfile.ZipFile(path) as archive:
                 # nor does it read a part marked as a folder (attribute 0x10): its tensor stays uninitialised
                 folders = [part.filename for part in archive.infolist() if part.external_attr & 0x10]
+                size = sum(part.file_size for part in archive.infolist())
+                if size > room(path.stat().st_size):
+                    raise ValueError(f"its parts unfold to {size} bytes")
                 failed = archive.testzip() or next(iter(folders), None)
+                for part in archive.infolist():
+                    if part.filename.endswith("data.pkl"):
+                        require_flat(archive.read(part))
             if failed:
                 raise ValueError(f"its part {failed} fails its checksum")
         return torch.load(path, weights_only=True, map_location="cpu")
@@ -117,4 +125,4 @@ def _damaged(path: Path, why: str) -> CheckpointError:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    return shown((str(error).splitlines() or [type(error).__name__])[0].rstrip("."))

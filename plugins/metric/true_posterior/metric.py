@@ -32,7 +32,7 @@ class TruePosterior(Metric):
 
     Each is NaN where no sample speaks of it. Integrals are sums over `points` equally spaced azimuths, so a
     sample costs that many evaluations of the azimuth marginal, and nothing of the other angles. A density
-    so narrow that the grid misses it (its sum there is not 1 within 1 %) is judged from
+    so narrow that the grid misses it (its sum there is not 1 within 1e-4) is judged from
     `prediction.samples` draws.
 
     Args:
@@ -48,7 +48,7 @@ class TruePosterior(Metric):
     bibtex = """@inproceedings{prokudin2018deep,
   author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
   title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  booktitle = {European Conference on Computer Vision},
+  booktitle = {European Conference on Computer Vision (ECCV)},
   pages     = {534--551},
   year      = {2018}
 }"""
@@ -164,7 +164,7 @@ def entropy_and_mode_mass(
     # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
     entropy = -(weight * log_density.clamp(min=-1e4)).sum(0) / total
     mass = _mass_by_mode(relative.unsqueeze(-1).expand_as(weight), weight / total, symmetry, modes, step)
-    narrow = ~((total - 1).abs() < 0.01)
+    narrow = ~((total - 1).abs() < 1e-4)
     if narrow.any():
         drawn = density.sample(torch.Size((samples,)))
         away = wrap(drawn.squeeze(-1).double() - azimuth.double())

@@ -194,6 +194,13 @@ def test_the_threshold_is_the_order_statistic(scores, percent):
     assert threshold(torch.tensor(scores, dtype=torch.float64), percent / 100) == wanted
 
 
+@pytest.mark.parametrize("count", [1, 2, 9, 1000])
+def test_however_much_may_be_missed_the_threshold_is_the_least_score(count):
+    scores = torch.arange(count, dtype=torch.float64)
+    for near in (1e-9, 1e-12, 1e-13, 1e-15, 2**-53):
+        assert threshold(scores, 1 - near) == 0
+
+
 @pytest.mark.parametrize("score", ["density", "mass"])
 def test_too_few_samples_make_the_set_everything_and_it_is_said(score, caplog):
     inputs, label = moons(16)  # 8 of its own: 9 would do for 10 %

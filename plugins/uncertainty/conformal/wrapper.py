@@ -138,5 +138,6 @@ def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
     """The k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉ (Vovk, Gammerman & Shafer 2005, §4.1); infinite if k > n."""
     count = len(scores)
     # from the other side, so that (n + 1) α is whole where it should be: α itself is rounded
-    left_out = math.floor((count + 1) * miscoverage * (1 + 1e-12))
+    # k is at least 1
+    left_out = min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
     return scores.sort().values[count - left_out].item() if left_out else math.inf

@@ -1,0 +1,315 @@
+"""Damages files, has them read in processes with bounded memory and time, and counts what becomes of them."""
+
+import contextlib
+import json
+import mmap
+import os
+import re
+import resource
+import signal
+import struct
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from framework.errors import UserError
+
+SEED = 13
+MEMORY = 2**30
+"""Bytes that reading may take beyond what the process has."""
+SECONDS = 2.0
+"""Of processor time that one file may take."""
+BLOCKED = 20.0
+"""Seconds without any progress until a process counts as blocked."""
+LONGEST_MESSAGE = 1500
+EXTREME = (
+    0,
+    1,
+    2,
+    0x7F,
+    0xFF,
+    0x7FFF,
+    0xFFFF,
+    10**6,
+    10**9,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**40,
+    2**63 - 1,
+    2**64 - 1,
+)
+WORDS = (
+    b"0",
+    b"-1",
+    b"1e9",
+    b"1e308",
+    b"nan",
+    b"inf",
+    b"2147483648",
+    b"1000000000",
+    b"99999999999999999999",
+    b"x",
+    b"",
+)
+
+Damage = Callable[[bytes, np.random.Generator], bytes]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader of ours.
+
+    Attributes:
+        name: of the format and who reads it.
+        file: what the file is called.
+        samples: whole files.
+        read: reads one, wholly.
+        inner: damage that keeps what the format checks first (checksums, compression); used for half of the files.
+        crafted: files that were made to do harm; read before the damaged ones.
+        told: what a refusal must name; None: the file.
+    """
+
+    name: str
+    file: str
+    samples: Sequence[bytes]
+    read: Callable[[Path], object]
+    inner: Sequence[Damage] = ()
+    crafted: Sequence[bytes] = ()
+    told: str | None = None
+
+
+@dataclass
+class Tally:
+    """What became of the files, and the first of each kind of fault: (number, text)."""
+
+    files: int = 0
+    read: int = 0
+    refused: int = 0
+    unclean: int = 0
+    crashes: int = 0
+    hangs: int = 0
+    slowest: float = 0.0
+    faults: list[tuple[int, str]] = field(default_factory=list)
+
+    @property
+    def bad(self) -> int:
+        return self.unclean + self.crashes + self.hangs
+
+
+def damaged(reader: Reader, number: int) -> bytes:
+    """File `number` of a reader: the same every time; the crafted ones come first."""
+    if number < len(reader.crafted):
+        return reader.crafted[number]
+    random = np.random.default_rng([SEED, zlib.crc32(reader.name.encode()), number])
+    whole = reader.samples[int(random.integers(len(reader.samples)))]
+    if reader.inner and random.random() < 0.5:
+        return reader.inner[int(random.integers(len(reader.inner)))](whole, random)
+    return spoilt(whole, random)
+
+
+def spoilt(content: bytes, random: np.random.Generator) -> bytes:
+    """Bytes with one to three faults."""
+    for _ in range(int(random.choice([1, 1, 2, 3]))):
+        content = FAULTS[int(random.integers(len(FAULTS)))](content, random)
+    return content
+
+
+def _flipped(content: bytes, random: np.random.Generator) -> bytes:
+    found = bytearray(content)
+    for place in random.integers(0, max(len(found), 1), int(random.integers(1, 9))) if found else ():
+        found[place] ^= 1 << int(random.integers(8))
+    return bytes(found)
+
+
+def _replaced(content: bytes, random: np.random.Generator) -> bytes:
+    found = bytearray(content)
+    for place in random.integers(0, max(len(found), 1), int(random.integers(1, 4))) if found else ():
+        found[place] = int(random.integers(256))
+    return bytes(found)
+
+
+def _cut(content: bytes, random: np.random.Generator) -> bytes:
+    return content[: int(random.integers(len(content) + 1))]
+
+
+def _run(content: bytes, random: np.random.Generator) -> bytes:
+    """A run of bytes put in."""
+    length = int(2 ** random.uniform(0, 12))
+    kinds = (
+        b"\0" * length,
+        b"\xff" * length,
+        random.bytes(length),
+        b" 9" * (length // 2),
+        b"(" * length,
+        b"\n" * length,
+    )
+    place = int(random.integers(len(content) + 1))
+    return content[:place] + kinds[int(random.integers(len(kinds)))] + content[place:]
+
+
+def _field(content: bytes, random: np.random.Generator) -> bytes:
+    """A field of one to eight bytes, a length perhaps, with another number."""
+    width = int(random.choice([1, 2, 4, 8]))
+    if len(content) < width:
+        return content
+    value = EXTREME[int(random.integers(len(EXTREME)))] % 256**width
+    place = int(random.integers(len(content) - width + 1))
+    if random.random() < 0.5:
+        place -= place % width
+    order = "little" if random.random() < 0.5 else "big"
+    return content[:place] + value.to_bytes(width, order) + content[place + width :]
+
+
+def _block(content: bytes, random: np.random.Generator) -> bytes:
+    """Two blocks swapped, one repeated, or one taken out."""
+    if len(content) < 4:
+        return content
+    a, b, c, d = np.sort(random.integers(0, len(content) + 1, 4)).tolist()
+    kind = random.random()
+    if kind < 0.4:
+        return content[:a] + content[c:d] + content[b:c] + content[a:b] + content[d:]
+    return content[:b] + (content[a:b] if kind < 0.7 else b"") + content[b if kind < 0.7 else c :]
+
+
+def _word(content: bytes, random: np.random.Generator) -> bytes:
+    """A number in letters with another one, near the beginning more often: counts stand there."""
+    within = len(content) if random.random() < 0.5 else min(len(content), 200)
+    found = list(re.finditer(rb"-?\d+(\.\d+)?", content[:within]))
+    if not found:
+        return _flipped(content, random)
+    one = found[int(random.integers(len(found)))]
+    return content[: one.start()] + WORDS[int(random.integers(len(WORDS)))] + content[one.end() :]
+
+
+FAULTS: tuple[Damage, ...] = (_flipped, _replaced, _cut, _run, _field, _field, _block, _word)
+
+
+def fuzz(reader: Reader, count: int, folder: Path) -> Tally:
+    """Have so many damaged files read, in forks of this process that must not have started threads."""
+    tally = Tally(files=count)
+    shared = mmap.mmap(-1, 64)
+    log = folder / "faults.jsonl"
+    log.unlink(missing_ok=True)
+    first = 0
+    while first < count:
+        child = os.fork()
+        if child == 0:
+            _child(reader, first, count, folder, shared, log)
+        status = _waited(child, shared)
+        number, *counts = struct.unpack_from("<4q", shared)
+        (slowest,) = struct.unpack_from("<d", shared, 32)
+        for name, found in zip(("read", "refused", "unclean"), counts, strict=True):
+            setattr(tally, name, getattr(tally, name) + found)
+        tally.slowest = max(tally.slowest, slowest)
+        if status == 0:
+            break
+        killed = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+        hang = killed in (signal.SIGPROF, signal.SIGKILL)
+        tally.hangs += hang
+        tally.crashes += not hang
+        what = signal.Signals(killed).name if killed else f"exit {status >> 8}"
+        tally.faults.append((number, f"{'hangs' if hang else 'crashes'} ({what})"))
+        first = number + 1
+    if log.exists():
+        tally.faults += [tuple(json.loads(line)) for line in log.read_text(encoding="utf-8").splitlines()]
+    return tally
+
+
+def _waited(child: int, shared: mmap.mmap) -> int:
+    """Status of the child; one that makes no progress is killed."""
+    before, since = -1, time.monotonic()
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return status
+        (number,) = struct.unpack_from("<q", shared)
+        if number != before:
+            before, since = number, time.monotonic()
+        elif time.monotonic() - since > BLOCKED:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(0.02)
+
+
+def _child(reader: Reader, first: int, count: int, folder: Path, shared: mmap.mmap, log: Path) -> None:
+    """Read files from number `first` on; never returns."""
+    code = 1
+    try:
+        _limit()
+        file = folder / reader.file
+        counts, slowest, seen = [0, 0, 0], 0.0, set()
+        for number in range(first, count):
+            struct.pack_into("<4q", shared, 0, number, *counts)
+            struct.pack_into("<d", shared, 32, slowest)
+            file.write_bytes(damaged(reader, number))
+            before = time.process_time()
+            signal.setitimer(signal.ITIMER_PROF, SECONDS)
+            outcome, text = outcome_of(reader, file)
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            slowest = max(slowest, time.process_time() - before)
+            counts[outcome] += 1
+            key = re.sub(r"\d+", "0", text)[:60]
+            if outcome == 2 and key not in seen and len(seen) < 30:
+                seen.add(key)
+                with log.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps([number, text[:400]]) + "\n")
+        struct.pack_into("<4q", shared, 0, count, *counts)
+        struct.pack_into("<d", shared, 32, slowest)
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def outcome_of(reader: Reader, file: Path) -> tuple[int, str]:
+    """0: read; 1: refused with a sentence that names the file; 2: anything else, and what."""
+    try:
+        reader.read(file)
+    except UserError as error:
+        text = str(error)
+        if len(text) - len(str(file)) > LONGEST_MESSAGE:
+            return 2, f"a message of {len(text)} characters: {text}"
+        return (
+            (1, "")
+            if (reader.file if reader.told is None else reader.told) in text
+            else (2, f"a message without the file: {text}")
+        )
+    except BaseException as error:
+        frames = []
+        trace = error.__traceback__
+        while trace is not None:
+            frames.append(f"{Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}")
+            trace = trace.tb_next
+        return 2, f"{type(error).__name__}: {error}"[:250] + f" at {' '.join(frames[-4:])}"
+    return 0, ""
+
+
+def _limit() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+
+
+@contextlib.contextmanager
+def scratch():
+    """A folder in memory where there is one."""
+    shm = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=shm if shm.is_dir() else None) as folder:
+        yield Path(folder)
+
+
+def replay(reader: Reader, number: int) -> None:
+    """Read one damaged file here, for whoever mends the fault."""
+    with scratch() as folder:
+        (folder / reader.file).write_bytes(damaged(reader, number))
+        sys.stdout.write(f"{reader.read(folder / reader.file)!r}\n"[:2000])

@@ -1,0 +1,221 @@
+"""Every reader of files that the project has, with whole files for it, damage inside checksums, and crafted ones."""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save as to_safetensors
+
+from benchmarks import crafted_files as crafted
+from benchmarks import damaged_files as whole
+from benchmarks.damage import Reader, spoilt
+from benchmarks.damaged_files import (
+    FACES,
+    VERTICES,
+    image,
+    in_mat,
+    in_png,
+    in_values,
+    in_zip,
+    npy,
+    npz,
+    signed,
+    written,
+)
+from framework import modes
+from framework.configuration.config import Config
+from framework.datasets.csv_columns import mostly_numbers, numbers, read_columns
+from framework.datasets.images import Crop
+from framework.geometry import meshes
+from framework.runs import loading
+from framework.storage.generated import read_mark
+from framework.sweeps import jobs
+from framework.testing import sample_files
+from framework.tracking.journal import Journal
+from framework.tracking.run_info import read_run_info
+from plugins.data.bodies import body_files
+from plugins.data.coil20.views import read_views
+from plugins.data.head_pose import caviar_labels, idiap_labels, towncentre_labels
+from plugins.data.images_with_angles.table import read_table
+from plugins.data.labelled_clouds.archive import read_archive
+from plugins.data.pascal3d import layout
+from plugins.encoder.inception_resnet_v2.weights import read_weights
+
+warnings.simplefilter("ignore")  # of what libraries say of damage
+
+
+def crop(file: Path) -> object:
+    return Crop(file, None, 0.1, 16, upright=True).read()
+
+
+def columns(file: Path) -> object:
+    found = read_columns(file)
+    return [numbers(found, name, missing=None) for name in found.cells if mostly_numbers(found, name)]
+
+
+def annotations(file: Path) -> object:
+    return layout.read_annotations(file.parent.parent.parent, "car", "pascal", file.stem)
+
+
+def cloud(file: Path) -> object:
+    mesh = meshes.read(file, drop_non_finite=True)
+    return mesh.attribute(())
+
+
+def weight(file: Path) -> object:
+    return read_weights(str(file))
+
+
+def stored(file: Path) -> object:
+    """Everything that is done with a stored config before data is read."""
+    (file.parent / "overrides.yaml").write_text("- seed=1\n", encoding="utf-8")
+    values, changed = modes._stored(file.parent, [f"resume={file.parent}"])
+    return Config.of(values, file.parent, changed).parts
+
+
+def records(file: Path) -> object:
+    return jobs.records(file.parent)
+
+
+def readers() -> Iterator[Reader]:
+    """In the order of the report."""
+    yield from clouds()
+    yield from tables_and_images()
+    yield from labels()
+    yield from models()
+    yield from runs()
+
+
+def clouds() -> Iterator[Reader]:
+    off = written("a.off", lambda file: sample_files.write_off(file, VERTICES, FACES))
+    text = written("a.ply", lambda file: sample_files.write_ply(file, VERTICES, FACES))
+    binary = [whole.ply_binary("<", "binary_little_endian"), whole.ply_binary(">", "binary_big_endian")]
+    arrays = [npy(VERTICES), npy(VERTICES.astype(">i4")), npy(np.asfortranarray(VERTICES))]
+    packed = [npz(packed=packed, points=VERTICES, normals=VERTICES, faces=FACES) for packed in (False, True)]
+    yield Reader("OFF", "one.off", [off], cloud, crafted=crafted.OFF)
+    yield Reader("PLY, text", "one.ply", [text], cloud)
+    yield Reader("PLY, binary", "two.ply", binary, cloud, crafted=crafted.PLY)
+    yield Reader("STL", "one.stl", [whole.stl_text(), whole.stl_binary()], cloud)
+    yield Reader("OBJ", "one.obj", [whole.obj()], cloud)
+    yield Reader("XYZ", "one.xyz", [whole.xyz()], cloud, crafted=crafted.XYZ)
+    yield Reader("NPY, clouds", "one.npy", arrays, cloud, crafted=crafted.NPY)
+    yield Reader("NPZ, clouds", "one.npz", packed, cloud, [in_zip], [*crafted.npz("points")])
+    scans = [whole.dales(False), whole.dales(True)]
+    yield Reader(
+        "NPZ, objects of scans",
+        "objects.npz",
+        scans,
+        lambda file: read_archive(str(file)),
+        [in_zip],
+        [*crafted.npz("points")],
+    )
+
+
+def tables_and_images() -> Iterator[Reader]:
+    table = b"\xef\xbb\xbfa,b,c\n" + b'1,2.5,x\n3,,y\n-1e3,4,"z\nw"\n' * 3
+    angles = b"file,pan,tilt,split\n" + b"".join(
+        b"%d.png,%d,-3.5,train\n" % (row, 10 * row) for row in range(9)
+    )
+    yield Reader("CSV, tables", "one.csv", [table], columns, crafted=crafted.CSV)
+    yield Reader(
+        "CSV, images with angles",
+        "angles.csv",
+        [angles],
+        lambda file: read_table(file, None, None),
+        crafted=crafted.CSV,
+    )
+    pngs = [image("PNG"), image("PNG", "P"), image("PNG", "RGBA"), image("PNG", "I;16")]
+    jpegs = [image("JPEG"), image("JPEG", progressive=True), image("JPEG", "L"), image("JPEG", "CMYK")]
+    others = [
+        image(kind)
+        for kind in ("GIF", "BMP", "TIFF", "WEBP", "PPM", "TGA", "PCX", "SGI", "JPEG2000", "ICO", "AVIF")
+    ]
+    others += [image("TIFF", compression=how) for how in ("tiff_lzw", "tiff_deflate", "packbits", "jpeg")]
+    yield Reader("PNG", "one.png", pngs, crop, [in_png], [*crafted.images()])
+    yield Reader("JPEG", "one.jpg", jpegs, crop)
+    yield Reader("other images", "one.img", others, crop)
+
+
+def labels() -> Iterator[Reader]:
+    yield Reader(
+        "MATLAB 5, labels of CAVIAR", "or_label.mat", [whole.caviar(False), whole.caviar(True)],
+        caviar_labels.read_labels, [in_mat], [*crafted.mat("or_label_train")],
+    )  # fmt: skip
+    yield Reader(
+        "MATLAB 5, annotations of PASCAL3D+", "Annotations/car_pascal/one.mat",
+        [whole.annotation(False), whole.annotation(True)], annotations, [in_mat], [*crafted.mat("record")],
+    )  # fmt: skip
+    yield Reader(
+        "MATLAB 5, COIL-20", "COIL20.mat", [whole.coil()], lambda file: read_views(str(file), 32), [in_mat],
+        [*crafted.mat("X")],
+    )  # fmt: skip
+    yield Reader(
+        "MATLAB 7.3 (HDF5), labels of IDIAP", "or_label_full.mat",
+        [whole.idiap(4), whole.idiap(1), whole.idiap_of_ours()],
+        lambda file: idiap_labels.read_labels(file, "radians"), crafted=[*crafted.hdf5()],
+    )  # fmt: skip
+    text = b"pan = -13.50\nvalid = 1\n"
+    yield Reader(
+        "text, labels of TownCentre", "one.txt", [text], towncentre_labels.read_label, crafted=crafted.TEXTS
+    )
+    names = b"2008_000008 -1\n2008_000015  1\n2008_000019\n"
+    yield Reader(
+        "text, lists of PASCAL VOC", "car_train.txt", [names], layout.read_list, crafted=crafted.TEXTS
+    )
+
+
+def models() -> Iterator[Reader]:
+    bodies = [npz(**whole.body()), npz(packed=True, **whole.body())]
+    made = whole.checkpoint()
+    harm = [*crafted.checkpoints(made, crafted.sha)]
+    tensors = {"a.weight": torch.zeros(3, 4), "b": torch.arange(5)}
+    files = [whole.saved(lambda stream: torch.save(tensors, stream))]
+    yield Reader(
+        "pickles of bodies", "body.pkl", whole.body_pickles(), body_files.read, crafted=crafted.PICKLES
+    )
+    yield Reader("NPZ of bodies", "body.npz", bodies, body_files.read, [in_zip], [*crafted.npz("v_template")])
+    yield Reader(
+        "checkpoints", "model.ckpt", [made], loading.load, [signed(spoilt), signed(in_zip), in_values], harm
+    )
+    bomb = crafted.deflated_part("archive/data.pkl", crafted.zeros(), crafted.BOMB)
+    yield Reader("weights, torch", "one.pth", files, weight, [in_zip], [bomb, *crafted.PICKLES])
+    yield Reader(
+        "weights, safetensors",
+        "one.safetensors",
+        [to_safetensors(tensors)],
+        weight,
+        crafted=crafted.SAFETENSORS,
+    )
+
+
+def runs() -> Iterator[Reader]:
+    config = whole.config()
+    job = b'{"key": "a", "status": "completed", "overrides": ["seed=1"], "config": "x"}'
+    mark = b'{"version": 1, "images": 20}'
+    yield Reader(
+        "run.json",
+        "run.json",
+        [whole.run_json()],
+        lambda file: read_run_info(file.parent),
+        crafted=crafted.JSONS,
+    )
+    yield Reader(
+        "journal",
+        "journal.jsonl",
+        [whole.journal()],
+        lambda file: list(Journal(file).lines()),
+        crafted=crafted.JOURNALS,
+    )
+    yield Reader(  # a key is named, as where a user wrote it
+        "config.yaml of a run", "config.yaml", [config], stored, crafted=[*crafted.yamls(config)], told=""
+    )
+    yield Reader("records of jobs", jobs.RECORD, [job], records, crafted=crafted.JSONS)
+    yield Reader(
+        "marks of generated data",
+        "synthetic.json",
+        [mark],
+        lambda file: read_mark(file.parent),
+        crafted=crafted.JSONS,
+    )

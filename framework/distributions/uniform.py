@@ -1,0 +1,110 @@
+"""The uniform law over what a density declares as its support."""
+
+import math
+from functools import singledispatch
+
+import torch
+from torch import Tensor
+from torch.distributions import Categorical, Distribution, constraints
+
+from framework.distributions.batch_shapes import Reshaped, Stacked
+from framework.distributions.circular import Circular, circular
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import about, arc, estimate, exactly, marginal, pick, turn
+from framework.errors import UserError
+
+
+@singledispatch
+def uniform(density: Distribution) -> Distribution:
+    """The law under which no part of the density's support is likelier than another of its size; same shapes.
+
+    Default: of classes, and of angles that are each a whole turn. A density on a chart of something else (rotations,
+    say) registers what is uniform there.
+
+    Raises:
+        UserError: nothing is uniform over the support, or the density has not said what.
+    """
+    if density.has_enumerate_support and density.event_shape == ():
+        return Categorical(
+            logits=torch.zeros_like(density.log_prob(density.enumerate_support())).movedim(0, -1),
+            validate_args=False,
+        )
+    support = density.support
+    if isinstance(support, Circular) and support.ranges is None:
+        return UniformAngles(density.sample(torch.Size((0,))), density.batch_shape, density.event_shape)
+    raise UserError(
+        f"{type(density).__name__} has no uniform law over its support that the framework knows: wanted classes, whole "
+        "turns, or a density that registers one with `framework.distributions.uniform.uniform.register`; leave out "
+        "what needs it."
+    )
+
+
+class UniformAngles(Distribution):
+    """Angles of which none is likelier than another.
+
+    Args:
+        like: any tensor of the samples' number type and device.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, like: Tensor, batch_shape: torch.Size, event_shape: torch.Size) -> None:
+        self.like = like
+        super().__init__(batch_shape, event_shape, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return circular
+
+    @property
+    def mode(self) -> Tensor:
+        return self.like.new_zeros(self.batch_shape + self.event_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return -self.entropy().expand(torch.broadcast_shapes(value.shape[:-1], self.batch_shape))
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
+        return (2 * torch.rand(shape, dtype=self.like.dtype, device=self.like.device) - 1) * math.pi
+
+    def entropy(self) -> Tensor:
+        return self.like.new_full(self.batch_shape, self.event_shape.numel() * math.log(2 * math.pi))
+
+
+@uniform.register
+def _(density: Mixture) -> Distribution:
+    return Mixture(density.log_weights, uniform(density.components))
+
+
+@uniform.register
+def _(density: Stacked) -> Distribution:
+    return Stacked([uniform(one) for one in density.densities])
+
+
+@uniform.register
+def _(density: Reshaped) -> Distribution:
+    return Reshaped(uniform(density.density), density.batch_shape)
+
+
+estimate.register(UniformAngles, exactly)
+
+
+@marginal.register
+def _(density: UniformAngles, index: int) -> UniformAngles:
+    return UniformAngles(density.like, density.batch_shape, torch.Size((1,)))
+
+
+@pick.register
+def _(density: UniformAngles, index: Tensor) -> UniformAngles:
+    return UniformAngles(density.like, index.shape, density.event_shape)
+
+
+@about.register
+def _(density: UniformAngles, index: tuple[Tensor, ...], place: Tensor) -> UniformAngles:
+    shape = torch.broadcast_shapes(place.shape[:-1], *(part.shape for part in index))
+    return UniformAngles(place, shape, density.event_shape)
+
+
+@arc.register
+def _(density: UniformAngles, start: Tensor, end: Tensor) -> Tensor:
+    return turn(start, end).squeeze(-1) / (2 * math.pi)

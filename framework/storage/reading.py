@@ -1,0 +1,80 @@
+"""Reads files that may be damaged or a stranger's: regular ones, within bounds; what goes wrong is one sentence.
+
+What a file may unfold to is bounded by its size, before anything is allocated: `room`.
+"""
+
+import os
+import stat
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from framework.errors import DataError, UserError, shown
+
+RESTORE = "Restore it from its source."
+SMALL, MOST_TIMES = 2**27, 20
+"""A compressed file may unfold to the larger of so many bytes, and so many times its size."""
+
+
+@contextmanager
+def guarded(
+    file: Path, wanted: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
+) -> Iterator[None]:
+    """Everything that damage leads a library to becomes an error of one `kind`, a UserError stays; all name the file.
+
+    Args:
+        wanted: what the file should be, "a MATLAB file" say.
+        remedy: what to do about a damaged file.
+        missing: what to say of one that is not there, beside that.
+    """
+    try:
+        yield
+    except UserError as error:
+        if str(file) in str(error):
+            raise
+        raise type(error)(f"{file}: {error}") from error
+    except Exception as error:
+        if isinstance(error, FileNotFoundError) and not file.exists():
+            raise kind(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
+        why = shown(error) or type(error).__name__
+        raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
+
+
+def opened(file: Path) -> BinaryIO:
+    """A file to read; whoever asks closes it.
+
+    Raises:
+        OSError: it is missing, or no regular file: a pipe could block for ever, a device go on without end.
+    """
+    stream = open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK))  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError("no regular file")
+    return stream
+
+
+def read_bytes(file: Path) -> bytes:
+    """All of a file; errors as `opened`."""
+    with opened(file) as stream:
+        return stream.read()
+
+
+def room(size: int) -> int:
+    """Bytes that a compressed file of `size` bytes may unfold to."""
+    return max(SMALL, MOST_TIMES * size)
+
+
+def inflated(data: bytes, most: int, *, part: bool = False) -> bytes:
+    """What zlib compressed; `part`: the first `most` bytes of it will do.
+
+    Raises:
+        ValueError: it is cut short, or more than `most` bytes.
+        zlib.error: it is damaged.
+    """
+    unpacker = zlib.decompressobj()
+    found = unpacker.decompress(data, most if part else most + 1)
+    if not part and (len(found) > most or not unpacker.eof):
+        raise ValueError(f"what is compressed is cut short, or unfolds to more than {most} bytes")
+    return found

@@ -1,0 +1,81 @@
+"""What a training says of itself while it runs: a bar on a terminal; in a log a line an epoch, or every half minute."""
+
+import time
+from typing import Any, final
+
+import pytorch_lightning as pl
+from rich import progress
+from rich.console import Console
+
+from framework.training.module import Training
+
+
+@final
+class Progress(pl.Callback):
+    """Shows the epoch, counted from 1, its mean training loss so far, and the last validation loss.
+
+    Args:
+        console: where; a quiet one in ranks other than the first.
+        seconds: after which a log gets a line within a long epoch.
+    """
+
+    def __init__(self, console: Console, seconds: float = 30.0) -> None:
+        self.console = console
+        self.seconds = seconds
+        self._total, self._steps, self._told = 0.0, 0, 0.0
+        self._bar: progress.Progress | None = None
+        self._task = progress.TaskID(0)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self._told = time.monotonic()
+        if self.console.is_terminal and not self.console.quiet:
+            shown = (
+                progress.TextColumn("{task.description}"),
+                progress.BarColumn(),
+                progress.MofNCompleteColumn(),
+            )
+            times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+            self._bar = progress.Progress(*shown, *times, console=self.console)
+            self._task = self._bar.add_task("")
+            self._bar.start()
+
+    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        self._total, self._steps = 0.0, 0
+        if self._bar is not None:
+            self._bar.reset(self._task, total=trainer.num_training_batches, description=self._said(trainer))
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        assert isinstance(pl_module, Training)
+        self._total += pl_module.last_loss
+        self._steps += 1
+        if self._bar is not None:
+            self._bar.update(self._task, completed=batch_idx + 1, description=self._said(trainer))
+        elif time.monotonic() - self._told > self.seconds:
+            self._line(trainer, f", step {batch_idx + 1} of {trainer.num_training_batches}")
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if self._bar is None:
+            self._line(trainer)
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def on_exception(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
+    ) -> None:
+        self.on_train_end(trainer, pl_module)
+
+    def _line(self, trainer: pl.Trainer, step: str = "") -> None:
+        self._told = time.monotonic()
+        self.console.print(self._said(trainer, step), soft_wrap=True, highlight=False)
+
+    def _said(self, trainer: pl.Trainer, step: str = "") -> str:
+        epochs = trainer.max_epochs or 0
+        said = f"epoch {trainer.current_epoch + 1}" + (f" of {epochs}" if epochs > 0 else "") + step
+        if self._steps:
+            said += f": loss {self._total / self._steps:.4g}"
+        validation = trainer.callback_metrics.get("validation/loss")
+        return said if validation is None else f"{said}, validation loss {float(validation):.4g}"

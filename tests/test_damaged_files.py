@@ -1,0 +1,154 @@
+"""Damaged and harmful files: every reader of the project reads them or says a sentence, and soon."""
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from framework.configuration.settings import settings
+from framework.datasets import images
+from framework.datasets.images import Crop, square
+from framework.errors import ConfigError, DataError, quoted, shown
+from framework.storage import reading
+from framework.storage.plain_values import read_yaml, require_flat
+from framework.storage.reading import guarded, inflated
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_no_reader_crashes_hangs_or_raises_anything_but_a_sentence(tmp_path: Path) -> None:
+    """Whole files, pipes, devices, folders, and a hundred crafted and damaged files; the full form has 20,000."""
+    done = subprocess.run(
+        [sys.executable, ROOT / "benchmarks" / "fuzz.py", "--files", "100", "--check"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = [line for line in done.stdout.splitlines() if " 100 files, " in line]
+    assert len(lines) >= 30
+    assert all("0 unclean, 0 crashes, 0 hangs" in line for line in lines), done.stdout
+
+
+def test_a_strip_is_scaled_before_it_is_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its middle is the picture of the strip, what is above and below its border; as where memory does not matter."""
+    random = np.random.default_rng(0)
+    smooth = np.kron(random.integers(0, 256, (1, 25, 3)), np.ones((12, 40, 1))).astype(np.uint8)  # 1000 x 12
+    for pixels in (smooth, smooth.transpose(1, 0, 2)):
+        picture = Image.fromarray(np.ascontiguousarray(pixels))
+        box = (0.0, 0.0, float(picture.width), float(picture.height))
+        wanted = square(picture, box, 0.1, 16)
+        with monkeypatch.context() as patched:
+            patched.setattr(images, "MOST_PADDED", 400**2)
+            found = square(picture, box, 0.1, 16)
+        assert wanted is not None and found is not None
+        assert np.abs(found.astype(float) - wanted).max() <= 12
+        assert np.abs(found.astype(float) - wanted).mean() <= 2
+    long = tmp_path / "long.png"
+    Image.fromarray(np.full((60_000, 3), 77, np.uint8)).save(long)
+    assert (Crop(long, None, 0.0, 16).read() == 77).all()
+
+
+@pytest.mark.parametrize("size", [(70_000, 2), (2, 70_000), (9_200, 9_200)])
+def test_images_of_too_many_pixels_are_refused_before_they_are_decoded(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    Image.new("1", size).save(tmp_path / "one.png")
+    with pytest.raises(DataError, match=r"one\.png: .*pixels; at most .* Scale the image down"):
+        Crop(tmp_path / "one.png", None, 0.0, 16).check()
+
+
+def test_an_image_that_another_program_would_decode_is_refused(tmp_path: Path) -> None:
+    Image.new("RGB", (9, 9)).save(tmp_path / "one.eps")
+    (tmp_path / "one.eps").rename(tmp_path / "one.png")
+    with pytest.raises(DataError, match=r"one\.png: cannot be read as an image"):
+        Crop(tmp_path / "one.png", None, 0.0, 16).read()
+
+
+def test_the_guard_turns_any_error_into_a_sentence_that_names_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "one.x"
+    file.touch()
+    for error in (
+        ValueError("a\nb" * 999),
+        NotImplementedError(),
+        MemoryError("\x1b[2J"),
+        RecursionError("r"),
+        KeyError("k"),
+    ):
+        with (
+            pytest.raises(DataError, match=r"one\.x: cannot be read as a thing \(.*\)\. Mend it\.") as caught,
+            guarded(file, "a thing", "Mend it."),
+        ):
+            raise error
+        assert len(str(caught.value)) < len(str(file)) + 260
+        assert str(caught.value).isprintable()
+    with pytest.raises(ConfigError, match=r"^.*one\.x: said$"), guarded(file, "a thing"):
+        raise ConfigError("said")
+    with pytest.raises(KeyboardInterrupt), guarded(file, "a thing"):
+        raise KeyboardInterrupt
+    gone = tmp_path / "gone.x"
+    with (
+        pytest.raises(DataError, match=r"gone\.x: no such file; wanted a thing\. Mend the path\."),
+        guarded(gone, "a thing"),
+    ):
+        reading.read_bytes(gone)
+
+
+def test_damage_is_quoted_in_two_hundred_characters_that_steer_no_terminal() -> None:
+    assert shown("x" * 300) == "x" * 199 + "…"
+    assert shown("a\x1b[31m\ud800b") == "a\\x1b[31m\\ud800b"
+    assert len(quoted("\0" * 10**6)) == 200
+    assert shown("first\n  second") == "first second"
+
+
+def test_inflating_stops_at_the_bound() -> None:
+    import zlib
+
+    packed = zlib.compress(bytes(1000))
+    assert inflated(packed, 1000) == bytes(1000)
+    assert inflated(packed, 10, part=True) == bytes(10)
+    for content, most in ((packed, 999), (packed[:-5], 1000)):
+        with pytest.raises(ValueError, match="cut short, or unfolds"):
+            inflated(content, most)
+
+
+def test_stored_values_are_plain(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    for text in (
+        "a: !!python/object/apply:os.system [id]",
+        "a: !mine 1",
+        "a: &a [1]\nb: *a",
+        "[" * 100 + "]" * 100,
+        "a: [",
+    ):
+        file.write_text(text)
+        with pytest.raises(ConfigError, match=r"config\.yaml: cannot be read as a config"):
+            read_yaml(file, "a config", "Start anew.", ConfigError)
+    file.write_text("a: [1, {b: null}]\n")
+    assert read_yaml(file, "a config") == {"a": [1, {"b": None}]}
+
+
+def test_a_pickle_of_tuples_that_hold_the_same_tuple_twice_is_refused() -> None:
+    """As a key, thirty deep, it takes minutes to hash; what is as deep and holds no tuple twice is all right."""
+    nested: tuple = (1,)
+    deep: tuple = (1,)
+    for number in range(30):
+        nested, deep = (nested, nested), (deep, number)
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        require_flat(pickle.dumps({"a": deep, "b": [(1, (2, 3))] * 9, "c": tuple(range(9999))}, protocol))
+        with pytest.raises(ValueError, match="stands for more than"):
+            require_flat(pickle.dumps([nested], protocol))
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["callbacks", "logger", "plugins", "default_root_dir", "enable_checkpointing", "use_distributed_sampler"],
+)
+def test_what_the_framework_says_to_the_trainer_is_not_a_configs_to_say(key: str) -> None:
+    with pytest.raises(ConfigError, match=rf"trainer\.{key}: unknown key"):
+        settings({"trainer": {key: ["x"]}})

@@ -1,0 +1,120 @@
+"""A trained model after its run: it takes what its user has, of each kind of data, when the training data are gone."""
+
+import shutil
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import framework as package
+from framework.configuration.assembly import build_predictor
+from framework.configuration.schema import resolve
+from framework.errors import DataError
+from framework.model import fitted_models
+from framework.target import Target
+from framework.testing.rows import DataRow
+from tests.conftest import Framework
+
+KINDS = {
+    "tabular": ("two numbers", "density_head=gaussian", "encoder=[mlp]", "metric=[rmse,mae]"),
+    "images_with_angles": (
+        "mirrored",
+        "density_head=von_mises",
+        "encoder=[mlp]",
+        "metric=[angular_deviation]",
+    ),
+    "point_cloud_folder": (
+        "pieces of land",
+        "density_head=categorical",
+        "encoder=[bps,mlp]",
+        "metric=[accuracy]",
+    ),
+}
+HOMES = {"point_cloud_folder": "labelled_clouds"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_model_takes_files_when_its_training_data_are_gone(
+    kind: str, framework: Framework, tmp_path: Path
+) -> None:
+    rows = import_module(f"plugins.data.{HOMES.get(kind, kind)}.rows").ROWS[kind]
+    name, *arguments = KINDS[kind]
+    row: DataRow = next(row for row in rows if row.name == name)
+    home, own = tmp_path / "home", tmp_path / "own"
+    home.mkdir(), own.mkdir()
+    assert row.write is not None and row.files is not None
+    said = {**row.write(home), **row.config}
+    options = [f"data.{key}={str(value).replace(' ', '')}" for key, value in said.items()]
+    quick = [
+        "encoder.mlp.widths=[8]",
+        "trainer.max_epochs=1",
+        "batch_size=8",
+        "pictures=false",
+        "logger=none",
+        "threads=1",
+    ]
+    done = framework(f"data={kind}", *options, *arguments, *quick)
+    assert done.code == 0, done.out
+    shutil.rmtree(home)
+    files = [Path(file) for file in row.files(own)]
+    predicted = framework(
+        "mode=predict", f"checkpoint={done.folder}", f"mode.files={own}", "logger=none", folder="predicted"
+    )
+    assert predicted.code == 0, predicted.out
+    lines = (predicted.folder / "predictions.csv").read_text().splitlines()
+
+    model, frozen = package.load(done.folder), package.freeze(done.folder)
+    assert f"trained on {kind}" in repr(model)
+    density = [model(str(file)) for file in files]
+    assert sum(len(one.sample()) for one in density) == len(lines) - 1
+    for one, file in zip(density, files, strict=True):
+        here = one.sample()
+        twin = frozen.density(file)
+        torch.testing.assert_close(twin.mode, one.mode, rtol=1e-5, atol=1e-5)
+        assert bool(torch.isfinite(twin.log_prob(here)).all())
+        assert bool(torch.isfinite(one.log_prob(here)).all())
+    for wrong in (object(), tmp_path / "gone.csv", np.zeros((2, 77, 5, 3))):
+        for form in (model, frozen):
+            with pytest.raises(DataError):
+                form(wrong)
+
+
+@pytest.mark.parametrize("unit", [(0.0, 1.0), (1e6, 1e-3), (-3e-9, 1e-12), (0.0, 1e30)])
+@pytest.mark.parametrize("head", ["gaussian", "mixture", "extra_trees", "cvae"])
+def test_reals_are_fitted_and_given_back_in_any_unit(head: str, unit: tuple[float, float]) -> None:
+    """What is learned is the same law, moved and scaled; log-densities differ by the logarithm of the scale."""
+    random = torch.Generator().manual_seed(0)
+    inputs = torch.rand(64, 2, generator=random)
+    law = torch.stack([inputs.sum(-1), inputs[:, 0] - 1], -1).double() + 0.1 * torch.rand(
+        64, 2, generator=random
+    )
+    found = []
+    for here, wide in ((0.0, 1.0), unit):
+        target = here + wide * law
+        mean, deviation = target.mean(0), target.std(0)
+        component = {"component": {"name": "gaussian"}} if head in ("mixture", "cvae") else {}
+        parts = {
+            "encoder": [],
+            "uncertainty": [],
+            "density_head": resolve("density_head", {"name": head, **component}),
+        }
+        about = Target("real", ("x", "y"), tuple(mean.tolist()), tuple(deviation.tolist()))
+        predictor = build_predictor(parts, about, (2,), seed=0)
+        if fitted_models(predictor):
+            predictor.head.fit(inputs, target, 0)
+        torch.manual_seed(1)
+        loss = predictor.loss(inputs, target).mean()
+        if not fitted_models(predictor):
+            loss.backward()
+        torch.manual_seed(2)
+        density = predictor.eval()(inputs)
+        torch.manual_seed(3)
+        drawn = density.sample()
+        torch.manual_seed(4)
+        found.append(
+            ((drawn - here) / wide, density.log_prob(target) + 2 * np.log(wide), loss - 2 * np.log(wide))
+        )
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one.double(), other.double(), rtol=1e-4, atol=2e-4)
