@@ -62,6 +62,7 @@ ROWS = {
             "rotations",
             VIEWPOINT,
             {"components": 2, "component": {"name": "matrix_fisher"}},
+            scale=0.5,
             leave_out={
                 "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles"
             },
