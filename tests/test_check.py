@@ -122,8 +122,10 @@ def test_the_worst_case_is_kept() -> None:
 def test_nan_is_the_worst_of_all(bad: float) -> None:
     worst = Worst()
     worst.see(torch.tensor([0.1, bad, 0.2]), lambda at: f"number {at[0]}")
+    worst.see(3.0, "later and finite")
     found = worst.finding("property", 1e300)
-    assert (found.error, found.worst, found.holds) == (math.inf, "number 1", False)
+    assert (str(found.error), found.holds) == (str(bad), False)
+    assert found.worst == ("NaN: number 1" if math.isnan(bad) else "number 1")
 
 
 def test_a_check_that_compares_nothing_fails() -> None:

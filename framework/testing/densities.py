@@ -2,74 +2,222 @@
 
 import math
 from collections.abc import Callable, Iterator
+from functools import cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.circular import angular_distance, grid
-from framework.distributions.protocol import marginal, median
-from framework.testing.finding import SEED, Finding, Worst, examined
-from framework.testing.heads import HeadSubject
+from framework.distributions.circular import Circular, angular_distance, wrap
+from framework.distributions.protocol import arc, cdf, marginal, median
+from framework.errors import UserError
+from framework.testing.adaptive import boxes
+from framework.testing.finding import SEED, Finding, Worst
+from framework.testing.heads import PATIENCE, HeadSubject
 from framework.testing.quadrature import cells, counted, density_at, side
 
 DRAWS = 20_000
+SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
+"""Standard deviations of the raw numbers, beside the row's own."""
+CELLS = 24
+"""Cells of about equal mass in which draws of one number are counted."""
+MEDIAN_DRAWS = 2000
 Check = Callable[[Distribution, Worst], None]
 
 
+class Property(NamedTuple):
+    """A check of densities: its limit, and which raw numbers it is asked of.
+
+    Attributes:
+        batch: "scales": at every scale; "own": at the row's own, where a fixed grid resolves them; "many": 64 rows each
+            of small, ordinary and large ones.
+    """
+
+    name: str
+    limit: float
+    check: Check
+    batch: str
+
+
 def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
-    """Every property of the row's densities, on three of them, in float64."""
-    head = subject.make().double()
-    head.requires_grad_(False)
-    raw = subject.row.scale * subject.raws(3).double()
-    for name, (limit, check) in CHECKS.items():
-        if name in subject.row.leave_out or not applies(name, subject):
+    """Every property of the row's densities, in float64.
+
+    A density that draws random numbers inside is asked at the row's own scale only: what it says of the same raw
+    numbers differs from one to the next by more than any quadrature errs.
+    """
+    draws = subject.draws()
+
+    @cache
+    def made(batch: str) -> tuple[Distribution, list[str]]:
+        own, several = subject.row.scale, 1 if _numbers(subject) > 1 else 3
+        scales = {"own": [own] * 3, "many": [s for s in (1e-2, 1.0, 1e2) for _ in range(64)]}.get(
+            batch, [s for s in (*SCALES, own) for _ in range(several)]
+        )
+        raw = subject.raws(len(scales)).double() * torch.tensor(scales, dtype=torch.float64).unsqueeze(-1)
+        head = subject.make().double()
+        head.requires_grad_(False)
+        names = [f"raw numbers of size {scale:g}, batch row {row}" for row, scale in enumerate(scales)]
+        return head(raw), names
+
+    for name, limit, check, batch in CHECKS:
+        if name in subject.row.leave_out or not applies(name, subject, draws):
+            continue
+        # more than two numbers are integrated, and more than one counted, on a fixed grid
+        grid = {"integral": 2, "samples follow log_prob": 1}.get(name, math.inf)
+        hangs = subject.seconds < PATIENCE  # most likely at extreme raw numbers
+        chosen = "own" if draws or hangs or _numbers(subject) > grid else batch
+        if chosen == "own" and batch == "many":
             continue
 
-        def look(worst: Worst, check: Check = check) -> None:
+        def look(worst: Worst, check: Check = check, chosen: str = chosen) -> None:
             with torch.no_grad():
-                check(head(raw), worst)
+                density, worst.rows = made(chosen)
+                check(density, worst)
 
-        yield examined(name, subject.row.limits.get(name, limit), look)
+        yield subject.examined(name, limit, look)
 
 
-def applies(name: str, subject: HeadSubject) -> bool:
-    """Whether a property can be asked of the row's target."""
+def _numbers(subject: HeadSubject) -> int:
     target = subject.row.target
-    numbers = 1 if target.kind == "class" else len(target.names)
+    return 1 if target.kind == "class" else len(target.names)
+
+
+def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
+    """Whether a property can be asked of the row's target."""
+    kind, numbers = subject.row.target.kind, _numbers(subject)
     wanted = {
         "integral": numbers <= 3,
+        "integral by draws": kind != "class" and numbers >= 3 and not draws,
         "samples follow log_prob": numbers <= 3,
-        "2π-periodic": target.kind == "angle",
-        "median": target.kind == "angle" and numbers == 1,
-        "marginals": target.kind == "angle" and numbers in (2, 3),
+        "samples follow marginals": kind != "class" and numbers == 2 and not draws,
+        "2π-periodic": kind == "angle",
+        "median": kind != "class" and numbers == 1,
+        "marginals": kind == "angle" and numbers in (2, 3),
+        "mean and variance": kind == "real" and numbers <= 2,
+        "cdf": kind != "class" and numbers == 1 and not draws,
     }
     return wanted.get(name, True)
 
 
 def integral(density: Distribution, worst: Worst) -> None:
-    """The density integrates to 1."""
-    _, mass = cells(density)
-    numbers = max(1, len(density.event_shape) and density.event_shape[0])
-    total = mass.sum(tuple(range(numbers)))
-    worst.see((total - 1).abs(), lambda at: f"batch row {at}: {total[at].item():.9g}")
+    """The density integrates to 1: of one or two numbers in boxes that follow it, of three on a grid."""
+    if density.event_shape in ((1,), (2,)):
+        found = boxes(density)
+        total = found.mean(torch.ones_like(found.log_prob))
+    else:
+        _, mass = cells(density)
+        total = mass.sum(tuple(range(max(1, len(density.event_shape) and density.event_shape[0]))))
+    worst.see((total - 1).abs(), lambda at: f"{worst.row(at[0])}: {total[at].item():.9g}")
+
+
+def integral_by_draws(density: Distribution, worst: Worst) -> None:
+    """E_p[q/(p + q)] over draws is E_q[p/(p + q)], q the normal of the draws' covariance; in standard errors.
+
+    Both are ∫ pq/(p + q) if p is normalised and drawn from; what is averaged lies in [0, 1], whatever the tails.
+    """
+    drawn = density.sample(torch.Size((DRAWS,))).double()
+    support = density.support
+    circular = isinstance(support, Circular)
+    center = density.mode.double() if circular else drawn.mean(0)
+    offset = wrap(drawn - center) if circular else drawn - center
+    shift = offset.mean(0)
+    _, root = torch.linalg.qr((offset - shift).movedim(0, 1) / DRAWS**0.5)  # (rows, numbers, numbers)
+    normal = torch.randn(DRAWS, *offset.shape[1:], dtype=torch.float64)
+    volume = root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+
+    def log_ratio(offset: Tensor, standard: Tensor) -> Tensor:
+        value = center + offset
+        found = torch.cat([density.log_prob(part) for part in value.split(4000)])
+        inside = torch.ones_like(found, dtype=torch.bool)
+        if circular:
+            inside = (offset.abs() <= math.pi).all(-1)
+            for number, (low, high) in enumerate((isinstance(support, Circular) and support.ranges) or ()):
+                place = wrap(value[..., number])
+                inside &= (place >= low) & (place <= high)
+        log_normal = -(standard.square() + math.log(2 * math.pi)).sum(-1) / 2 - volume
+        return torch.where(inside, found, -math.inf) - log_normal
+
+    standard = torch.linalg.solve_triangular(root.mT, (offset - shift).movedim(0, -1), upper=False)
+    of_p = torch.sigmoid(-log_ratio(offset, standard.movedim(-1, 0)))
+    of_q = torch.sigmoid(log_ratio(shift + torch.einsum("dbi,bij->dbj", normal, root), normal))
+    noise = ((of_p.var(0) + of_q.var(0)) / DRAWS).sqrt()
+    # where draws are coarser than the density is narrow, nothing can be said
+    least = root.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
+    told = least > 1e4 * torch.finfo(torch.float64).eps * drawn.abs().amax(0).amax(-1)
+    gap = (of_p.mean(0) - of_q.mean(0)).abs() / (noise + 1e-9)
+    worst.see(
+        gap.where(told, 0), lambda at: f"{worst.row(at[0])}: off by {(of_p.mean(0) - of_q.mean(0))[at]:.3g}"
+    )
 
 
 def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
-    """Pearson's χ² of samples over cells, in its standard deviations; cells expecting below five draws are one."""
+    """χ² of draws over cells, as standard deviations of a normal (Wilson & Hilferty 1931): of one number in cells of
+    equal mass by quadrature, of more on a grid; cells expecting below five draws are one."""
     torch.manual_seed(SEED)
+    drawn = density.sample(torch.Size((DRAWS,)))
+    if density.event_shape == (1,):
+        _one_number(density, drawn, worst, "")
+        return
     borders, mass = cells(density)
-    count = counted(density, borders, density.sample(torch.Size((DRAWS,))))
+    count = counted(density, borders, drawn)
     batch = density.batch_shape
-    expected, count = DRAWS * mass.reshape(-1, *batch), count.reshape(-1, *batch)
+    _chi_square(DRAWS * mass.reshape(-1, *batch), count.reshape(-1, *batch), worst, "")
+
+
+def samples_follow_marginals(density: Distribution, worst: Worst) -> None:
+    """Each number of the draws follows marginal(density, number)."""
+    drawn = density.sample(torch.Size((DRAWS,)))
+    for number in range(density.event_shape[0]):
+        try:
+            one = marginal(density, number)
+        except UserError:
+            worst.count(isinstance(density.support, Circular), "no marginal is given")
+            return
+        _one_number(one, drawn[..., number : number + 1], worst, f"number {number}, ")
+
+
+def _one_number(density: Distribution, drawn: Tensor, worst: Worst, what: str) -> None:
+    found = boxes(density)
+    place, border = found.way.back(drawn)[..., 0], found.way.back(found.border[1:-1].unsqueeze(-1))[..., 0]
+    box = torch.searchsorted(border.T.contiguous(), place.T.contiguous()).T
+    middle = found.mass.cumsum(0) - found.mass / 2
+    cell = (CELLS * middle / found.mass.sum(0)).long().clamp(0, CELLS - 1)
+    expected = torch.zeros(CELLS, len(found.way.mode), dtype=torch.float64).scatter_add_(0, cell, found.mass)
+    count = torch.zeros_like(expected).scatter_add_(0, cell.gather(0, box), torch.ones_like(place))
+    worst.finite(f"{what}draws", drawn)
+    _chi_square(DRAWS * expected, count, worst, what)
+
+
+def _chi_square(expected: Tensor, count: Tensor, worst: Worst, what: str) -> None:
     rare = expected < 5
     score = ((count - expected).square() / expected).where(~rare, 0).sum(0)
     rest, rest_count = expected.where(rare, 0).sum(0), count.where(rare, 0).sum(0)
     score = score + (rest_count - rest).square() / rest.clamp(min=5)
-    freedom = (~rare).sum(0).clamp(min=1)
-    worst.see(
-        (score - freedom) / (2 * freedom).sqrt(), lambda at: f"batch row {at}, {freedom[at].item()} cells"
-    )
+    freedom = ((~rare).sum(0) - 1 + (rest >= 5)).clamp(min=1)
+    spread = 2 / (9 * freedom)
+    normal = ((score / freedom).pow(1 / 3) - 1 + spread) / spread.sqrt()
+    worst.see(normal, lambda at: f"{what}{worst.row(at[0])}, {freedom[at].item()} degrees of freedom")
+
+
+def independent(density: Distribution, worst: Worst) -> None:
+    """Draws know nothing of the draw before nor of the neighbour's: correlation of their signs, in standard errors."""
+    drawn = density.sample(torch.Size((4000,))).double()
+    if density.event_shape:
+        offset = drawn - density.mode.double()
+        offset = wrap(offset) if isinstance(density.support, Circular) else offset
+        sign = torch.where(offset > offset.median(0).values, 1.0, -1.0).double().flatten(1)
+    else:
+        sign = torch.where(drawn == density.mode, 1.0, -1.0).double()
+    sign = sign - sign.mean(0)
+    numbers = max(1, sign.shape[1] // density.batch_shape.numel())
+    spread = sign.square().mean(0).sqrt()
+    for what, first, second, scale in (
+        ("the draw before", sign[1:], sign[:-1], spread * spread),
+        ("the next row", sign[:, numbers:], sign[:, :-numbers], spread[numbers:] * spread[:-numbers]),
+    ):
+        together = (first * second).mean(0) / scale.clamp(min=1e-3) * len(first) ** 0.5
+        worst.see(together.abs(), lambda at, what=what: f"{worst.row(at[0] // numbers)} with {what}")
 
 
 def periodic(density: Distribution, worst: Worst) -> None:
@@ -77,6 +225,7 @@ def periodic(density: Distribution, worst: Worst) -> None:
     generator = torch.Generator().manual_seed(SEED)
     shape = torch.Size((8, *density.batch_shape, *density.event_shape))
     value = 6 * torch.randn(shape, dtype=torch.float64, generator=generator)
+    value[0], value[1], value[2] = math.pi, -math.pi, 0.0
     with torch.enable_grad():
         here = density.log_prob(value.requires_grad_())
         (slope,) = torch.autograd.grad(here.sum(), value)
@@ -86,31 +235,52 @@ def periodic(density: Distribution, worst: Worst) -> None:
         # a rounded turn is off by the same share as any other float
         scale = scale * (1 + moved.abs().amax(-1))
         error = (density.log_prob(moved) - here.detach()).abs() / scale
-        worst.see(error, lambda at, turns=turns: f"{turns} turns on, value and batch row {at}")
+        worst.see(error, lambda at, turns=turns: f"{turns} turns on, value {at[0]}, {worst.row(at[1])}")
 
 
 def entropy(density: Distribution, worst: Worst) -> None:
-    """entropy() is the mean of -log_prob over samples; in standard errors of such a mean over 1000."""
-    torch.manual_seed(SEED)
-    drawn = density.sample(torch.Size((DRAWS,)))
-    surprise = torch.cat([-density.log_prob(part) for part in drawn.split(2000)])
-    noise = surprise.std(0) / 1000**0.5
-    found = density.entropy()
-    # a density that is constant has no noise: rounding is allowed instead
-    error = (found - surprise.mean(0)).abs() / (noise + 1e-6)
+    """entropy() is -∫ p log p: by quadrature of one or two numbers, else by draws; limits are in units of 1e-6 nats
+    (relative above 1), or of an error of what is drawn that ordinary luck does not exceed."""
+    found = torch.stack(
+        [_after(seed, density.entropy) for seed in range(1 if _still(density) else 16)]
+    ).double()
+    noise = 2 * found.std(0) / 4 if len(found) > 1 else torch.zeros_like(found[0])
+    if density.event_shape == ():
+        log_prob = density.log_prob(density.enumerate_support()).double()
+        wanted = -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
+    elif density.event_shape in ((1,), (2,)):
+        wanted = boxes(density).entropy()
+    else:
+        drawn = density.sample(torch.Size((DRAWS,)))
+        surprise = torch.cat([-density.log_prob(part) for part in drawn.split(2000)]).double()
+        wanted, noise = surprise.mean(0), noise + 1.2 * surprise.std(0) / DRAWS**0.5
+    error = (found.mean(0) - wanted).abs() / (noise + 1e-6 * wanted.abs().clamp(min=1))
     worst.see(
         error,
-        lambda at: f"batch row {at}: {found[at].item():.6g}, by samples {surprise.mean(0)[at].item():.6g}",
+        lambda at: f"{worst.row(at[0])}: {found.mean(0)[at].item():.9g}, wanted {wanted[at].item():.9g}",
     )
 
 
+def _after(seed: int, ask: Callable[[], Tensor]) -> Tensor:
+    torch.manual_seed(seed)
+    return ask()
+
+
+def _still(density: Distribution) -> bool:
+    """Whether entropy() draws nothing."""
+    return torch.equal(_after(1, density.entropy), _after(2, density.entropy))
+
+
 def mode_is_highest(density: Distribution, worst: Worst) -> None:
-    """No sample is more than `limit` nats above the mode."""
+    """No draw, and no point of the quadrature, is more than `limit` nats above the mode."""
     torch.manual_seed(SEED)
-    drawn = density.sample(torch.Size((2000,)))
-    torch.manual_seed(SEED)
-    above = density.log_prob(drawn).amax(0) - density.log_prob(density.mode)
-    worst.see(above, lambda at: f"batch row {at}: {above[at].item():.3g} nats above the mode")
+    count = max(64, 36_000 // max(18, density.batch_shape.numel()))
+    drawn = density.sample(torch.Size((count,)))
+    highest = density.log_prob(drawn).amax(0)
+    if density.event_shape in ((1,), (2,)) and density.batch_shape.numel() < 64:
+        highest = torch.maximum(highest, boxes(density).log_prob.amax(0))
+    above = highest - density.log_prob(density.mode)
+    worst.see(above, lambda at: f"{worst.row(at[0])}: {above[at].item():.3g} nats above the mode")
 
 
 def marginals(density: Distribution, worst: Worst) -> None:
@@ -131,34 +301,93 @@ def marginals(density: Distribution, worst: Worst) -> None:
         found = density_at(marginal(density, index), some[:, None])
         worst.see(
             (found - wanted).abs() / wanted.clamp(min=1),
-            lambda at, index=index: f"angle {index}, point and row {at}",
+            lambda at, index=index: f"angle {index}, point {at[0]}, {worst.row(at[1])}",
         )
 
 
 def median_is_best(density: Distribution, worst: Worst) -> None:
-    """No angle of a grid has a smaller expected deviation than median(density); radians."""
-    torch.manual_seed(SEED)
-    axis = grid(2048, dtype=torch.float64)
-    shape = (len(axis), *(1,) * len(density.batch_shape))
-    mass = density.log_prob(axis.reshape(*shape, 1).expand(-1, *density.batch_shape, 1)).exp()
-    mass = mass / mass.sum(0)
-    chosen = (angular_distance(median(density, 2000)[..., 0], axis.reshape(shape)) * mass).sum(0)
-    best = torch.stack([_deviation(angle, axis, shape, mass) for angle in axis[::8]]).amin(0)
+    """Half of the mass lies on either side of median(density), and no angle has a smaller expected deviation.
+
+    In standard errors of a median of 2000 draws; where nothing is drawn, in 1e-6 of the mass.
+    """
+    chosen = _after(SEED, lambda: median(density, MEDIAN_DRAWS)).double()
+    still = torch.equal(chosen, _after(SEED + 1, lambda: median(density, MEDIAN_DRAWS)).double())
+    found = boxes(density)
+    below = found.below(chosen[..., 0].unsqueeze(0))[0]
+    if isinstance(density.support, Circular):
+        # ahead of the median up to its antipode, both counted from half a turn before the mode
+        other = found.below(
+            wrap(chosen[..., 0] + math.pi - found.way.mode[:, 0]).unsqueeze(0) + found.way.mode[:, 0]
+        )
+        below = (below - other[0]).remainder(1.0)
+        deviation = angular_distance(chosen[..., 0], found.value[..., 0])
+        mean = found.mean(deviation)
+        spread = (found.mean(deviation.square()) - mean.square()).clamp(min=1e-30).sqrt()
+        # few of the nodes will do: the others lie between them
+        best = torch.stack(
+            [found.mean(angular_distance(node, found.value[..., 0])) for node in found.value[::7, :, 0]]
+        )
+        worst.see(
+            (mean - best.amin(0)) / (2 * spread / MEDIAN_DRAWS**0.5),
+            lambda at: f"{worst.row(at[0])}: {mean[at].item():.4g}, best {best.amin(0)[at].item():.4g} rad",
+        )
+    unit = 1e-6 if still else 0.5 / MEDIAN_DRAWS**0.5
     worst.see(
-        chosen - best, lambda at: f"batch row {at}: {chosen[at].item():.4g}, best {best[at].item():.4g} rad"
+        (below - 0.5).abs() / unit,
+        lambda at: f"{worst.row(at[0])}: {below[at].item():.6g} of the mass before it",
     )
 
 
-def _deviation(angle: Tensor, axis: Tensor, shape: tuple[int, ...], mass: Tensor) -> Tensor:
-    return (angular_distance(angle, axis).reshape(shape) * mass).sum(0)
+def moments(density: Distribution, worst: Worst) -> None:
+    """mean and variance, where the density has them, are those of the quadrature, in standard deviations."""
+    found = boxes(density)
+    offset = found.value - found.way.mode  # so that a narrow density far from 0 cancels nothing
+    mean = torch.stack([found.mean(part) for part in offset.unbind(-1)], -1)
+    variance = torch.stack([found.mean(part) for part in (offset - mean).square().unbind(-1)], -1)
+    given = {}
+    for name in ("mean", "variance"):
+        try:
+            given[name] = getattr(density, name).double()
+        except (NotImplementedError, AttributeError):
+            worst.count(False, f"no {name} is given")
+    if "mean" in given:
+        gap = given["mean"] - found.way.mode - mean
+        worst.see(gap.abs() / variance.sqrt(), lambda at: f"mean, {worst.row(at[0])}")
+    if "variance" in given:
+        worst.see((given["variance"] / variance - 1).abs(), lambda at: f"variance, {worst.row(at[0])}")
 
 
-CHECKS: dict[str, tuple[float, Check]] = {
-    "integral": (1e-6, integral),
-    "samples follow log_prob": (5.0, samples_follow_log_prob),
-    "2π-periodic": (1e-13, periodic),
-    "entropy": (5.0, entropy),
-    "mode": (0.05, mode_is_highest),
-    "marginals": (1e-6, marginals),
-    "median": (1e-3, median_is_best),
-}
+def masses(density: Distribution, worst: Worst) -> None:
+    """cdf and arc, where they are known, are those of the quadrature at mode ± {0, 0.3, 1, 3, 30} widths."""
+    found = boxes(density)
+    offset = torch.tensor([-30, -3, -1, -0.3, 0, 0.3, 1, 3, 30], dtype=torch.float64)[:, None]
+    value = found.way.mode[:, 0] + offset * found.way.scale[:, 0]
+    if isinstance(density.support, Circular):
+        value = value.clamp(found.way.mode[:, 0] - 3.1, found.way.mode[:, 0] + 3.1)
+        given = arc(density, found.border[:1].unsqueeze(-1).expand(len(offset), -1, 1), value.unsqueeze(-1))
+    else:
+        given = cdf(density, value.unsqueeze(-1))
+    if given is None:
+        worst.count(False, "not known in closed form")
+        return
+    wanted = found.below(value)
+    worst.see(
+        (given - wanted).abs(), lambda at: f"mode + {offset[at[0]].item():g} widths, {worst.row(at[1])}"
+    )
+
+
+CHECKS = (
+    Property("integral", 1e-6, integral, "scales"),
+    Property("integral by draws", 6.0, integral_by_draws, "scales"),
+    Property("samples follow log_prob", 5.0, samples_follow_log_prob, "scales"),
+    Property("samples follow marginals", 5.0, samples_follow_marginals, "scales"),
+    Property("draws are independent", 6.0, independent, "own"),
+    Property("2π-periodic", 1e-13, periodic, "own"),
+    Property("entropy", 5.0, entropy, "scales"),
+    Property("mode", 0.05, mode_is_highest, "scales"),
+    Property("mode", 0.5, mode_is_highest, "many"),
+    Property("marginals", 1e-6, marginals, "own"),
+    Property("median", 5.0, median_is_best, "scales"),
+    Property("mean and variance", 1e-5, moments, "scales"),
+    Property("cdf", 1e-6, masses, "scales"),
+)

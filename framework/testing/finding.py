@@ -1,8 +1,9 @@
 """What one check found: its worst case and how far that is from the limit."""
 
+import math
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,8 @@ class Finding:
     Attributes:
         name: what must hold.
         worst: the worst case in words; why, where it failed.
-        error: how wrong it is, in the property's own measure; infinite where the plugin raised or did not end.
+        error: how wrong it is, in the property's own measure; NaN where something came out NaN, infinite where the
+            plugin raised or did not end.
         limit: the largest error that passes.
     """
 
@@ -39,22 +41,29 @@ class Finding:
 
 
 class Worst:
-    """Keeps the worst of what it sees."""
+    """Keeps the worst of what it sees.
+
+    Attributes:
+        rows: what the batch rows of the densities looked at are, where a number does not say it.
+    """
 
     def __init__(self) -> None:
         self.error = -torch.inf
         self.case = "nothing to compare"
+        self.rows: Sequence[str] = ()
+
+    def row(self, index: int) -> str:
+        return self.rows[index] if self.rows else f"batch row {index}"
 
     def see(self, error: float | Tensor, case: str | Callable[[tuple[int, ...]], str]) -> None:
-        """An error, or a tensor of them with a description by index. NaN counts as infinite."""
+        """An error, or a tensor of them with a description by index. Nothing is worse than NaN."""
         if not isinstance(error, Tensor):
             error = torch.tensor(float(error), dtype=torch.float64)
         if error.numel() == 0:
             return
         flat = error.detach().double().flatten()
-        flat = flat.where(~flat.isnan(), torch.inf)
-        index = int(flat.argmax())
-        if flat[index].item() > self.error:
+        index = int(flat.argmax())  # that of the first NaN, if there is one
+        if not flat[index].item() <= self.error and not math.isnan(self.error):
             self.error = flat[index].item()
             at = tuple(int(number) for number in torch.unravel_index(torch.tensor(index), error.shape))
             self.case = case if isinstance(case, str) else case(at)
@@ -86,8 +95,9 @@ class Worst:
 
     def finding(self, name: str, limit: float) -> Finding:
         # a check that compared nothing has shown nothing
-        error = self.error if self.error > -torch.inf else torch.inf
-        return Finding(name, self.case, max(error, 0.0), limit)
+        error = torch.inf if self.error == -torch.inf else self.error
+        case = f"NaN: {self.case}" if math.isnan(error) else self.case
+        return Finding(name, case, error if math.isnan(error) else max(error, 0.0), limit)
 
 
 class TooSlow(Exception):

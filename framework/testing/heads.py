@@ -25,12 +25,28 @@ SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
 """Raw numbers of these sizes, and of the largest a type holds, are fed in as they may come from a diverging network."""
 
 
-@dataclass(frozen=True)
+PATIENCE = 20.0
+"""Seconds of processor time for one check."""
+
+
+@dataclass
 class HeadSubject:
-    """A row and how to build the head it describes; every built head has the same parameters."""
+    """A row and how to build the head it describes; every built head has the same parameters.
+
+    Attributes:
+        seconds: what a check may take: little, once one has not ended.
+    """
 
     row: HeadRow
     build: Callable[[], DensityHead]
+    seconds: float = PATIENCE
+
+    def examined(self, name: str, limit: float, look: Callable[[Worst], None]) -> Finding:
+        """The finding of one check, with the row's limit where it has its own."""
+        found = examined(name, self.row.limits.get(name, limit), look, seconds=self.seconds)
+        if found.worst.startswith("TooSlow"):
+            self.seconds = 1.0
+        return found
 
     def make(self) -> DensityHead:
         """A fresh head in evaluation mode."""
@@ -45,6 +61,19 @@ class HeadSubject:
     def values(self, *batch: int) -> Tensor:
         """Seeded targets: angles over several turns, reals of size 1, labels."""
         return values(self.row.target, batch)
+
+    def draws(self) -> bool:
+        """Whether the density of the same raw numbers and parameters is another with another seed."""
+        try:
+            with torch.no_grad():
+                head, raw, value = self.make(), self.raws(4), self.values(4)
+                found = []
+                for seed in (0, 1):
+                    torch.manual_seed(seed)
+                    found.append(head(raw).log_prob(value))
+            return not torch.equal(*found)
+        except Exception:  # the checks themselves say what
+            return False
 
 
 def ready(head: DensityHead, target: Target) -> DensityHead:
@@ -66,6 +95,8 @@ def values(target: Target, batch: tuple[int, ...]) -> Tensor:
 
 def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     """Every property of the head itself, cheapest first."""
+    from framework.testing.gradients import gradient, proper
+
     checks = (
         ("batch shapes", 0.0, _shapes),
         ("number types", 0.0, _number_types),
@@ -76,7 +107,9 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("mixture of one is the component", 0.0, _mixture_of_one),
         ("knobs turn", 0.0, _knobs),
         ("finite for any raw numbers", 0.0, _finite_anywhere),
-        ("loss gradient", 1e-6, _gradient),
+        ("calibrate does not harm", 1e-5, _calibrated),
+        ("loss gradient", 1e-6, gradient),
+        ("loss is least for its own density", 6.0, proper),
         ("float32 against float64", 32.0, _precision),
         ("log_prob, float64", 1e-12, lambda subject, worst: _reference(subject, worst, torch.float64)),
         ("log_prob, float32", 2e-6, lambda subject, worst: _reference(subject, worst, torch.float32)),
@@ -84,9 +117,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     for name, limit, check in checks:
         if name in subject.row.leave_out or (name.startswith("log_prob") and subject.row.cases is None):
             continue
-        yield examined(
-            name, subject.row.limits.get(name, limit), lambda worst, check=check: check(subject, worst)
-        )
+        yield subject.examined(name, limit, lambda worst, check=check: check(subject, worst))
 
 
 def _shapes(subject: HeadSubject, worst: Worst) -> None:
@@ -118,10 +149,11 @@ def _shapes(subject: HeadSubject, worst: Worst) -> None:
                 shapes["entropy"] = (density.entropy().shape, batch)
                 if target.kind != "class":
                     shapes["median"] = (median(density, 200).shape, (*batch, *event))
-            if target.kind == "angle":
-                worst.count(
-                    not isinstance(density.support, Circular), f"support: {density.support}, wanted angles"
-                )
+            angles = isinstance(density.support, Circular)
+            worst.count(angles != (target.kind == "angle"), f"support: {density.support} of {target.kind}")
+            if target.kind == "class":
+                labels = density.enumerate_support(expand=False).flatten().tolist()
+                worst.same("labels", labels, list(range(len(target.names))))
             for what, (found, wanted) in shapes.items():
                 worst.same(f"{what} of a batch {batch}", tuple(found), wanted)
 
@@ -132,7 +164,7 @@ def _number_types(subject: HeadSubject, worst: Worst) -> None:
     wanted = {float64: float64, float32: float32, torch.float16: float32, torch.bfloat16: float32}
     for given, computed in wanted.items():
         head = subject.make().to(computed)
-        value = _as(subject.values(4), computed)
+        value = as_type(subject.values(4), computed)
         with torch.no_grad():
             density = head(subject.raws(4).to(given))
             worst.same(f"log_prob of {given} raw numbers", density.log_prob(value).dtype, computed)
@@ -158,9 +190,10 @@ def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _repeatable(subject: HeadSubject, worst: Worst) -> None:
-    head, raw, value = subject.make(), subject.raws(4), subject.values(4)
+    """Also after other raw numbers, in training and evaluation: a head keeps nothing between calls."""
+    raw, value = subject.raws(4), subject.values(4)
 
-    def everything() -> dict[str, Tensor]:
+    def everything(head: DensityHead) -> dict[str, Tensor]:
         torch.manual_seed(SEED)
         density = head.eval()(raw)
         return {
@@ -170,13 +203,30 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
         }
 
     with torch.no_grad():
-        second = everything()
-        for name, first in everything().items():
-            worst.same_bits(f"{name} of two runs", first, second[name])
+        head = subject.make()
+        first = everything(head)
+        head.eval()(2 + 3 * raw).sample()
+        head.train().loss(2 + 3 * raw, value)
+        for what, other in {"two runs": head, "two heads": subject.make()}.items():
+            for name, again in everything(other).items():
+                worst.same_bits(f"{name} of {what}", again, first[name])
 
 
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
-    """A row's loss has no gradient in another row: no density depends on its neighbours in the batch."""
+    """A row's loss has no gradient in another row, nor changes with it: no density depends on its neighbours."""
+    found = []
+    for factor in (1.0, -3.0):
+        head, raw, value = subject.make(), subject.raws(4), subject.values(4)
+        raw[[0, 1, 3]] *= factor
+        with torch.no_grad():
+            torch.manual_seed(SEED)
+            density = head(raw)
+            found.append({"log_prob": density.log_prob(value)[2], "mode": density.mode[2].float()})
+            torch.manual_seed(SEED)
+            found[-1]["loss"] = head.train().loss(raw, value)[2]
+    for name, alone in found[0].items():
+        gap = (found[1][name] - alone).abs() > 1e-5 * alone.abs().clamp(min=1)
+        worst.count(gap, f"{name} of row 2 where the others change")
     raw = subject.raws(4).requires_grad_()
     subject.make().train().loss(raw, subject.values(4))[2].backward()
     if raw.grad is None:
@@ -240,7 +290,7 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
         for size in (*SIZES, torch.finfo(dtype).max):
             raw = subject.raws(16).sign().to(dtype) * size
             raw[:4], raw[4:8] = size, -size
-            value = _as(subject.values(16), dtype)
+            value = as_type(subject.values(16), dtype)
             where = f"{str(dtype)[6:]}, raw numbers of size {size:.3g}"
             with torch.no_grad():
                 density = head.eval()(raw)
@@ -254,36 +304,18 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
             worst.finite(f"gradient of the loss: {where}", torch.zeros(1) if raw.grad is None else raw.grad)
 
 
-def _gradient(subject: HeadSubject, worst: Worst, step: float = 1e-5) -> None:
-    """Directional derivatives of the loss in raw numbers and parameters against central differences."""
-    head = subject.make().double().train()
-    value = _as(subject.values(3), torch.float64)
-    for size in (0.1, 1.0, 3.0):
-        raw = (size * subject.raws(3).double()).requires_grad_()
-        arguments = {"raw numbers": raw}
-        arguments.update((name, part) for name, part in head.named_parameters() if part.requires_grad)
-
-        def loss(raw: Tensor = raw) -> Tensor:
-            torch.manual_seed(SEED)
-            return head.loss(raw, value).sum()
-
-        gradients = torch.autograd.grad(loss(), list(arguments.values()), allow_unused=True)
-        for number, ((name, argument), gradient) in enumerate(zip(arguments.items(), gradients, strict=True)):
-            generator = torch.Generator().manual_seed(number)
-            direction = torch.randn(argument.shape, dtype=argument.dtype, generator=generator)
-            direction = direction / direction.norm()
-            analytic = 0.0 if gradient is None else (gradient * direction).sum().item()
-            ends = []
-            with torch.no_grad():
-                for sign in (1, -1):
-                    argument += sign * step * direction
-                    ends.append(loss().item())
-                    argument -= sign * step * direction
-            numeric = (ends[0] - ends[1]) / (2 * step)
-            worst.see(
-                abs(analytic - numeric) / max(1.0, abs(numeric)),
-                f"in {name} of size {size:g}: {analytic:.9g}, by differences {numeric:.9g}",
-            )
+def _calibrated(subject: HeadSubject, worst: Worst) -> None:
+    """calibrate leaves the mean log_prob of what it was given as good as before, or better; relative above 1 nat."""
+    head, raw, value = subject.make(), subject.raws(64), subject.values(64)
+    if subject.draws():
+        worst.count(False, "draws in log_prob")
+        return
+    with torch.no_grad():
+        before = head(raw).log_prob(value).double().mean()
+        head.calibrate(raw, value)
+        after = head(raw).log_prob(value).double().mean()
+    loss = (before - after).clamp(min=0) / before.abs().clamp(min=1) if after.isfinite() else after
+    worst.see(loss, f"{before.item():.6g} before, {after.item():.6g} after")
 
 
 def _precision(subject: HeadSubject, worst: Worst) -> None:
@@ -297,16 +329,16 @@ def _precision(subject: HeadSubject, worst: Worst) -> None:
     for size in (1e-8, 1e-3, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6):
         raw = size * subject.raws(64)
         with torch.no_grad():
-            at_mode = _seeded(single, raw).mode
+            at_mode = seeded(single, raw).mode
         for where, value in (("the mode", at_mode), ("a random value", subject.values(64))):
             with torch.no_grad():
-                found = _seeded(single, raw).log_prob(value).double()
+                found = seeded(single, raw).log_prob(value).double()
             exact_raw = raw.double().requires_grad_()
             arguments = [exact_raw]
             if value.is_floating_point():
                 value = value.double().requires_grad_()
                 arguments.append(value)
-            exact = _seeded(double, exact_raw).log_prob(value)
+            exact = seeded(double, exact_raw).log_prob(value)
             slopes = torch.autograd.grad(exact.sum(), arguments)
             scale = exact.detach().abs().clamp(min=1) + (slopes[0] * exact_raw).abs().sum(-1).detach()
             if len(slopes) > 1:
@@ -322,7 +354,7 @@ def _precision(subject: HeadSubject, worst: Worst) -> None:
             )
 
 
-def _seeded(head: DensityHead, raw: Tensor) -> Distribution:
+def seeded(head: DensityHead, raw: Tensor) -> Distribution:
     """The density with the same random numbers, if it draws any, each time."""
     torch.manual_seed(SEED)
     return head(raw)
@@ -336,7 +368,7 @@ def _reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
     head = head.to(dtype)
     for case in cases:
         with torch.no_grad():
-            found = _seeded(head, case.raw.to(dtype)).log_prob(_as(case.value, dtype)).double()
+            found = seeded(head, case.raw.to(dtype)).log_prob(as_type(case.value, dtype)).double()
         error = (found - case.log_prob).abs() / case.log_prob.abs().clamp(min=1)
         worst.see(
             error,
@@ -346,5 +378,5 @@ def _reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
         )
 
 
-def _as(value: Tensor, dtype: torch.dtype) -> Tensor:
+def as_type(value: Tensor, dtype: torch.dtype) -> Tensor:
     return value.to(dtype) if value.is_floating_point() else value

@@ -42,8 +42,8 @@ class HeadRow:
         target: what it predicts.
         config: its parameters.
         cases: the reference: a built head (evaluation mode, float64) → cases. None where none is known.
-        scale: standard deviation of the normal raw numbers on which densities are integrated, such that they are
-            broad enough for a grid of 1024 angles, or reals within some tens of zero.
+        scale: standard deviation of the normal raw numbers on which densities of three numbers, and those that draw,
+            are integrated, such that they are broad enough for a grid; others follow at scales of 1e-2 to 1e3 too.
         limits: property → limit, where it is not the contract's own.
         leave_out: property → why this density cannot have it.
     """

@@ -49,16 +49,20 @@ def stiff(head: DensityHead) -> Iterator[Case]:
         yield Case(name, raw, target, log_prob)
 
 
+OVERLAPPING = {"mode": 0.5}
+"""The mode is the best of the components', which is not the highest point where they overlap."""
+
 ROWS = {
     "mixture": (
-        HeadRow("five components", ONE, cases=stiff, scale=3.0),
+        HeadRow("five components", ONE, cases=stiff, scale=3.0, limits=OVERLAPPING),
         HeadRow("one component", ONE, {"components": 1}, cases=stiff, scale=3.0),
-        HeadRow("two angles", TWO, {"components": 3}, cases=stiff),
-        HeadRow("mixture of mixtures", ONE, NESTED),
+        HeadRow("two angles", TWO, {"components": 3}, cases=stiff, limits=OVERLAPPING),
+        HeadRow("mixture of mixtures", ONE, NESTED, limits=OVERLAPPING),
         HeadRow(
             "rotations",
             VIEWPOINT,
             {"components": 2, "component": {"name": "matrix_fisher"}},
+            scale=0.5,
             leave_out={
                 "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles"
             },

@@ -1,0 +1,244 @@
+"""Quadrature of a density of one or two numbers that follows it, however narrow: boxes split where they disagree."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.circular import Circular, wrap
+from framework.distributions.protocol import peaks
+
+RULES = {1: (10, 6), 2: (8, 5)}
+"""Gauss-Legendre points a side; a box whose two sums differ is split."""
+TOLERANCE = {1: 1e-10, 2: 1e-6}
+ROUNDS = {1: 60, 2: 40}
+MOST = {1: 128, 2: 48}
+"""Boxes of a batch row split in one round."""
+REACH = 36.0
+"""Values are mode + a sinh(s), a the density's own width: of reals to sinh 36 = 2e15 widths, of angles half a turn."""
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """What the quadrature leaves of a density with batch_shape (rows,).
+
+    Attributes:
+        value: (node, rows, number), where the density was evaluated last; log_prob: (node, rows), nats.
+        weight: (node, rows) volume of each node. Σ weight · exp(log_prob) is the integral.
+        border: of one number (box + 1, rows) ascending, mass (box, rows) between them.
+        way: the coordinates in which boxes are cut.
+    """
+
+    value: Tensor
+    log_prob: Tensor
+    weight: Tensor
+    border: Tensor
+    mass: Tensor
+    way: "_Map"
+
+    def mean(self, of: Tensor) -> Tensor:
+        """∫ p f of f (node, rows)."""
+        share = self.weight * self.log_prob.exp()
+        return torch.where(share > 0, share * of, 0.0).sum(0)
+
+    def entropy(self) -> Tensor:
+        return -self.mean(self.log_prob)
+
+    def below(self, value: Tensor) -> Tensor:
+        """Mass from the first border to `value` (several, rows) of one number; of angles from half a turn before the
+        mode."""
+        place = self.way.back(value.unsqueeze(-1))
+        border = self.way.back(self.border.unsqueeze(-1))[..., 0]
+        border[0], border[-1] = (end[:, 0] for end in self.way.ends)
+        box = torch.searchsorted(border.T.contiguous(), place[..., 0].T.contiguous()).T.clamp(
+            1, len(border) - 1
+        )
+        low = border.gather(0, box - 1).unsqueeze(-1)
+        _, log_prob, weight = _nodes(self.way, low, place, RULES[1][0])
+        before = torch.cat([torch.zeros_like(self.mass[:1]), self.mass.cumsum(0)]).gather(0, box - 1)
+        return before + (weight * log_prob.exp()).sum(1)
+
+
+class _Map:
+    """Coordinates in which boxes are cut → values: sinh along the density's own axes, in its own widths.
+
+    About the highest of some candidates, since a mode may be wrong.
+    """
+
+    def __init__(self, density: Distribution, candidates: Tensor) -> None:
+        self.density = density
+        height = self.log_prob(candidates)
+        best = height.where(~height.isnan(), -math.inf).argmax(0)
+        self.mode = candidates[best, torch.arange(len(best))]
+        self.angles = isinstance(density.support, Circular)
+        self.chart = isinstance(density.support, Circular) and density.support.ranges is not None
+        if self.chart:
+            self.mode = wrap(self.mode)
+        self.scale = self._widths()
+        self.slope = torch.zeros_like(self.mode[:, 0])
+        if not self.angles and self.mode.shape[1] == 2:
+            self._whiten()
+        end = torch.full_like(self.mode, REACH)
+        self.ends = -end, end
+        if isinstance(density.support, Circular):
+            turn = [(-math.pi, math.pi)] * self.mode.shape[1]
+            first, last = torch.tensor(density.support.ranges or turn, dtype=torch.float64).T
+            if density.support.ranges is None:
+                first, last = first + self.mode, last + self.mode
+            self.ends = ((first - self.mode) / self.scale).asinh(), ((last - self.mode) / self.scale).asinh()
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        like = self.density.sample(torch.Size((0,)))
+        return self.density.log_prob(value.to(like.dtype)).double()
+
+    def _widths(self) -> Tensor:
+        """How far from the mode along each axis the density has fallen by half a nat, (rows, number)."""
+        steps = 2.0 ** torch.arange(-40, 2 if self.angles else 60, dtype=torch.float64)
+        top = self.log_prob(self.mode)
+        found = []
+        for number in range(self.mode.shape[1]):
+            axis = torch.zeros(self.mode.shape[1], dtype=torch.float64)
+            axis[number] = 1
+            there = self.mode + steps[:, None, None] * axis
+            fallen = (top - self.log_prob(there) > 0.5).int()
+            first = torch.where(
+                fallen.amax(0) > 0, fallen.argmax(0), 40
+            )  # a width of 1 where it does not fall
+            found.append(steps[first])
+        return torch.stack(found, -1)
+
+    def _whiten(self) -> None:
+        """Slope of the second number's conditional mode in the first, from mixed differences of the width's size."""
+        first, second = self.scale[:, 0], self.scale[:, 1]
+        corner = {}
+        for one, two in product((-1, 0, 1), repeat=2):
+            offset = torch.stack([one * first, two * second], -1)
+            corner[one, two] = self.log_prob(self.mode + offset)
+        mixed = (corner[1, 1] - corner[1, -1] - corner[-1, 1] + corner[-1, -1]) / 4
+        bend = corner[0, 1] + corner[0, -1] - 2 * corner[0, 0]
+        slope = -mixed / bend * second / first
+        self.slope = torch.where(slope.isfinite(), slope, 0.0)
+        # along the first axis the second number follows: the width is that of the marginal
+        steps = 2.0 ** torch.arange(0, 40, dtype=torch.float64)
+        offset = torch.stack([first, self.slope * first], -1)
+        fallen = (corner[0, 0] - self.log_prob(self.mode + steps[:, None, None] * offset) > 0.5).int()
+        wider = torch.where(fallen.amax(0) > 0, steps[fallen.argmax(0)], 1.0)
+        self.scale = torch.stack([first * wider, second], -1)
+
+    def to(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Values and the volume of the map there, from coordinates (node, rows, number)."""
+        offset = self.scale * place.sinh()
+        volume = (self.scale * place.cosh()).prod(-1)
+        if place.shape[-1] == 2:
+            offset = torch.stack([offset[..., 0], offset[..., 1] + self.slope * offset[..., 0]], -1)
+        return self.mode + offset, volume
+
+    def back(self, value: Tensor) -> Tensor:
+        """Coordinates of values."""
+        offset = (wrap(value.double()) if self.chart else value.double()) - self.mode
+        if self.angles and not self.chart:
+            offset = wrap(offset)
+        if offset.shape[-1] == 2:
+            offset = torch.stack([offset[..., 0], offset[..., 1] - self.slope * offset[..., 0]], -1)
+        return (offset / self.scale).asinh().clamp(*self.ends)
+
+
+def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
+    """Nodes (points^numbers, numbers) of the unit box and their weights."""
+    node, weight = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
+    nodes = torch.cartesian_prod(*[(node + 1) / 2] * numbers).reshape(-1, numbers)
+    weights = torch.cartesian_prod(*[weight / 2] * numbers).reshape(-1, numbers).prod(-1)
+    return nodes, weights
+
+
+@lru_cache(maxsize=4)
+def boxes(density: Distribution) -> Boxes:
+    """The density of one or two numbers, batch_shape (rows,), in boxes on which two rules agree.
+
+    Peaks are found by candidates: the mode, `peaks`, draws, and for angles a sweep of the circle. A box is also split
+    while a candidate in it is far above the box's mean density.
+    """
+    candidates = [density.mode.unsqueeze(0), peaks(density)[:64], density.sample(torch.Size((24,)))]
+    seen = torch.cat([part.double() for part in candidates])
+    way = _Map(density, seen)
+    numbers = way.mode.shape[1]
+    height = way.log_prob(seen)
+    place = way.back(seen)
+    side = 8 if numbers == 1 else 4
+    cut = torch.linspace(0, 1, side + 1, dtype=torch.float64)
+    length = way.ends[1] - way.ends[0]
+    low = way.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
+    high = way.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
+    parts = _summed(way, low, high, place, height)
+    # float32 does not agree with itself to more digits
+    tolerance = TOLERANCE[numbers] if density.log_prob(density.mode).dtype == torch.float64 else 1e-4
+    for _ in range(ROUNDS[numbers]):
+        split = int((parts[3] > tolerance).sum(0).max())
+        if split == 0:
+            break
+        split = min(split, MOST[numbers])
+        order = parts[3].argsort(0, descending=True)
+        low, high = (_taken(part, order[:split]) for part in parts[:2])
+        middle = (low + high) / 2
+        lows, highs = [], []
+        for corner in product((False, True), repeat=numbers):
+            upper = torch.tensor(corner)
+            lows.append(torch.where(upper, middle, low))
+            highs.append(torch.where(upper, high, middle))
+        fresh = _summed(way, torch.cat(lows), torch.cat(highs), place, height)
+        parts = tuple(
+            torch.cat([_taken(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
+        )
+    return _gathered(way, *parts[:3])
+
+
+def _taken(part: Tensor, index: Tensor) -> Tensor:
+    """`part` (box, rows, ...) at index (some, rows)."""
+    if part.dim() == 3:
+        index = index.unsqueeze(-1).expand(*index.shape, part.shape[-1])
+    return part.gather(0, index)
+
+
+def _nodes(way: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Values (box · node, rows, number), log-densities and weights (box, node, rows)."""
+    nodes, weights = _rule(points, low.shape[-1])
+    place = low.unsqueeze(1) + (high - low).unsqueeze(1) * nodes[:, None]
+    value, volume = way.to(place.flatten(0, 1))
+    shape = (low.shape[0], len(nodes), low.shape[1])
+    weight = volume.reshape(shape) * weights[:, None] * (high - low).prod(-1).unsqueeze(1)
+    return value, way.log_prob(value).reshape(shape), weight
+
+
+def _summed(
+    way: _Map, low: Tensor, high: Tensor, place: Tensor, height: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Borders, masses (box, rows) and how urgent it is to split each."""
+    sums = []
+    for points in RULES[low.shape[-1]]:
+        _, log_prob, weight = _nodes(way, low, high, points)
+        sums.append((weight * log_prob.exp()).sum(1))
+    gap = (sums[0] - sums[1]).abs()
+    # a candidate far above what the box has for its mean: a peak between the nodes
+    inside = ((place.unsqueeze(1) >= low) & (place.unsqueeze(1) <= high)).all(-1)  # (candidate, box, rows)
+    _, volume = way.to(place)
+    peak = torch.where(inside, (height.exp() * volume).unsqueeze(1), 0.0).amax(0) * (high - low).prod(-1)
+    hidden = torch.where(peak > 16 * sums[0].abs(), peak.clamp(max=1.0), 0.0)
+    wide = (high - low).amax(-1) > 1e-13  # narrower ones hold a peak that float64 does not resolve
+    urgency = torch.maximum(gap, hidden)
+    return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0)
+
+
+def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
+    value, log_prob, weight = _nodes(way, low, high, RULES[low.shape[-1]][0])
+    border = mass[:0]
+    if low.shape[-1] == 1:
+        order = low[..., 0].argsort(0)
+        mass = mass.gather(0, order)
+        ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
+        border = way.to(ends.unsqueeze(-1))[0][..., 0]
+    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, way)

@@ -1,0 +1,171 @@
+"""A shipped density head of which single answers are replaced, so that it is wrong in one thing only."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.density_head import DensityHead
+from framework.distributions.protocol import arc, cdf, estimate, exactly, marginal, median
+from framework.target import Target
+from framework.testing.densities import CHECKS, examine_densities
+from framework.testing.finding import Finding
+from framework.testing.heads import HeadSubject, examine_head
+from framework.testing.rows import HeadRow
+from plugins.density_head.categorical.head import CategoricalHead
+from plugins.density_head.gaussian.head import GaussianHead
+from plugins.density_head.von_mises.head import VonMisesHead
+from plugins.density_head.von_mises.rows import predicted
+
+OF_DENSITIES = {check.name for check in CHECKS}
+Parts = Mapping[str, Callable[..., Any]]
+ONE, TWO, THREE = (Target("angle", ("azimuth", "elevation", "tilt")[:count]) for count in (1, 2, 3))
+HEIGHT, PLACE = Target("real", ("height",)), Target("real", ("x", "y"))
+CLASSES = Target("class", ("a", "b", "c"))
+NO_CASES = {"floor": 1e-9}
+"""Parameters for which no reference is given."""
+
+
+class Changed(Distribution):
+    """A density of which some answers are replaced: name → function of the sound density and the arguments."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, density: Distribution, parts: Parts) -> None:
+        self.density = density
+        self.parts = parts
+        self.has_enumerate_support = density.has_enumerate_support
+        super().__init__(density.batch_shape, density.event_shape, validate_args=False)
+
+    def ask(self, name: str, *arguments: Any) -> Any:
+        """The replaced answer, or the sound one."""
+        if name in self.parts:
+            return self.parts[name](self.density, *arguments)
+        found = getattr(self.density, name)
+        return found(*arguments) if callable(found) else found
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.ask("log_prob", value)
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        return self.ask("sample", torch.Size(sample_shape))
+
+    def entropy(self) -> Tensor:
+        return self.ask("entropy")
+
+    def enumerate_support(self, expand: bool = True) -> Tensor:
+        return self.ask("enumerate_support", expand)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.ask("mode")
+
+    @property
+    def mean(self) -> Tensor:
+        return self.ask("mean")
+
+    @property
+    def variance(self) -> Tensor:
+        return self.ask("variance")
+
+    @property
+    def support(self) -> Any:
+        return self.ask("support")
+
+
+estimate.register(Changed, exactly)
+
+
+@marginal.register
+def _(density: Changed, index: int) -> Distribution:
+    if "marginal" in density.parts:
+        return density.parts["marginal"](density.density, index)
+    return density if density.event_shape == (1,) else marginal(density.density, index)
+
+
+@median.register
+def _(density: Changed, samples: int) -> Tensor:
+    return density.parts.get("median", median)(density.density, samples)
+
+
+@cdf.register
+def _(density: Changed, value: Tensor) -> Tensor | None:
+    return density.parts.get("cdf", cdf)(density.density, value)
+
+
+@arc.register
+def _(density: Changed, start: Tensor, end: Tensor) -> Tensor | None:
+    return density.parts.get("arc", arc)(density.density, start, end)
+
+
+class Faulty(DensityHead):
+    """A sound head with changed answers; `forward`, `loss` and `calibrate` may be replaced too, given this head."""
+
+    bibtex = ""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+
+    def __init__(self, sound: DensityHead, parts: Parts) -> None:
+        super().__init__()
+        self.sound = sound
+        self.parts = parts
+        self.size = sound.size
+        self.calls = 0
+        self.offset = float(torch.rand(()))
+        self.weight = torch.nn.Parameter(torch.ones(())) if "calibrate" in parts else None
+        self.samples = 1
+        if "knobs" in parts:
+            self.knobs = parts["knobs"]()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def forward(self, raw: Tensor) -> Distribution:
+        found = self.parts["forward"](self, raw) if "forward" in self.parts else self.sound(raw)
+        return Changed(found, self.parts)
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        if "loss" in self.parts:
+            return self.parts["loss"](self.sound, raw, target)
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        self.parts["calibrate"](self, raw) if "calibrate" in self.parts else self.sound.calibrate(raw, target)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One wrong head.
+
+    Attributes:
+        name: what is wrong.
+        target: what it predicts.
+        parts: the answers that are replaced.
+        only: the one property that is to find it; "" where several may.
+        config: of the sound head.
+    """
+
+    name: str
+    target: Target
+    parts: Parts
+    only: str = ""
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    def findings(self) -> Iterator[Finding]:
+        """Every finding; those of densities first where they are to find it, since nobody need ask further."""
+        kinds = {"angle": VonMisesHead, "real": GaussianHead, "class": CategoricalHead}
+
+        def build() -> DensityHead:
+            return Faulty(kinds[self.target.kind](self.target, **self.config), self.parts)
+
+        cases = predicted if self.target.kind == "angle" and not self.config else None
+        subject = HeadSubject(HeadRow(self.name, self.target, cases=cases), build)
+        groups = [examine_head(subject), examine_densities(subject)]
+        for group in groups[::-1] if self.only in OF_DENSITIES else groups:
+            yield from group
+
+
+class Halved(Changed):
+    """log_prob in half precision."""
+
+    def __init__(self, density: Distribution) -> None:
+        Changed.__init__(self, density, {"log_prob": lambda d, v: d.log_prob(v).half()})
