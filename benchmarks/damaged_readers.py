@@ -71,7 +71,7 @@ def weight(file: Path) -> object:
 def stored(file: Path) -> object:
     """Everything that is done with a stored config before data is read."""
     (file.parent / "overrides.yaml").write_text("- seed=1\n", encoding="utf-8")
-    values, changed = modes._stored(file.parent, [f"resume={file.parent}"])
+    values, changed = modes._stored(file.parent, {}, [f"resume={file.parent}"])
     return Config.of(values, file.parent, changed).parts
 
 

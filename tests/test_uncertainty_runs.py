@@ -192,7 +192,7 @@ def test_outliers_have_the_inputs_of_the_data(tmp_path: Path) -> None:
 def test_a_mistake_on_the_command_line_is_said_before_training(framework: Framework) -> None:
     done = framework(*SMALL, "trainer.keep=first")
     assert done.code == 2, done.out
-    assert "wanted `best`" in done.out
+    assert "trainer.keep = 'first': Input should be 'best' or 'last'" in done.out
     done = framework("experiment=moons/vanilla_128", "data@outliers=null")
     assert done.code == 2, done.out
     assert "Take it out with `~`" in done.out
