@@ -16,7 +16,7 @@ from framework.prediction import Prediction, Split
 
 BLOCK = 64
 """Samples that are evaluated at once. Draws are a function of (seed, sample) only where it is one number for all: a
-density may draw for a whole batch at once. Without gradients 64 samples fit wherever a training batch of 8 does."""
+density may draw for a whole batch at once. No gradient is kept: it takes less memory than training on as many."""
 
 
 @dataclass(frozen=True)

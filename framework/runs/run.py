@@ -82,12 +82,6 @@ def stored_config(folder: Path) -> dict[str, Any] | None:
     return read_yaml(path, "the config of a run") if path.is_file() else None
 
 
-def stored_overrides(folder: Path) -> list[str]:
-    """The overrides a run folder was made with."""
-    path = folder / "overrides.yaml"
-    return read_yaml(path, "the overrides of a run") if path.is_file() else []
-
-
 @contextmanager
 def opened(config: Config) -> Iterator[Run]:
     """Open the run; on the way out close it with the right status.

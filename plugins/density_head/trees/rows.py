@@ -13,7 +13,7 @@ ROWS = {
     "extra_trees": (
         HeadRow("five classes", FIVE, {"trees": 7}),
         HeadRow("one real", ONE_REAL, {"trees": 7, "leaf": 5}),
-        HeadRow("two reals", TWO_REALS, {"trees": 5, "leaf": 5}, limits={"mode": 0.5}),  # a component's
+        HeadRow("two reals", TWO_REALS, {"trees": 5, "leaf": 5}),
     ),
     "xgboost": (
         HeadRow("five classes", FIVE, {"rounds": 5}),
