@@ -40,7 +40,8 @@ class Errors(Mean):
         """The number to report and its standard error, from the mean's."""
 
     def update(self, prediction: Prediction) -> None:
-        each = self.power(prediction.point.double() - prediction.target.double())  # in double precision before it rounds
+        # in double precision before the difference rounds
+        each = self.power(prediction.point.double() - prediction.target.double())
         self.take_in(torch.cat([each.mean(-1, keepdim=True), each[:, : len(self.names) - 1]], -1))
 
     def compute(self) -> dict[str, Tensor]:
