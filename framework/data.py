@@ -23,6 +23,18 @@ first angle are equally right; 1 where none is, as where the field is missing; 0
 there is no direction."""
 
 
+class Frame(NamedTuple):
+    """Where the targets of some samples lie: the user's own numbers are location + scale · target.
+
+    Attributes:
+        location: (batch, number).
+        scale: (batch, number), above 0.
+    """
+
+    location: Tensor
+    scale: Tensor
+
+
 class Splits(NamedTuple):
     """The splits of a data set; disjoint.
 
@@ -113,6 +125,15 @@ class Data(ABC):
                 raise DataError("These files give inputs of different sizes. Give them one by one.")
             return torch.stack(items)
         return as_inputs(given, self.input_shape)
+
+    def asked(self, given: Any) -> Batch:
+        """What a user gives a trained model, with whatever `frame` reads beside "input". Raises as `inputs`."""
+        return {"input": self.inputs(given)}
+
+    def frame(self, batch: Batch) -> Frame | None:
+        """Of samples whose target of reals lies in a frame of the input's own (a normalised cloud's), so that answers
+        can be given in the user's; None, the default, where targets are in the user's own unit."""
+        return None
 
     def state_dict(self) -> Mapping[str, Any]:
         """What `inputs` and `read` need beside the config, as plain values and tensors: it travels with the model."""

@@ -21,7 +21,9 @@ from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import circular_moments
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import Mixture
+from framework.distributions.moved import Moved
 from framework.distributions.protocol import (
+    about,
     arc,
     cdf,
     estimate,
@@ -31,6 +33,7 @@ from framework.distributions.protocol import (
     normals,
     peaks,
     pick,
+    scales,
     tempered,
     value_set,
 )
@@ -80,7 +83,9 @@ class Made:
             ),
             "with a set": with_set(self.target)(first, torch.tensor(1.0, dtype=torch.float64), "density"),
         }
-        if self.target.kind != "real":
+        if self.target.kind == "real":
+            found["moved there and back"] = there_and_back(first)
+        else:
             found["floored"] = floored(first, self.target)
         if self.one_turn and not self.slow:
             found["power"] = CircularPower(first, WARM)
@@ -100,6 +105,14 @@ class Made:
     @property
     def one_turn(self) -> bool:
         return self.target.kind == "angle" and len(self.target.names) == 1
+
+
+def there_and_back(density: Distribution) -> Distribution:
+    """The density itself, but for rounding, by way of another frame."""
+    like = density.sample()
+    location = torch.linspace(-3, 5, like.numel(), dtype=like.dtype).reshape(like.shape)
+    scale = 0.1 + location.square()
+    return Moved(Moved(density, location, scale), -location / scale, 1 / scale)
 
 
 def restricted(name: str, row: HeadRow) -> bool:
@@ -137,7 +150,7 @@ def item_of(name: str, made: Made, answer) -> Tensor | None:
     if any(part is None for part in log_parts):
         return None
     match name:
-        case "itself" | "with a set" | "mixture of one":
+        case "itself" | "with a set" | "mixture of one" | "moved there and back":
             return log_parts[0]
         case "stacked":
             return torch.stack(log_parts, -1)
@@ -298,7 +311,7 @@ def errors(kind: str, made: Made, found) -> None:
     error = torch.stack([part.standard_error for part in parts], -1)
     count = torch.stack([part.samples for part in parts], -1)
     term = torch.stack([part.log_mean for part in parts], -1).exp()
-    if kind in ("itself", "with a set", "mixture of one"):
+    if kind in ("itself", "with a set", "mixture of one", "moved there and back"):
         wanted, samples = error[:, 0], count[:, 0]
     elif kind == "stacked":
         wanted, samples = error, count
@@ -326,6 +339,8 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
     flat = not getattr(density.support, "ranges", None)
     if kind in ("with a set", "mixture of one", "itself") or (kind == "floored" and flat):
         assert torch.equal(found, median(made.parts[0], 20))
+    elif kind == "moved there and back":
+        close(found, median(made.parts[0], 20))
     elif kind == "stacked":
         assert torch.equal(found, torch.stack([median(part, 20) for part in made.parts], 1))
     elif kind == "reshaped":
@@ -358,6 +373,8 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
             assert all(torch.equal(humps[: len(w), :, k], w) for k, w in enumerate(wanted))
         elif kind in ("floored", "with a set", "mixture of one"):
             assert torch.equal(humps, wanted[0])
+        elif kind == "moved there and back":
+            close(humps, wanted[0])
     assert (value_set(density) is density) if kind == "with a set" else value_set(density) is None
 
 
@@ -391,6 +408,7 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         wanted = item_of(kind, made, mahalanobis)
         assert (squared is None) == (wanted is None), kind
         agree(squared, wanted)
+        moments(kind, made, density)
         return
     assert cdf(one, at) is None and normals(one) is None and mahalanobis(one, at) is None
     mass = mass_of(kind, made, lambda part, y: arc(marginal(part, 0), y[..., :1], y[..., :1] + 2.0))
@@ -404,9 +422,49 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         close(found[seen.resolved], by_series[seen.resolved], 1e-6)
 
 
+def moments(kind: str, made: Made, density: Distribution) -> None:
+    """mean and variance where the parts have them: by plain sums of the parts' first two moments."""
+    try:
+        means = torch.stack([part.mean for part in made.parts], 1)
+        squares = torch.stack([part.variance for part in made.parts], 1) + means.square()
+    except NotImplementedError:
+        with pytest.raises(NotImplementedError):
+            density.mean  # noqa: B018
+        return
+
+    def mixed(weights: Tensor, number: Tensor) -> Tensor:
+        return (share(weights).unsqueeze(-1) * number).sum(1)
+
+    def of(number: Tensor) -> Tensor:
+        match kind:
+            case "stacked":
+                return number
+            case "reshaped":
+                return number[:, 0].reshape(2, 2, -1)
+            case "mixture":
+                return mixed(made.weights, number)
+            case "mixture of mixtures":
+                inner = torch.stack([mixed(made.weights, number), number[:, 1]], 1)
+                return mixed(made.weights[:, :2], inner)
+            case "mixture of a fold":
+                return mixed(made.weights[:2, :2], number[:, 0].reshape(2, 2, -1))
+        return number[:, 0]
+
+    if kind != "tempered":  # a density of its own
+        close(density.mean, of(means))
+        close(density.variance, of(squares) - of(means).square())
+
+
 def mass_of(kind: str, made: Made, mass) -> Tensor | None:
     simple = item_of(kind, made, mass)
-    if simple is not None or kind in ("itself", "stacked", "reshaped", "with a set", "mixture of one"):
+    if simple is not None or kind in (
+        "itself",
+        "stacked",
+        "reshaped",
+        "with a set",
+        "mixture of one",
+        "moved there and back",
+    ):
         return simple
     if kind == "floored":
         return mass(made.parts[0], made.value)
@@ -493,6 +551,49 @@ def test_what_draws_nothing_says_so() -> None:
     assert torch.equal(found.debiased, found.log_mean)
     assert found.standard_error.tolist() == found.samples.tolist() == [0] * 4
     assert not found.unresolved.any()
+
+
+def test_a_moved_normal_density_is_the_normal_density_there() -> None:
+    """Every question, of one number and of several, against the density with the moved parameters."""
+    torch.manual_seed(0)
+    for numbers in (1, 3):
+        mean, scale, location, unit = torch.randn(4, 5, numbers).double()
+        scale, unit = 0.2 + scale.abs(), 0.01 + unit.abs()
+        head = build(
+            "density_head", resolve("density_head", "gaussian"), target=Target("real", tuple("xyz"[:numbers]))
+        )
+        gaussian = type(head(torch.zeros(1, head.size)))
+        found = Moved(gaussian(mean, scale), location, unit)
+        wanted = gaussian(location + unit * mean, unit * scale)
+        value = wanted.sample()
+        questions = [
+            lambda one, value=value: one.log_prob(value),
+            lambda one: one.entropy(),
+            lambda one: one.mode,
+            lambda one: one.mean,
+            lambda one: one.variance,
+            lambda one: median(one, 10),
+            lambda one, value=value: marginal(one, value.shape[-1] - 1).log_prob(value[..., -1:]),
+            lambda one, value=value: cdf(marginal(one, 0), value[..., :1]),
+            lambda one, value=value: mahalanobis(one, value),
+            lambda one, value=value: temper(one, WARM).log_prob(value),
+            lambda one: peaks(one),
+            lambda one: scales(marginal(one, 0)),
+            lambda one, value=value: torch.stack(list(normals(marginal(one, 0)))[1:]),
+            lambda one, value=value: about(
+                marginal(one, 0), (torch.tensor([0, 3]),), value[[0, 3], :1]
+            ).log_prob(torch.full((2, 1), 1e-3).double()),
+        ]
+        for question in questions:
+            close(question(found), question(wanted))
+        chosen = torch.tensor([[0, 1, 2], [4, 0, 3]])
+        for one, seed in ((found, 7), (wanted, 7)):
+            torch.manual_seed(seed)
+            drawn = pick(one, chosen).sample()
+            torch.manual_seed(seed)
+            close(drawn, pick(wanted, chosen).sample())
+    with pytest.raises(ValueError, match="wanted three times the same shape"):
+        Moved(wanted, location[:1], unit)
 
 
 CHARTS = [(name, row) for name, row in ROWS if row.target.kind == "angle" and restricted(name, row)]

@@ -1,6 +1,7 @@
 """A trained model after its run: it takes what its user has, of each kind of data, when the training data are gone."""
 
 import shutil
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import torch
 import framework as package
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
+from framework.deployment.frozen import Frozen
 from framework.errors import DataError
-from framework.model import fitted_models
+from framework.geometry.meshes import read
+from framework.model import Predictor, fitted_models
 from framework.target import Target
 from framework.testing.rows import DataRow
 from tests.conftest import Framework
@@ -31,8 +34,16 @@ KINDS = {
         "encoder=[bps,mlp]",
         "metric=[accuracy]",
     ),
+    "registration": (
+        "a doll",
+        "density_head=gaussian",
+        "density_head.scale=fixed",
+        "encoder=[bps,mlp]",
+        "encoder.bps.normalise=none",
+        "metric=[vertex_error]",
+    ),
 }
-HOMES = {"point_cloud_folder": "labelled_clouds"}
+HOMES = {"point_cloud_folder": "labelled_clouds", "registration": "bodies"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -75,10 +86,28 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
         torch.testing.assert_close(twin.mode, one.mode, rtol=1e-5, atol=1e-5)
         assert bool(torch.isfinite(twin.log_prob(here)).all())
         assert bool(torch.isfinite(one.log_prob(here)).all())
+    if kind == "registration":
+        follows_the_scan(model, frozen, files[0], lines)
     for wrong in (object(), tmp_path / "gone.csv", np.zeros((2, 77, 5, 3))):
         for form in (model, frozen):
             with pytest.raises(DataError):
                 form(wrong)
+
+
+def follows_the_scan(model: Predictor, frozen: Frozen, file: Path, lines: list[str]) -> None:
+    """Answers are in metres where the scan lies: one twice as large, and elsewhere, has its mesh there."""
+    scan = torch.from_numpy(read(file).vertices)
+    away = torch.tensor([3.0, -2.0, 5.0])
+    here, there = model(scan[None]), model(2 * scan + away)
+    everywhere = away.repeat(here.event_shape[0] // 3)
+    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-4)
+    close(there.mean, 2 * here.mean + everywhere)
+    close(there.variance, 4 * here.variance)
+    close(there.entropy(), here.entropy() + here.event_shape[0] * np.log(2))
+    close(torch.from_numpy(frozen(2 * scan + away)), there.mode)
+    named = next(line for line in lines[1:] if file.name in line).split(",")
+    close(torch.tensor([float(number) for number in named[1:-1]])[None], here.mode)
+    close(float(named[-1]), float(here.entropy()))
 
 
 @pytest.mark.parametrize("unit", [(0.0, 1.0), (1e6, 1e-3), (-3e-9, 1e-12), (0.0, 1e30)])

@@ -32,6 +32,12 @@ class Fields(Dataset[dict[str, Tensor]]):
         return {name: tensor[list(indices)] for name, tensor in self.fields.items()}
 
 
+def fetched(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:
+    """Some samples as a batch, at once where the dataset can do that, as a loader fetches them."""
+    at_once = getattr(dataset, "__getitems__", None)
+    return as_batch(at_once(indices) if at_once else [dataset[index] for index in indices])
+
+
 def as_batch(items: Mapping[str, Tensor] | list[Batch]) -> Batch:
     """Collation: what a dataset's `__getitems__` batched stays as it is, single items are stacked."""
     return dict(items) if isinstance(items, Mapping) else default_collate(items)

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
-from framework.data import Data
+from framework.data import Data, Frame
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.moved import Moved
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor
@@ -89,7 +90,7 @@ class Frozen:
             DataError: it is no input of this model.
             ValueError: what is computed is not finite; names the first such batch row.
         """
-        features, network = self._features(inputs)
+        features, network, frame = self._features(inputs)
         if network is not None and network.classes:
             probability = network(features)
             softmax(probability)
@@ -101,17 +102,23 @@ class Frozen:
             density = self._density(features, network)
             if density.has_enumerate_support and not density.event_shape:
                 return class_probabilities(density).to(self.dtype).numpy()
-            return median(density, 1000).numpy()
+            found = median(density, 1000)
+            return (found if frame is None else frame.location + frame.scale * found).numpy()
 
     @torch.no_grad()  # not in inference mode: whoever asks the density later is outside of it
     def density(self, inputs: Any) -> Distribution:
         """The density over the target, with batch_shape (batch,); inputs as above."""
-        return self._density(*self._features(inputs))
+        features, network, frame = self._features(inputs)
+        density = self._density(features, network)
+        return density if frame is None else Moved(density, *frame)
 
-    def _features(self, inputs: Any) -> tuple[Any, Network | None]:
-        """What the inner predictor reads, in the form that the network reads, if there is one for it."""
+    def _features(self, inputs: Any) -> tuple[Any, Network | None, Frame | None]:
+        """What the inner predictor reads, in the form that the network reads, if there is one for it; and the frame of
+        the answers."""
+        frame = None
         if self.data is not None:
-            inputs = self.data.inputs(inputs)
+            batch = self.data.asked(inputs)
+            inputs, frame = batch["input"], self.data.frame(batch)
         if self.preceded is not None:
             with torch.no_grad():
                 inputs = self.preceded.features(_tensor(inputs))
@@ -120,14 +127,14 @@ class Frozen:
             self._read(self.shape)
         network = self.network
         if network is None or not _floating(inputs):
-            return _tensor(inputs), None
+            return _tensor(inputs), None, frame
         found = inputs.detach().numpy() if isinstance(inputs, Tensor) else inputs
         if found.shape[1:] != self.shape:
             raise ValueError(
                 f"inputs of shape {tuple(found.shape)}; wanted (batch, {', '.join(map(str, self.shape))})."
             )
         flat = found.reshape(len(found), math.prod(self.shape))
-        return np.ascontiguousarray(flat, dtype=network.dtype), network
+        return np.ascontiguousarray(flat, dtype=network.dtype), network, frame
 
     def _density(self, features: Any, network: Network | None) -> Distribution:
         if network is None:

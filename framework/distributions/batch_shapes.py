@@ -75,6 +75,14 @@ class Stacked(Distribution):
     def mode(self) -> Tensor:
         return torch.stack([density.mode for density in self.densities], self._axis)
 
+    @property
+    def mean(self) -> Tensor:
+        return torch.stack([density.mean for density in self.densities], self._axis)
+
+    @property
+    def variance(self) -> Tensor:
+        return torch.stack([density.variance for density in self.densities], self._axis)
+
     def entropy(self) -> Tensor:
         return torch.stack([density.entropy() for density in self.densities], -1)
 
@@ -127,6 +135,14 @@ class Reshaped(Distribution):
     @property
     def mode(self) -> Tensor:
         return self.density.mode.reshape(*self.batch_shape, *self.event_shape)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.density.mean.reshape(*self.batch_shape, *self.event_shape)
+
+    @property
+    def variance(self) -> Tensor:
+        return self.density.variance.reshape(*self.batch_shape, *self.event_shape)
 
     def entropy(self) -> Tensor:
         return self.density.entropy().reshape(self.batch_shape)

@@ -122,6 +122,33 @@ class Mixture(Distribution):
         index = best.reshape(1, *best.shape, *(1,) * len(self.event_shape))
         return modes.gather(0, index.expand(1, *best.shape, *self.event_shape)).squeeze(0)
 
+    @property
+    def mean(self) -> Tensor:
+        """Of reals, (*batch, number); angles and classes have none."""
+        first, offset, shares = self._moments()
+        return first + (shares * offset).sum(-2)
+
+    @property
+    def variance(self) -> Tensor:
+        """Of each real, by the law of total variance."""
+        _, offset, shares = self._moments()
+        apart = offset - (shares * offset).sum(-2, keepdim=True)
+        return (shares * (self.components.variance + apart.square())).sum(-2)
+
+    def _moments(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean of the first component, how far the components' means are from it, and their weights.
+
+        Raises:
+            NotImplementedError: there is no mean; so say torch's own densities.
+        """
+        if self.has_enumerate_support or isinstance(self.support, Circular):
+            raise NotImplementedError(
+                "Angles and classes have no mean; ask mode, median or circular_moments."
+            )
+        means = self.components.mean
+        # about one of them: weights of float32 sum to 1 but for 1e-7, of means far from 0 that is much
+        return means[..., 0, :], means - means[..., :1, :], self.log_weights.exp().unsqueeze(-1)
+
     def entropy(self) -> Tensor:
         """Nats. Exact for classes, by quadrature for one number.
 

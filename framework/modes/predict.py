@@ -14,6 +14,7 @@ from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
 from framework.distributions.circular import wrap
+from framework.distributions.moved import Moved
 from framework.distributions.noise import Draw
 from framework.errors import DataError
 from framework.evaluation.splits import BLOCK, predicted
@@ -73,7 +74,11 @@ def predictions(
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
     for number, batch in enumerate(loader):
-        prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
+        draw, frame = Draw(settings.seed, number), data.frame(batch)
+        prediction = predicted(predictor, batch, settings.samples, draw)
+        if frame is not None:
+            moved = Moved(prediction.density, *frame)
+            prediction = Prediction(moved, batch, settings.samples, draw=draw)
         columns = _columns(target, prediction) | {"entropy_nats": prediction.entropy}
         for row in range(len(batch["index"])):
             values = {key: _text(column[row]) for key, column in columns.items()}

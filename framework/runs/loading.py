@@ -6,12 +6,14 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
 from framework.configuration.schema import resolve
-from framework.data import Data
+from framework.data import Data, Frame
 from framework.density_head import Fitted
+from framework.distributions.moved import Moved
 from framework.errors import CheckpointError
 from framework.model import Predictor, describe_mismatch
 from framework.runs.description import Description
@@ -41,13 +43,23 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     predictor.description = description
     data = reader(description)
 
+    frames: dict[int, Frame | None] = {}  # of the inputs that are being predicted for, by their identity
+
     def ready(model: nn.Module, given: tuple[Any]) -> Tensor:
-        inputs = data.inputs(*given)
+        batch = data.asked(*given)
+        inputs = batch["input"]
         own = next(model.parameters(), inputs)
         # bytes are pixels, which encoders scale; any other number is one of the model's own type
-        return inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
+        inputs = inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
+        frames[id(inputs)] = data.frame(batch)
+        return inputs
+
+    def answered(model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
+        frame = frames.pop(id(inputs[0]))
+        return density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
 
     predictor.register_forward_pre_hook(ready)
+    predictor.register_forward_hook(answered)
     return predictor
 
 

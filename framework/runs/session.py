@@ -26,7 +26,7 @@ from framework.configuration.config import Config
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
-from framework.datasets.fields import as_batch
+from framework.datasets.fields import fetched
 from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.splits import BLOCK, on_device
@@ -190,7 +190,7 @@ def rehearse(session: Session) -> None:
     if fitted_models(session.predictor):
         return  # predicts nothing before it is fitted
     validation = session.data.splits().validation
-    some = as_batch([validation[index] for index in range(min(2, len(validation)))])  # type: ignore[arg-type]
+    some = fetched(validation, range(min(2, len(validation))))  # type: ignore[arg-type]
     seed_step(session.settings.seed, 0, "rehearsal")
     training = session.predictor.training
     density = session.predictor.eval()(some["input"])

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from framework.data import Batch, Data
-from framework.datasets.fields import as_batch
+from framework.datasets.fields import fetched
 from framework.target import Target
 from framework.testing.data_files import (
     damaged_files,
@@ -244,12 +243,6 @@ def _fetching(bench: Workbench, worst: Worst) -> None:
                     whole = key == "input" and single[key].dim() == 2
                     found = trimmed(batch[key][row]) if whole else batch[key][row]
                     worst.same_bits(f"{where}: {key}", found, trimmed(single[key]) if whole else single[key])
-
-
-def fetched(split: Dataset[Batch], asked: list[int]) -> Batch:
-    """A batch as a DataLoader makes it."""
-    at_once = getattr(split, "__getitems__", None)
-    return as_batch(at_once(asked) if at_once else [split[number] for number in asked])
 
 
 def _fingerprint(bench: Workbench, worst: Worst) -> None:

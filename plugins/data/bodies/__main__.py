@@ -49,7 +49,7 @@ def register(checkpoint: str, scans: list[Path], folder: Path) -> list[Path]:
     faces = chosen_body(data.body)[0].faces
     written = []
     for scan in scans:
-        batch = data.read([scan]).__getitems__([0])  # pyright: ignore[reportAttributeAccessIssue]
+        batch = data.asked(scan)
         local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
         place = batch["centre"], batch["scale"]
         vertices = denormalised(local, *place)[0].numpy()

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from framework.data import Batch, Data, Splits
+from framework.data import Batch, Data, Frame, Splits, as_inputs
 from framework.datasets import cloud_picture
-from framework.datasets.fields import Fields
+from framework.datasets.fields import Fields, fetched
 from framework.errors import DataError
 from framework.geometry import clouds
 from framework.geometry.mesh_files import XYZ
@@ -47,6 +48,24 @@ class Bodies(Data):
             raise DataError("No file was given; wanted the scan of a body, or several.")
         found = clouds.pad([self.cloud(file) for file in files])
         return Fields(**normalised(found), index=torch.arange(len(files)))
+
+    def asked(self, given: Any) -> Batch:
+        """Of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
+        files = [given] if isinstance(given, str | Path) else given
+        if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
+            return fetched(self.read([Path(file) for file in files]), range(len(files)))
+        clouds = as_inputs(given, self.input_shape)
+        found = normalised(clouds if clouds.is_floating_point() else clouds.double())
+        return {**found, "input": found["input"].float()}
+
+    def inputs(self, given: Any) -> Tensor:
+        return self.asked(given)["input"]
+
+    def frame(self, batch: Batch) -> Frame:
+        """Metres, as the scan lies."""
+        vertices = len(self.target.names) // 3
+        location = batch["centre"].repeat(1, vertices)
+        return Frame(location, batch["scale"][:, None].expand_as(location))
 
     def augment(self, batch: Batch) -> Batch:
         return batch

@@ -1,0 +1,155 @@
+"""A density of reals in another frame: what is known of Y, asked of X = location + scale · Y."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.protocol import (
+    Estimate,
+    Normals,
+    about,
+    cdf,
+    estimate,
+    mahalanobis,
+    marginal,
+    median,
+    normals,
+    peaks,
+    pick,
+    scales,
+    take,
+    tempered,
+)
+
+
+class Moved(Distribution):
+    """The density of location + scale · Y, number by number.
+
+    Args:
+        density: of Y, over n reals.
+        location: (*batch, n).
+        scale: (*batch, n), above 0.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    has_rsample = False
+
+    def __init__(self, density: Distribution, location: Tensor, scale: Tensor) -> None:
+        shape = density.batch_shape + density.event_shape
+        if len(density.event_shape) != 1 or location.shape != shape or scale.shape != shape:
+            raise ValueError(
+                f"location {tuple(location.shape)} and scale {tuple(scale.shape)} do not fit a density over "
+                f"{tuple(shape)}; wanted three times the same shape, (*batch, number)."
+            )
+        self.density = density
+        self.location = location
+        self.scale = scale
+        super().__init__(density.batch_shape, density.event_shape, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint | None:
+        return self.density.support
+
+    @property
+    def log_volume(self) -> Tensor:
+        """By which log-densities fall, (*batch,), nats: log |det| of the map (change of variables)."""
+        return self.scale.log().sum(-1)
+
+    def inner(self, value: Tensor) -> Tensor:
+        """Y, of X."""
+        return (value - self.location) / self.scale
+
+    def outer(self, value: Tensor) -> Tensor:
+        """X, of Y."""
+        return self.location + self.scale * value
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.density.log_prob(self.inner(value)) - self.log_volume
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        return self.outer(self.density.sample(torch.Size(sample_shape)))
+
+    @property
+    def mode(self) -> Tensor:
+        return self.outer(self.density.mode)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.outer(self.density.mean)
+
+    @property
+    def variance(self) -> Tensor:
+        return self.density.variance * self.scale.square()
+
+    def entropy(self) -> Tensor:
+        return self.density.entropy() + self.log_volume
+
+
+@marginal.register
+def _(density: Moved, index: int) -> Moved:
+    here = slice(index, index + 1)
+    inner = marginal(density.density, index)
+    return Moved(inner, density.location[..., here], density.scale[..., here])
+
+
+@median.register
+def _(density: Moved, samples: int) -> Tensor:
+    return density.outer(median(density.density, samples))
+
+
+@pick.register
+def _(density: Moved, index: Tensor) -> Moved:
+    place = (take(number, index) for number in (density.location, density.scale))
+    return Moved(pick(density.density, index), *place)
+
+
+@about.register
+def _(density: Moved, index: tuple[Tensor, ...], place: Tensor) -> Moved:
+    # X - place = scale · (Y - y) with y = (place - location) / scale
+    location, scale = (number.double()[index] for number in (density.location, density.scale))
+    inner = about(density.density, index, (place - location) / scale)
+    scale = scale.expand((*inner.batch_shape, 1))
+    return Moved(inner, torch.zeros_like(scale), scale)
+
+
+@tempered.register
+def _(density: Moved, temperature: Tensor) -> Moved:
+    return Moved(tempered(density.density, temperature), density.location, density.scale)
+
+
+@estimate.register
+def _(density: Moved, value: Tensor) -> Estimate:
+    found = estimate(density.density, density.inner(value))
+    down = density.log_volume
+    return found._replace(log_mean=found.log_mean - down, debiased=found.debiased - down)
+
+
+@cdf.register
+def _(density: Moved, value: Tensor) -> Tensor | None:
+    return cdf(density.density, density.inner(value))
+
+
+@normals.register
+def _(density: Moved) -> Normals | None:
+    found = normals(density.density)
+    if found is None:
+        return None
+    location, scale = density.location.double(), density.scale.double()
+    return Normals(found.log_weights, location + scale * found.mean, scale * found.scale)
+
+
+@mahalanobis.register
+def _(density: Moved, value: Tensor) -> Tensor | None:
+    return mahalanobis(density.density, density.inner(value))
+
+
+@peaks.register
+def _(density: Moved) -> Tensor:
+    return density.outer(peaks(density.density))
+
+
+@scales.register
+def _(density: Moved) -> Tensor:
+    return scales(density.density) * density.scale[..., 0]
