@@ -75,6 +75,10 @@ checkpoint=outputs/run | mode=train reads none, test, predict, work_precision do
 seed=-1 | seed = -1
 seed=one | seed = 'one'
 seed=0,1 | To sweep over it, add --multirun
+-m experiment=moons/vanilla_128 seed=0,one | seed=one; none of the sweep was run
+-m experiment=moons/vanilla_128 optimizer.learning_rate=0.1,0 | greater than 0
+-m experiment=moons/vanilla_128 density_head=categorical,von_mises | von_mises describes targets of kind 'angle'
+-m experiment=moons/vanilla_128 metric=[accuracy],[crps] | crps measures distances
 batch_size=0 | batch_size = 0
 batchsize=32 | Did you mean 'batch_size'?
 bs=32 | Did you mean 'batch_size'?

@@ -11,6 +11,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from framework.errors import ConfigError
 from framework.sweeps import jobs as sweep
 
 _OF_THE_SWEEP = (
@@ -47,17 +48,23 @@ class PoolLauncher(Launcher):
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Called once, or by some sweepers once for each batch of jobs."""
-        from framework.sweeps import comparison  # Hydra imports this module at every start
+        from framework.sweeps import comparison, rehearsal  # Hydra imports this module at every start
 
         setup_globals()
         hydra = self.config.hydra
         configure_log(hydra.hydra_logging, hydra.verbose)
         folder = Path(str(hydra.sweep.dir)).absolute()
-        folder.mkdir(parents=True, exist_ok=True)
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
         jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
+        values = [_plain(config, folder) for config in configs]
+        try:
+            rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))
+        except ConfigError:
+            _leave_nothing(folder)
+            raise
+        folder.mkdir(parents=True, exist_ok=True)
         if not self.launched:
-            self.parent = comparison.begin(folder, _plain(configs[0], folder))
+            self.parent = comparison.begin(folder, values[0])
         self.launched += [job.overrides for job in jobs]
         try:
             sweep.run(
@@ -116,6 +123,13 @@ class PoolLauncher(Launcher):
             *(override for override in given if not override.startswith(_OF_THE_SWEEP)),
             "hydra.mode=RUN",
         ]
+
+
+def _leave_nothing(folder: Path) -> None:
+    """Remove the folder of a sweep that never began, where it holds but the command that Hydra wrote into it."""
+    if [file.name for file in folder.glob("*")] == ["multirun.yaml"]:
+        (folder / "multirun.yaml").unlink()
+        folder.rmdir()
 
 
 def _returned(job: sweep.Job, failure: Exception | None) -> JobReturn:

@@ -1,0 +1,56 @@
+"""Finds the mistakes in a sweep's jobs before any of them runs, in a process of its own that may import torch."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from framework.configuration.config import Config
+from framework.errors import ConfigError, UserError
+
+COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework.sweeps.rehearsal")
+
+
+def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> None:
+    """Check the configs of trainings as far as that needs no data.
+
+    Args:
+        jobs: overrides and composed values of each.
+
+    Raises:
+        ConfigError: what the first job at fault would say of itself.
+    """
+    training = [
+        (list(overrides), values) for overrides, values in jobs if values.get("mode") == {"name": "train"}
+    ]
+    for overrides, values in training:
+        try:
+            Config.of(values, Path(), overrides)  # takes no process
+        except UserError as error:
+            raise ConfigError(_told(overrides, str(error))) from error
+    if not training:
+        return
+    done = subprocess.run(COMMAND, input=json.dumps(training), capture_output=True, text=True, check=False)
+    if done.returncode == 2:
+        raise ConfigError(done.stdout)
+    # anything else that went wrong is for the jobs to say
+
+
+def _told(overrides: Sequence[str], message: str) -> str:
+    return f"{message} That is the job {' '.join(overrides)}; none of the sweep was run."
+
+
+def main() -> None:
+    """Read jobs from standard input; print the first mistake and exit with 2."""
+    for overrides, values in json.load(sys.stdin):
+        try:
+            _ = Config.of(values, Path(), overrides).parts
+        except ConfigError as error:
+            sys.stdout.write(_told(overrides, str(error)))
+            sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
