@@ -68,6 +68,8 @@ class Data(ABC):
     """What is to be predicted."""
     input_shape: tuple[int, ...]
     """Shape of one input, without the batch dimension; of point clouds (points, columns), of the largest of them."""
+    suffixes: tuple[str, ...] = ()
+    """Of the files that `read` reads, in small letters, so that others may lie beside them; () where any may be one."""
     columns: tuple[str, ...] = ()
     """What the numbers of an input's last dimension are called, where they have names: ("x", "y", "z", "red", ...)."""
     plane: bool = False

@@ -378,6 +378,11 @@ def test_predictions_of_a_folder_leave_out_what_is_no_input(framework: Framework
     refused = framework(*predict, folder="predicted")
     assert refused.code == 1
     assert "broken.png" in refused.out
+    (folder / "broken.png").rename(folder / "broken.webp")  # alone in its kind, which is one of pictures
+    refused = framework(*predict, folder="predicted")
+    assert refused.code == 1
+    assert "broken.webp" in refused.out.partition("error: ")[2]
+    (folder / "broken.webp").rename(folder / "broken.png")
     skip = ("data=caviar", "data.image_size=32", "data.skip_unreadable=true")
     done = framework(*predict, *skip, folder="predicted")
     assert done.code == 0, done.out

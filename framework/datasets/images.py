@@ -30,6 +30,8 @@ FORMATS = ("AVIF", "BMP", "GIF", "ICO", "JPEG", "JPEG2000", "PCX", "PNG", "PPM",
 """Of Pillow's formats those that decode pixels and do nothing else: EPS starts another program."""
 MOST_PIXELS, LONGEST_SIDE = 2**26 + 2**24, 2**16
 """Of an image as it is stored; below where Pillow warns."""
+SUFFIXES = (".avif", ".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
+"""The usual ends of their names; a file of another one is an image where it can be read."""
 MOST_PADDED = 2**26
 """Pixels of a square; where one that must be padded has more, it is scaled down before."""
 IN_MEMORY = 2 * 2**30

@@ -29,14 +29,19 @@ def to_read(
 ) -> tuple[list[Path], list[Path]]:
     """The files to read, and those left out because they cannot be read; `console` is told of what is not read.
 
-    Hidden files are ignored, and files with a suffix of which the data set reads none (a README, a table). What then
-    cannot be read stays, and is an error later; where the data's `config` says to skip it, it is left out.
+    Hidden files are ignored, and files whose suffix is not one of the data set's and of which it can read none (a
+    README, a table). What then cannot be read stays, and is an error later; where the data's `config` says to skip it,
+    it is left out.
     """
     kinds: dict[str, list[Path]] = {}
     for file in files:
         if not file.name.startswith("."):
             kinds.setdefault(file.suffix.lower(), []).append(file)
-    read = {kind for kind, some in kinds.items() if any(readable(data, file) for file in some)}
+    read = {
+        kind
+        for kind, some in kinds.items()
+        if kind in data.suffixes or any(readable(data, file) for file in some)
+    }
     kept = [
         file for file in files if not file.name.startswith(".") and (not read or file.suffix.lower() in read)
     ]

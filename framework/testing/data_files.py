@@ -86,6 +86,8 @@ def left_out(bench: Workbench, worst: Worst) -> None:
 def own_files(bench: Workbench, worst: Worst) -> None:
     """Files are read without preparing anything, in their order, as the splits' samples are; no file is refused."""
     files, data = _own(bench)
+    unknown = [file.name for file in files if data.suffixes and file.suffix.lower() not in data.suffixes]
+    worst.count(bool(unknown), f"suffixes do not name that of {', '.join(unknown)}")
     refused(lambda: data.read([]), [], "no file", worst)
     together = _read(data, files, bench, worst)
     apart = [sample for file in files for sample in _read(data, [file], bench, worst)]

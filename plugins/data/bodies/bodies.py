@@ -17,6 +17,7 @@ from framework.datasets.fields import Fields, fetched
 from framework.errors import DataError
 from framework.geometry import clouds
 from framework.geometry.mesh_files import XYZ
+from framework.geometry.meshes import READERS
 from framework.target import Target
 
 
@@ -28,6 +29,7 @@ class Bodies(Data):
     family adds its constructor, what to cite, `prepare`, `fingerprint` and `cloud`.
     """
 
+    suffixes = tuple(READERS)
     varies = False
     columns = XYZ
     _splits: Splits

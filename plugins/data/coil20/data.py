@@ -42,6 +42,8 @@ class COIL20(Data):
   year = {1996}
 }"""
 
+    suffixes = images.SUFFIXES
+
     def __init__(
         self,
         *,

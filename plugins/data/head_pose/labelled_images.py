@@ -93,6 +93,7 @@ class Heads(Data):
     The constructor sets `source`, `reading`, `target`, and `signs` where mirror images are shown in training.
     """
 
+    suffixes = images.SUFFIXES
     source: Source
     reading: Reading
     signs: tuple[float, ...] = ()

@@ -30,6 +30,8 @@ class ImagesWithAngles(Data):
   note = {Cite the source of these images}
 }"""
 
+    suffixes = images.SUFFIXES
+
     def __init__(
         self,
         *,

@@ -16,6 +16,7 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture, images
 from framework.errors import DataError
+from framework.geometry.meshes import READERS
 from framework.target import Target
 from plugins.data.labelled_clouds.folders import Listed
 from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, load, unlabelled
@@ -58,6 +59,7 @@ class Found(NamedTuple):
 class LabelledClouds(Data):
     """Clouds with classes. A data set of the family adds its constructor, what to cite, and `found`."""
 
+    suffixes = tuple(READERS)
     varies = False
     reading: Reading
     """How files become clouds."""

@@ -48,6 +48,7 @@ class PlanePoints(Data):
     input_shape = (2,)
     synthetic = True
     skipped = 0
+    suffixes = (".csv",)
     varies = False
     draws: Draws
 

@@ -95,6 +95,8 @@ class Pascal3D(Data):
 }"""
     target = Target("angle", ("azimuth", "elevation", "tilt"))
 
+    suffixes = images.SUFFIXES
+
     def __init__(
         self,
         *,

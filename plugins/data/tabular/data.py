@@ -41,6 +41,7 @@ class Tabular(Data):
   note = {Cite the source of this table}
 }"""
     synthetic = False
+    suffixes = (".csv",)
     varies = False
 
     def __init__(
