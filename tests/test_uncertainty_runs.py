@@ -139,6 +139,10 @@ def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
     assert common([described(), described(path="there")]).path == "here"
     with pytest.raises(CheckpointError, match="differ in encoder"):
         common([described(), described(encoder=[{"name": "mlp"}])])
+    with pytest.raises(
+        CheckpointError, match=r"differ in data\.seed: .* Train the members .* with data\.seed=0 in all"
+    ):
+        common([described(), described(data={"name": "d", "seed": 1})])
     with pytest.raises(CheckpointError, match="differ in input_shape"):
         common([described(), described(input_shape=(3,))])
     with pytest.raises(CheckpointError, match="differ in data_state"):

@@ -89,7 +89,14 @@ def common(members: Sequence[Description]) -> Description:
     """
     first = members[0]
     for other in members[1:]:
-        for key in ("density_head", "encoder", "uncertainty", "data"):
+        here, there = other.config["data"], first.config["data"]
+        if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
+            fixed = " ".join(f"data.{key}={there.get(key)}" for key in differing)
+            raise CheckpointError(
+                f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}: what is test "
+                f"data of one may have trained the other. Train the members on the same data, with {fixed} in all."
+            )
+        for key in ("density_head", "encoder", "uncertainty"):
             if other.config[key] != first.config[key]:
                 raise CheckpointError(
                     f"{other.path} and {first.path} differ in {key}: {other.config[key]} and "
