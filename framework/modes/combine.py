@@ -93,8 +93,8 @@ def common(members: Sequence[Description]) -> Description:
         if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
             fixed = " ".join(f"data.{key}={there.get(key)}" for key in differing)
             raise CheckpointError(
-                f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}: what is test "
-                f"data of one may have trained the other. Train the members on the same data, with {fixed} in all."
+                f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}: what is "
+                f"test data of one may have trained the other. Train the members on the same data, with {fixed} in all."
             )
         for key in ("density_head", "encoder", "uncertainty"):
             if other.config[key] != first.config[key]:
