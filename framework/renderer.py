@@ -18,13 +18,14 @@ class Scene:
     Attributes:
         vertices: world coordinates, metres.
         faces: three vertex indices per triangle, counter-clockwise seen from outside.
-        colors: per vertex, linear in [0, 1]; None where no colour is asked for.
+        colors: per vertex, linear in [0, 1], of one channel or more (red, green, blue; or 1 for a silhouette); None
+            where no colour is asked for.
         camera: where from, and the image size.
     """
 
     vertices: Float[Tensor, "vertices 3"]
     faces: Int[Tensor, "faces 3"]
-    colors: Float[Tensor, "vertices 3"] | None
+    colors: Float[Tensor, "vertices channels"] | None
     camera: Camera
 
 
@@ -32,16 +33,19 @@ class Renderer(ABC):
     """Draws scenes; draws only what is asked for and what the camera can see.
 
     Keyword-only constructor parameters are the config. A renderer has no state that one call leaves for the next
-    (buffers it reuses are its own affair), so that calls may come in any order. A triangle with a vertex behind the
-    near plane, a coordinate that is not finite or no area (at the renderer's own precision) is left out, never drawn
-    wrong; a scene out of view gives the background. Where two surfaces are equally far, the lower face index wins.
+    (buffers it reuses are its own affair), so that calls may come in any order. A triangle with a coordinate that is
+    not finite or no area (at the renderer's own precision) is left out, never drawn wrong; of one that the near plane
+    cuts, what is beyond is drawn, or nothing; a scene out of view gives the background. Where two surfaces are equally
+    far, the lower face index wins.
+
+    A picture may be differentiable in whatever of its scene requires a gradient; a renderer says in what.
     """
 
     group: ClassVar[str] = "renderer"
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
     channels: ClassVar[frozenset[str]]
-    """What it can draw, of: "color" (height, width, 3) float32 in [0, 1], background 0; "depth" (height, width)
+    """What it can draw, of: "color" (height, width, channels) float32 in [0, 1], background 0; "depth" (height, width)
     float32, metres along the optical axis, background inf; "face" (height, width) int32, index of the visible
     face, background -1; "mask" (height, width) bool."""
 

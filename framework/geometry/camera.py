@@ -27,8 +27,8 @@ class Camera:
 
     rotation: Float[Tensor, "3 3"]
     translation: Float[Tensor, "3"]
-    focal: tuple[float, float]
-    principal: tuple[float, float]
+    focal: tuple[float, float] | Float[Tensor, "2"]
+    principal: tuple[float, float] | Float[Tensor, "2"]
     height: int
     width: int
     near: float = 1e-3

@@ -6,6 +6,7 @@ belongs to exactly one of them. A visible face and its pixel give back the baryc
 which is what a backward pass needs beside `screen`.
 
 Arrays:
+    seen: (vertices, 3) float64: x right, y down, z forward from the camera, metres.
     screen: (vertices, 3) float64: column and row in 1/256 pixel, whole numbers, and 1 / depth in 1/metre; the
         last is 0 where a vertex cannot be drawn.
     depth, face, mask: (height, width) float32, int32, bool; of size 0 where nobody reads them.
@@ -84,8 +85,10 @@ def out_of_view(vertices, rotation, translation, focal, principal, near, height,
 
 @compiled
 @no_type_check
-def project(vertices, rotation, translation, focal, principal, near, screen):
-    """Fill `screen` from world coordinates, in float64."""
+def project(vertices, rotation, translation, focal, principal, near, seen, screen):
+    """Fill `seen` and `screen` from world coordinates, in float64. Returns how many vertices are finite and cut off by
+    the near plane."""
+    hidden = 0
     for vertex in range(vertices.shape[0]):
         a = np.float64(vertices[vertex, 0])
         b = np.float64(vertices[vertex, 1])
@@ -93,16 +96,89 @@ def project(vertices, rotation, translation, focal, principal, near, screen):
         x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c + translation[0]
         y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + translation[1]
         z = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + translation[2]
-        inverse = 1.0 / z
-        column = np.rint((focal[0] * x * inverse + principal[0]) * SUBPIXELS)
-        row = np.rint((focal[1] * y * inverse + principal[1]) * SUBPIXELS)
-        # Tested as floats and before any cast; NaN fails every comparison.
-        if z >= near and z <= FARTHEST and abs(column) <= LARGEST and abs(row) <= LARGEST:
-            screen[vertex, 0] = column
-            screen[vertex, 1] = row
-            screen[vertex, 2] = inverse
-        else:
-            screen[vertex, :] = 0.0
+        seen[vertex, 0], seen[vertex, 1], seen[vertex, 2] = x, y, z
+        on_screen(x, y, z, focal, principal, near, screen[vertex])
+        if screen[vertex, 2] == 0 and z < near and abs(x) <= LARGEST and abs(y) <= LARGEST and z >= -LARGEST:
+            hidden += 1
+    return hidden
+
+
+@compiled
+@no_type_check
+def on_screen(x, y, z, focal, principal, near, place):
+    """Fill `place`, a row of `screen`, from camera coordinates."""
+    inverse = 1.0 / z
+    column = np.rint((focal[0] * x * inverse + principal[0]) * SUBPIXELS)
+    row = np.rint((focal[1] * y * inverse + principal[1]) * SUBPIXELS)
+    # Tested as floats and before any cast; NaN fails every comparison.
+    if z >= near and z <= FARTHEST and abs(column) <= LARGEST and abs(row) <= LARGEST:
+        place[0], place[1], place[2] = column, row, inverse
+    else:
+        place[:] = 0.0
+
+
+@compiled
+@no_type_check
+def clipped(seen, faces, focal, principal, near):
+    """What the near plane leaves of faces that it cuts: corners on the screen, triangles of them, the faces' numbers.
+
+    One corner in front gives a triangle, two give two. A corner on an edge is computed from the edge's vertices in the
+    order of their indices, so that neighbours get the same.
+    """
+    count = 0
+    for index in range(faces.shape[0]):
+        front = 0
+        for corner in range(3):
+            front += drawable(seen, faces[index, corner], near)
+        good = finite(seen, faces, index)
+        count += front if good and front < 3 else 0
+    corners = np.zeros((4 * count, 3))
+    parts = np.empty((count, 3), np.int64)
+    numbers = np.empty(count, np.int64)
+    part = corner_number = 0
+    for index in range(faces.shape[0]):
+        front = 0
+        for corner in range(3):
+            front += drawable(seen, faces[index, corner], near)
+        if front == 0 or front == 3 or not finite(seen, faces, index):
+            continue
+        first = corner_number
+        for corner in range(3):
+            here, following = faces[index, corner], faces[index, (corner + 1) % 3]
+            if drawable(seen, here, near):
+                x, y, z = seen[here, 0], seen[here, 1], seen[here, 2]
+                on_screen(x, y, z, focal, principal, near, corners[corner_number])
+                corner_number += 1
+            if drawable(seen, here, near) != drawable(seen, following, near):
+                low, high = min(here, following), max(here, following)
+                share = (near - seen[low, 2]) / (seen[high, 2] - seen[low, 2])
+                x = seen[low, 0] + share * (seen[high, 0] - seen[low, 0])
+                y = seen[low, 1] + share * (seen[high, 1] - seen[low, 1])
+                on_screen(x, y, near, focal, principal, near, corners[corner_number])
+                corner_number += 1
+        for second in range(first + 1, corner_number - 1):
+            parts[part, 0], parts[part, 1], parts[part, 2] = first, second, second + 1
+            numbers[part] = index
+            part += 1
+    return corners[:corner_number], parts[:part], numbers[:part]
+
+
+@compiled
+@no_type_check
+def drawable(seen, vertex, near):
+    """Whether a vertex is in front of the near plane."""
+    return seen[vertex, 2] >= near
+
+
+@compiled
+@no_type_check
+def finite(seen, faces, index):
+    """Whether the coordinates of a face's vertices are within what products of them can hold."""
+    for corner in range(3):
+        for axis in range(3):
+            if not abs(seen[faces[index, corner], axis]) <= FARTHEST:
+                return False
+    return True
 
 
 @compiled
@@ -121,16 +197,16 @@ def before(x, y, other_x, other_y):
 
 @compiled
 @no_type_check
-def rasterise(screen, faces, cull, height, width, depth, face, mask):
-    """Draw the faces, each pixel the nearest, among equal float32 depths the first. Returns the box.
+def rasterise(screen, faces, numbers, cull, height, width, depth, face, mask):
+    """Draw the faces, each pixel the nearest, among equal float32 depths that of the lowest number. Returns the box.
 
     `cull` leaves out faces seen from behind. With `depth` of size 0 only `mask` is drawn, without depths; one
-    of the two is needed. `mask` comes cleared; `depth` and `face` are cleared here.
+    of the two is needed. `numbers` of the faces: of size 0 they are numbered as they come; else these are drawn over
+    what is there. `mask`, and `depth` and `face` with it, come cleared.
     """
     want_depth = depth.size > 0
     want_face = face.size > 0
-    depth[:] = np.float32(np.inf)
-    face[:] = -1
+    over = numbers.size > 0
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
     box_top, box_bottom, box_left, box_right = height, 0, width, 0
     for index in range(faces.shape[0]):
@@ -167,10 +243,11 @@ def rasterise(screen, faces, cull, height, width, depth, face, mask):
             ax, ay, near0, bx, by, near1, cx, cy, near2 = cx, cy, near2, ax, ay, near0, bx, by, near1
         box_top, box_bottom = min(box_top, first_row), max(box_bottom, last_row + 1)
         box_left, box_right = min(box_left, first_column), max(box_right, last_column + 1)
+        number = numbers[index] if over else index
         if left < -EXACT or right > EXACT or top < -EXACT or bottom > EXACT:
             corners = (ax, ay, near0, bx, by, near1, cx, cy, near2)
             pixels = (first_row, last_row, first_column, last_column)
-            _draw_far(corners, pixels, index, depth, face, mask)
+            _draw_far(corners, pixels, number, depth, face, mask)
             continue
         x0, y0, x1, y1 = np.int64(ax), np.int64(ay), np.int64(bx), np.int64(by)
         x2, y2 = np.int64(cx), np.int64(cy)
@@ -202,7 +279,14 @@ def rasterise(screen, faces, cull, height, width, depth, face, mask):
                         if distance < depth[row, column]:
                             depth[row, column] = distance
                             if want_face:
-                                face[row, column] = index
+                                face[row, column] = number
+                        elif (
+                            over
+                            and want_face
+                            and distance == depth[row, column]
+                            and number < face[row, column]
+                        ):
+                            face[row, column] = number
                     else:
                         mask[row, column] = True
                 edge0 += column0
@@ -220,7 +304,7 @@ def rasterise(screen, faces, cull, height, width, depth, face, mask):
 
 @compiled
 @no_type_check
-def _draw_far(corners, pixels, index, depth, face, mask):
+def _draw_far(corners, pixels, number, depth, face, mask):
     """Draw a face that reaches past `EXACT`, with edge functions in float64, anew at each pixel.
 
     Even rounded, they change exactly their sign with an edge's direction (`edges`), so that neighbours share
@@ -242,7 +326,9 @@ def _draw_far(corners, pixels, index, depth, face, mask):
                 if distance < depth[row, column]:
                     depth[row, column] = distance
                     if face.size > 0:
-                        face[row, column] = index
+                        face[row, column] = number
+                elif face.size > 0 and distance == depth[row, column] and number < face[row, column]:
+                    face[row, column] = number
             elif inside:
                 mask[row, column] = True
 
@@ -270,16 +356,46 @@ def weights(screen, a, b, c, row, column):
 
 @compiled
 @no_type_check
-def shade(screen, faces, colors, face, box, color):
-    """Fill `color` (height, width, 3) with interpolated colours where `face` shows a face."""
+def weights_in_space(seen, a, b, c, ray_x, ray_y):
+    """The same of a face of which corners may be behind the camera, by its planes through the eye (Olano & Greer
+    1997): r·(b × c) and so on, each of the share it has of their sum."""
+    part0 = volume(seen, b, c, ray_x, ray_y)
+    part1 = volume(seen, c, a, ray_x, ray_y)
+    part2 = volume(seen, a, b, ray_x, ray_y)
+    turn = 1.0 if part0 + part1 + part2 > 0 else -1.0
+    # rounding of corners may leave the pixel a little outside of the face
+    part0, part1, part2 = max(turn * part0, 0.0), max(turn * part1, 0.0), max(turn * part2, 0.0)
+    total = part0 + part1 + part2
+    if not (total > 0 and total < np.inf):  # seen edge-on
+        return 1.0 / 3, 1.0 / 3, 1.0 / 3
+    return part0 / total, part1 / total, part2 / total
+
+
+@compiled
+@no_type_check
+def volume(seen, a, b, ray_x, ray_y):
+    """r · (a × b) of two vertices and a ray (ray_x, ray_y, 1)."""
+    ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
+    bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
+    return ray_x * (ay * bz - az * by) + ray_y * (az * bx - ax * bz) + (ax * by - ay * bx)
+
+
+@compiled
+@no_type_check
+def shade(seen, screen, faces, colors, focal, principal, face, box, color):
+    """Fill `color` (height, width, channel) with interpolated colours where `face` shows a face."""
     top, bottom, left, right = box
     for row in range(top, bottom):
         for column in range(left, right):
             index = face[row, column]
             if index >= 0:
                 a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-                weight0, weight1, weight2 = weights(screen, a, b, c, row, column)
-                for channel in range(3):
+                if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
+                    weight0, weight1, weight2 = weights(screen, a, b, c, row, column)
+                else:
+                    ray_x, ray_y = (column - principal[0]) / focal[0], (row - principal[1]) / focal[1]
+                    weight0, weight1, weight2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
+                for channel in range(colors.shape[1]):
                     color[row, column, channel] = (
                         weight0 * colors[a, channel]
                         + weight1 * colors[b, channel]

@@ -1,4 +1,4 @@
-"""Milliseconds a frame of the renderer zbuffer, written beside this file: `python benchmarks/zbuffer.py`."""
+"""Milliseconds a frame of the renderer rasterizer, written beside this file: `python benchmarks/rasterizer.py`."""
 
 import math
 import os
@@ -8,7 +8,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import date
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -24,13 +26,14 @@ HEIGHT, WIDTH = 410, 308
 FOCAL = 600  # pixels
 DISTANCE = 2.6  # metres
 ASKED = (("mask",), ("depth",), ("color",), ("color", "depth"))
+LEARNED = ("vertices", "colors")
 FIRST_CALL = """
 import time, torch
-from benchmarks.zbuffer import DISTANCE, figure, scene
-from plugins.renderer.zbuffer.renderer import ZBuffer
+from benchmarks.rasterizer import DISTANCE, figure, scene
+from plugins.renderer.rasterizer.renderer import Rasterizer
 drawn = scene(*figure(), distance=DISTANCE)
 start = time.perf_counter()
-ZBuffer()(drawn, ("color", "depth", "face", "mask"))
+Rasterizer()(drawn, ("color", "depth", "face", "mask"))
 print(time.perf_counter() - start)
 """
 
@@ -100,7 +103,14 @@ def milliseconds(call: Callable[[], object], repeats: int = 300) -> float:
 
 def row(name: str, renderer: Renderer, drawn: Scene) -> str:
     cells = [f"{milliseconds(lambda asked=asked: renderer(drawn, asked)):.2f}" for asked in ASKED]
+    cells += [f"{milliseconds(partial(both_ways, renderer, drawn, what)):.2f}" for what in LEARNED]
     return f"| {name} | {' | '.join(cells)} |"
+
+
+def both_ways(renderer: Renderer, drawn: Scene, learned: str) -> None:
+    """A picture, and the slopes of a loss in the vertices or in the colours."""
+    part = getattr(drawn, learned).clone().requires_grad_()
+    renderer(replace(drawn, **{learned: part}), ("color",))["color"].sum().backward()
 
 
 def first_calls() -> tuple[float, float]:
@@ -129,8 +139,9 @@ def processor() -> str:
 
 def report() -> str:
     torch.set_num_threads(1)
-    plain, culling = (
-        build("renderer", resolve("renderer", {"name": "zbuffer", "cull": cull})) for cull in (False, True)
+    plain, culling, inside = (
+        build("renderer", resolve("renderer", {"name": "rasterizer", **config}))
+        for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
     )
     bodies = [figure(), subdivided(*figure())]
     cover = plain(scene(*bodies[0], distance=DISTANCE), ("mask",))["mask"].float().mean().item()
@@ -139,17 +150,22 @@ def report() -> str:
         size = f"{len(vertices):,} / {len(faces):,}"
         rows.append(row(f"{size}, in view", plain, scene(vertices, faces, distance=DISTANCE)))
         rows.append(row(f"{size}, in view, culled", culling, scene(vertices, faces, distance=DISTANCE)))
+        rows.append(
+            row(f"{size}, in view, culled, interior", inside, scene(vertices, faces, distance=DISTANCE))
+        )
         rows.append(row(f"{size}, out of view", plain, scene(vertices, faces, distance=-DISTANCE)))
     cold, warm = first_calls()
     return "\n".join(
         [
-            "# zbuffer: milliseconds a frame",
+            "# rasterizer: milliseconds a frame",
             "",
             f"A synthetic closed body in {HEIGHT} rows × {WIDTH} columns, of which it covers {cover:.0%}; "
             "one thread; processor time, median of 300 calls.",
             "",
-            f"| vertices / faces | {' | '.join(' + '.join(asked) for asked in ASKED)} |",
-            "|---|" + "---|" * len(ASKED),
+            f"| vertices / faces | {' | '.join(' + '.join(asked) for asked in ASKED)} | "
+            + " | ".join(f"color, and back to {what}" for what in LEARNED)
+            + " |",
+            "|---|" + "---|" * (len(ASKED) + len(LEARNED)),
             *rows,
             "",
             f"First call in a process, all channels: {cold:.1f} s where everything is compiled, "
@@ -157,7 +173,7 @@ def report() -> str:
             "",
             f"{processor()}, {os.cpu_count()} cores; {date.today()}; Python {platform.python_version()}, "
             f"torch {torch.__version__}, numba {numba.__version__}, numpy {np.__version__}. "
-            "Command: `python benchmarks/zbuffer.py`.",
+            "Command: `python benchmarks/rasterizer.py`.",
             "",
         ]
     )

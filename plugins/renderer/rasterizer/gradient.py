@@ -1,0 +1,244 @@
+"""From the slope of a loss in an image to its slopes in colours, vertices and camera; compiled functions on arrays.
+
+Arrays are those of `raster`. In camera coordinates a pixel's ray is r = ((column - cx) / fx, (row - cy) / fy, 1), and
+the barycentric weights of a face A, B, C under it are m_i / Σ m with m_0 = r·(B×C), m_1 = r·(C×A), m_2 = r·(A×B)
+(homogeneous edge functions, Olano & Greer 1997): linear in every corner, and right for corners behind the camera.
+
+What an image of areas gains where an edge moves is the difference of the two surfaces beside it, times how far it
+moves, along its whole length (Li et al. 2018, eq. 4). Between two neighbouring pixels that show surfaces of different
+depth the edge is crossed once; the pair in a row sees what moves along the row, the pair in a column the rest.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+
+from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled
+
+FLATTEST = 1e-12
+"""Of Σ m, relative to its terms: what is flatter is seen edge-on, and has no slope that says anything."""
+
+
+@compiled
+@no_type_check
+def cross(a0, a1, a2, b0, b1, b2):
+    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+
+
+@compiled
+@no_type_check
+def add(to, vertex, scale, x, y, z):
+    to[vertex, 0] += scale * x
+    to[vertex, 1] += scale * y
+    to[vertex, 2] += scale * z
+
+
+@compiled
+@no_type_check
+def interior(seen, faces, colors, lens, face, box, along_color, along_depth, of_seen, of_colors, of_lens):
+    """Add to `of_*` what weights and depths change within the faces.
+
+    Args:
+        lens: fx, fy, cx, cy, pixels.
+        along_color, along_depth: slopes of the loss, (height, width, channels) and (height, width); size 0: none.
+        of_seen, of_colors, of_lens: the sums, float64.
+    """
+    top, bottom, left, right = box
+    shaded, deep = along_color.size > 0, along_depth.size > 0
+    channels = colors.shape[1]
+    last = a = b = c = -1
+    ax = ay = az = bx = by = bz = cx = cy = cz = 0.0
+    bc0 = bc1 = bc2 = ca0 = ca1 = ca2 = ab0 = ab1 = ab2 = 0.0
+    for row in range(top, bottom):
+        ray_y = (row - lens[3]) / lens[1]
+        for column in range(left, right):
+            index = face[row, column]
+            if index < 0:
+                continue
+            ray_x = (column - lens[2]) / lens[0]
+            if index != last:
+                last = index
+                a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+                ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
+                bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
+                cx, cy, cz = seen[c, 0], seen[c, 1], seen[c, 2]
+                bc0, bc1, bc2 = cross(bx, by, bz, cx, cy, cz)
+                ca0, ca1, ca2 = cross(cx, cy, cz, ax, ay, az)
+                ab0, ab1, ab2 = cross(ax, ay, az, bx, by, bz)
+            m0 = ray_x * bc0 + ray_y * bc1 + bc2
+            m1 = ray_x * ca0 + ray_y * ca1 + ca2
+            m2 = ray_x * ab0 + ray_y * ab1 + ab2
+            total = m0 + m1 + m2
+            if not abs(total) > FLATTEST * (abs(m0) + abs(m1) + abs(m2)):
+                continue
+            inverse = 1.0 / total
+            d0 = d1 = d2 = 0.0
+            if shaded:
+                # rounding of corners may leave the pixel a little outside of the face
+                w0, w1, w2 = max(m0 * inverse, 0.0), max(m1 * inverse, 0.0), max(m2 * inverse, 0.0)
+                scale = 1.0 / (w0 + w1 + w2)
+                w0, w1, w2 = w0 * scale, w1 * scale, w2 * scale
+                for channel in range(channels):
+                    slope = np.float64(along_color[row, column, channel])
+                    if slope != 0:
+                        of_colors[a, channel] += slope * w0
+                        of_colors[b, channel] += slope * w1
+                        of_colors[c, channel] += slope * w2
+                        d0 += slope * colors[a, channel]
+                        d1 += slope * colors[b, channel]
+                        d2 += slope * colors[c, channel]
+                mean = w0 * d0 + w1 * d1 + w2 * d2
+                d0, d1, d2 = (d0 - mean) * inverse, (d1 - mean) * inverse, (d2 - mean) * inverse
+            if deep and along_depth[row, column] != 0:
+                # depth = A·(B×C) / Σ m
+                slope = np.float64(along_depth[row, column]) * inverse
+                add(of_seen, a, slope, bc0, bc1, bc2)
+                add(of_seen, b, slope, ca0, ca1, ca2)
+                add(of_seen, c, slope, ab0, ab1, ab2)
+                down = slope * (ax * bc0 + ay * bc1 + az * bc2) * inverse
+                d0, d1, d2 = d0 - down, d1 - down, d2 - down
+            if d0 == 0 and d1 == 0 and d2 == 0:
+                continue
+            ra0, ra1, ra2 = cross(ray_x, ray_y, 1.0, ax, ay, az)
+            rb0, rb1, rb2 = cross(ray_x, ray_y, 1.0, bx, by, bz)
+            rc0, rc1, rc2 = cross(ray_x, ray_y, 1.0, cx, cy, cz)
+            add(of_seen, a, 1.0, d1 * rc0 - d2 * rb0, d1 * rc1 - d2 * rb1, d1 * rc2 - d2 * rb2)
+            add(of_seen, b, 1.0, d2 * ra0 - d0 * rc0, d2 * ra1 - d0 * rc1, d2 * ra2 - d0 * rc2)
+            add(of_seen, c, 1.0, d0 * rb0 - d1 * ra0, d0 * rb1 - d1 * ra1, d0 * rb2 - d1 * ra2)
+            slope_x = (d0 * bc0 + d1 * ca0 + d2 * ab0) / lens[0]
+            slope_y = (d0 * bc1 + d1 * ca1 + d2 * ab1) / lens[1]
+            of_lens[0] -= slope_x * ray_x
+            of_lens[1] -= slope_y * ray_y
+            of_lens[2] -= slope_x
+            of_lens[3] -= slope_y
+
+
+@compiled
+@no_type_check
+def boundary(seen, screen, faces, lens, face, depth, color, box, along_color, of_seen, of_lens):
+    """Add to `of_seen` and `of_lens` what edges hand over where they move."""
+    height, width = face.shape
+    top, bottom = max(box[0] - 1, 0), min(box[1] + 1, height)
+    left, right = max(box[2] - 1, 0), min(box[3] + 1, width)
+    footprint = 1.0 / min(lens[0], lens[1])
+    for row in range(top, bottom):
+        for column in range(left, right):
+            here = face[row, column]
+            for down, across in ((0, 1), (1, 0)):
+                other_row, other_column = row + down, column + across
+                if other_row >= bottom or other_column >= right or face[other_row, other_column] == here:
+                    continue
+                if parted(depth[row, column], depth[other_row, other_column], footprint):
+                    pixels = (row, column, other_row, other_column)
+                    pair(pixels, seen, screen, faces, lens, face, depth, color, along_color, of_seen, of_lens)
+
+
+@compiled
+@no_type_check
+def parted(depth, other, footprint):
+    """Whether neighbouring pixels may show surfaces that are apart: by a pixel's width, at their distance, or more."""
+    return abs(depth - other) > footprint * max(depth, other) or depth == np.inf or other == np.inf
+
+
+@compiled
+@no_type_check
+def pair(pixels, seen, screen, faces, lens, face, depth, color, along_color, of_seen, of_lens):
+    """What one pair of neighbouring pixels sees of the edge between them, if there is one."""
+    row, column, other_row, other_column = pixels
+    if depth[other_row, other_column] < depth[row, column]:  # the nearer one first
+        row, column, other_row, other_column = other_row, other_column, row, column
+    index = face[row, column]
+    a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+    if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
+        return  # cut by the near plane
+    # whichever way round the face is seen, its inside is on the positive side of its edges
+    turn = 1.0 if side(screen, a, b, screen[c, 1] / SUBPIXELS, screen[c, 0] / SUBPIXELS) > 0 else -1.0
+    # where the way from one pixel to the other leaves the nearer face: the least crossing of its three edges
+    share, first, second = 2.0, -1, -1
+    for corner in range(3):
+        a, b = faces[index, corner], faces[index, (corner + 1) % 3]
+        inside = turn * side(screen, a, b, row, column)
+        outside = turn * side(screen, a, b, other_row, other_column)
+        if outside < 0 <= inside:
+            crossing = inside / (inside - outside)
+            if crossing < share:
+                share, first, second = crossing, a, b
+    if first < 0:
+        return
+    if face[other_row, other_column] >= 0:
+        # a surface that goes on is no edge: the farther one must lie behind the crossing by more than it may rise
+        ray_x = (column + share * (other_column - column) - lens[2]) / lens[0]
+        ray_y = (row + share * (other_row - row) - lens[3]) / lens[1]
+        near = depth_at(seen, faces, index, ray_x, ray_y)
+        far = np.float64(depth[other_row, other_column])
+        beyond = depth_at(seen, faces, face[other_row, other_column], ray_x, ray_y)
+        if not far - near > 2 * abs(far - beyond) + far / min(lens[0], lens[1]):
+            return
+    handed = 0.0
+    for channel in range(color.shape[2]):
+        slope = np.float64(along_color[row, column, channel]) + along_color[other_row, other_column, channel]
+        handed += 0.5 * slope * (color[row, column, channel] - color[other_row, other_column, channel])
+    if handed == 0:
+        return
+    in_row = other_row == row
+    axis = 0 if in_row else 1
+    # the crossing's place between the edge's ends, along the other axis
+    start, end = screen[first, 1 - axis], screen[second, 1 - axis]
+    if start == end:
+        return
+    part = ((row if in_row else column) * SUBPIXELS - start) / (end - start)
+    part = min(max(part, 0.0), 1.0)
+    outwards = handed * ((other_column - column) + (other_row - row))
+    along(seen, first, axis, outwards * (1 - part), lens, of_seen, of_lens)
+    along(seen, second, axis, outwards * part, lens, of_seen, of_lens)
+
+
+@compiled
+@no_type_check
+def side(screen, a, b, row, column):
+    """On which side of an edge, extended, a pixel lies, and how far: twice the area of the triangle they make."""
+    x, y = column * SUBPIXELS, row * SUBPIXELS
+    return (screen[a, 0] - x) * (screen[b, 1] - y) - (screen[b, 0] - x) * (screen[a, 1] - y)
+
+
+@compiled
+@no_type_check
+def depth_at(seen, faces, index, ray_x, ray_y):
+    """Depth of a face's plane under a ray, metres."""
+    a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+    bc0, bc1, bc2 = cross(seen[b, 0], seen[b, 1], seen[b, 2], seen[c, 0], seen[c, 1], seen[c, 2])
+    ca0, ca1, ca2 = cross(seen[c, 0], seen[c, 1], seen[c, 2], seen[a, 0], seen[a, 1], seen[a, 2])
+    ab0, ab1, ab2 = cross(seen[a, 0], seen[a, 1], seen[a, 2], seen[b, 0], seen[b, 1], seen[b, 2])
+    total = ray_x * (bc0 + ca0 + ab0) + ray_y * (bc1 + ca1 + ab1) + bc2 + ca2 + ab2
+    return (seen[a, 0] * bc0 + seen[a, 1] * bc1 + seen[a, 2] * bc2) / total
+
+
+@compiled
+@no_type_check
+def along(seen, vertex, axis, slope, lens, of_seen, of_lens):
+    """Add a slope along the screen's `axis`, per pixel, of a vertex's place f x / z + c."""
+    focal, inverse = lens[axis], 1.0 / seen[vertex, 2]
+    place = seen[vertex, axis] * inverse
+    of_seen[vertex, axis] += slope * focal * inverse
+    of_seen[vertex, 2] -= slope * focal * place * inverse
+    of_lens[axis] += slope * place
+    of_lens[2 + axis] += slope
+
+
+@compiled
+@no_type_check
+def of_the_world(vertices, rotation, of_seen, of_vertices, of_rotation, of_translation):
+    """From slopes in camera coordinates x = R X + t to those in X, R and t."""
+    for vertex in range(vertices.shape[0]):
+        x, y, z = of_seen[vertex, 0], of_seen[vertex, 1], of_seen[vertex, 2]
+        if x == 0 and y == 0 and z == 0:
+            continue
+        for axis in range(3):
+            of_vertices[vertex, axis] = rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z
+            place = np.float64(vertices[vertex, axis])
+            of_rotation[0, axis] += x * place
+            of_rotation[1, axis] += y * place
+            of_rotation[2, axis] += z * place
+        of_translation[0] += x
+        of_translation[1] += y
+        of_translation[2] += z

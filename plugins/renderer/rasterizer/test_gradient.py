@@ -1,0 +1,212 @@
+"""Gradients of pictures, against autograd through a plain formula and against differences of supersampled pictures."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from framework.geometry.camera import Camera, look_from
+from framework.renderer import Scene
+from plugins.renderer.rasterizer.renderer import Rasterizer
+
+torch_float = torch.float64
+
+
+def blob(rings: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A closed body that hides parts of itself: a sphere with two bumps and a dent; smooth colours."""
+    theta = torch.linspace(0, math.pi, rings + 1, dtype=torch_float)
+    phi = torch.arange(2 * rings, dtype=torch_float) * (math.pi / rings)
+    x, y = torch.outer(theta.sin(), phi.cos()), torch.outer(theta.sin(), phi.sin())
+    z = theta.cos()[:, None].expand_as(x)
+    unit = torch.stack([x, y, z], -1)
+    radius = 0.6 + 0.35 * (3 * x).cos() * (2 * z).sin() + 0.2 * (4 * phi).cos() * theta.sin()[:, None]
+    row, column = torch.meshgrid(torch.arange(rings), torch.arange(2 * rings), indexing="ij")
+    a, b = row * 2 * rings + column, row * 2 * rings + (column + 1) % (2 * rings)
+    faces = torch.cat(
+        [torch.stack([a, a + 2 * rings, b], -1), torch.stack([b, a + 2 * rings, b + 2 * rings], -1)]
+    )
+    vertices = (radius[..., None] * unit).reshape(-1, 3)
+    colors = 0.5 + 0.5 * torch.sin(
+        2.0 * vertices @ torch.tensor([[1.0, 2, 0], [0, 1, 2], [2, 0, 1]]).double()
+    )
+    return vertices, faces.reshape(-1, 3), colors
+
+
+def camera(azimuth: float = 0.5, size: tuple[int, int] = (72, 88)) -> Camera:
+    seen = look_from(azimuth, 0.3, 0.1, 3.2, 0.6, size)
+    lens = [torch.tensor(part, dtype=torch_float) for part in (seen.focal, seen.principal)]
+    return replace(
+        seen,
+        rotation=seen.rotation.double(),
+        translation=seen.translation.double(),
+        focal=lens[0],
+        principal=lens[1],
+    )
+
+
+def turned(rotation: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
+    """exp([by]×) R."""
+    zero = torch.zeros_like(by[0])
+    cross = torch.stack(
+        [
+            torch.stack([zero, -by[2], by[1]]),
+            torch.stack([by[2], zero, -by[0]]),
+            torch.stack([-by[1], by[0], zero]),
+        ]
+    )
+    return torch.linalg.matrix_exp(cross) @ rotation
+
+
+DEFORMATIONS = {
+    "along x": lambda v: torch.tensor([1.0, 0, 0]).expand_as(v),
+    "along y": lambda v: torch.tensor([0, 1.0, 0]).expand_as(v),
+    "up": lambda v: torch.tensor([0, 0, 1.0]).expand_as(v),
+    "wider": lambda v: v * torch.tensor([1.0, 1, 0]),
+    "taller": lambda v: v * torch.tensor([0, 0, 1.0]),
+    "twisted": lambda v: torch.stack([-v[:, 1] * v[:, 2], v[:, 0] * v[:, 2], 0 * v[:, 0]], -1),
+    "sheared": lambda v: torch.stack([v[:, 2], 0 * v[:, 0], 0 * v[:, 0]], -1),
+    "bent": lambda v: torch.stack([torch.sin(3 * v[:, 2]), torch.cos(2 * v[:, 2]), 0 * v[:, 2]], -1),
+}
+VIEWS = (0.5, 2.0, 3.6, 5.2)
+
+
+def parameters() -> dict[str, torch.Tensor]:
+    """What is differentiated in, all 0 at the scene itself."""
+    sizes = {"vertices": 8, "colors": 3, "rotation": 3, "translation": 3, "focal": 1}
+    return {name: torch.zeros(size, dtype=torch_float, requires_grad=True) for name, size in sizes.items()}
+
+
+def scene(by: dict[str, torch.Tensor], azimuth: float, body: tuple[torch.Tensor, ...]) -> Scene:
+    vertices, faces, colors = body
+    moved = vertices + 0.3 * sum(
+        amount * move(vertices).double()
+        for amount, move in zip(by["vertices"], DEFORMATIONS.values(), strict=True)
+    )
+    seen = camera(azimuth)
+    seen = replace(
+        seen,
+        rotation=turned(seen.rotation, by["rotation"]),
+        translation=seen.translation + by["translation"],
+        focal=seen.focal * (1 + by["focal"]),
+    )
+    tinted = colors + torch.sin(3 * vertices) * by["colors"]
+    return Scene(moved, faces, tinted, seen)
+
+
+def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
+    """Squared error against another pose, over four views, in every kind of parameter: 8 deformations, colours, the
+    camera's rotation, translation and focal length. Cosine and length over all parameters of a kind."""
+    body = blob()
+    soft, hard = Rasterizer(supersampling=4), Rasterizer(supersampling=16)
+    interior = Rasterizer(supersampling=4, gradient="interior")
+    found: dict[str, list] = {}
+    alone: list = []
+    wanted: dict[str, list] = {}
+    for view, azimuth in enumerate(VIEWS):
+        torch.manual_seed(view)
+        off = {name: 0.05 * torch.randn_like(value.detach()) for name, value in parameters().items()}
+        with torch.no_grad():
+            target = hard(scene(off, azimuth, body))["color"]
+
+        def loss(renderer, by, azimuth=azimuth, target=target):
+            picture = renderer(scene(by, azimuth, body))["color"]
+            return (picture.double() - target).square().sum()
+
+        by = parameters()
+        loss(soft, by).backward()
+        once = parameters()
+        loss(interior, once).backward()
+        alone += once["vertices"].grad.tolist()
+        step = 2e-3
+        for name, value in by.items():
+            found.setdefault(name, []).extend(value.grad.tolist())
+            for index in range(len(value)):
+                ends = []
+                for sign in (1, -1):
+                    there = {key: part.detach().clone() for key, part in parameters().items()}
+                    there[name][index] += sign * step
+                    with torch.no_grad():
+                        ends.append(loss(hard, there).item())
+                wanted.setdefault(name, []).append((ends[0] - ends[1]) / (2 * step))
+    for name in found:
+        one, other = np.array(found[name]), np.array(wanted[name])
+        cosine = one @ other / np.linalg.norm(one) / np.linalg.norm(other)
+        length = np.linalg.norm(one) / np.linalg.norm(other)
+        assert cosine > 0.99, f"{name}: {cosine:.4f}"
+        assert abs(length - 1) < 0.05, f"{name}: {length:.4f}"
+    alone, other = np.array(alone), np.array(wanted["vertices"])
+    assert (
+        alone @ other / np.linalg.norm(alone) / np.linalg.norm(other) < 0.99
+    )  # what edges hand over is needed
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
+    """Colour, depth and every parameter, against autograd through rays and planes at the pixels that one face covers;
+    also where the near plane cuts it."""
+    torch.manual_seed(0)
+    vertices = torch.tensor(
+        [[-2.0, -2, 4], [3, -1, 5], [-1, 0.3, -1.0] if behind else [-1, 3, 3]], dtype=torch_float
+    )
+    colors = torch.rand(3, 4, dtype=torch_float)
+    rotation = turned(torch.eye(3, dtype=torch_float), torch.tensor([0.1, -0.05, 0.2]).double())
+    translation = torch.tensor([0.02, 0.03, 0.1], dtype=torch_float)
+    focal, principal = torch.tensor([40.0, 45.0]).double(), torch.tensor([12.2, 9.7]).double()
+    given = [
+        part.clone().requires_grad_() for part in (vertices, colors, rotation, translation, focal, principal)
+    ]
+    seen = Camera(given[2], given[3], given[4], given[5], 20, 24, 0.5)
+    faces = torch.tensor([[0, 2, 1]])
+    drawn = Rasterizer()(Scene(given[0], faces, given[1], seen), ("color", "depth", "mask"))
+    covered = drawn["mask"]
+    assert 20 < covered.sum() < 480
+    slope, down = torch.rand(20, 24, 4), torch.rand(20, 24)
+    inside = covered & (torch.nn.functional.avg_pool2d(covered.float()[None], 3, 1, 1)[0] == 1)
+    slope, down = slope * inside[..., None], down * inside
+    ((slope * drawn["color"]).sum() + (down * drawn["depth"].where(inside, 0)).sum()).backward()
+
+    again = [part.detach().clone().requires_grad_() for part in given]
+    x = again[0] @ again[2].T + again[3]
+    row, column = torch.meshgrid(torch.arange(20.0).double(), torch.arange(24.0).double(), indexing="ij")
+    place = torch.stack([column, row], -1)
+    ray = torch.cat([(place - again[5]) / again[4], torch.ones(20, 24, 1).double()], -1)
+    a, b, c = x
+    parts = torch.stack([ray @ torch.linalg.cross(*pair) for pair in ((b, c), (c, a), (a, b))], -1)
+    color = parts / parts.sum(-1, keepdim=True) @ again[1]
+    depth = (a @ torch.linalg.cross(b, c)) / parts.sum(-1)
+    ((slope * color)[inside].sum() + (down * depth)[inside].sum()).backward()
+    for one, other in zip(given, again, strict=True):
+        torch.testing.assert_close(one.grad, other.grad, rtol=2e-3, atol=2e-3 * float(other.grad.abs().max()))
+
+
+def test_gradients_of_extreme_scenes_are_finite() -> None:
+    edge_on = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0.5, 2.5]])
+    sliver = torch.tensor([[-1.0, 0, 2], [1, 1e-7, 2], [0, 2e-7, 2]])
+    everywhere = torch.tensor([[-1e6, -1e6, 1.0], [1e6, -1e6, 1.0], [0, 1e6, 1.0]])
+    crossing = torch.tensor([[-1.0, -1, -2], [1, -1, 3], [0, 1, 2.0]])
+    plane = torch.tensor([[-1.0, -1, 1e-3], [1, -1, 1e-3], [0, 1, 2.0]])
+    bad = torch.tensor([[math.nan, 0, 1], [0, math.inf, 1], [0, 0, 1.0]])
+    for corners in (edge_on, sliver, everywhere, crossing, plane, bad):
+        for focal in (1e-3, 30.0, 1e6):
+            vertices = torch.cat([corners, torch.tensor([[-0.3, -0.3, 4.0], [0.3, -0.3, 4], [0, 0.3, 4]])])
+            given = vertices.clone().requires_grad_()
+            lens = torch.tensor([focal, focal]).double().requires_grad_()
+            seen = Camera(torch.eye(3), torch.zeros(3), lens, (8.0, 8.0), 17, 17)
+            faces = torch.tensor([[0, 1, 2], [0, 2, 1], [3, 4, 5]])
+            drawn = Rasterizer()(Scene(given, faces, torch.rand(6, 3), seen), ("color", "depth"))
+            (drawn["color"].sum() + drawn["depth"].where(drawn["depth"] < math.inf, 0).sum()).backward()
+            assert given.grad.isfinite().all()
+            assert lens.grad.isfinite().all()
+
+
+def test_what_nobody_differentiates_costs_nothing() -> None:
+    vertices, faces, colors = blob(8)
+    drawn = Rasterizer()(Scene(vertices, faces, colors, camera()), ("color", "depth", "face", "mask"))
+    assert not any(value.requires_grad for value in drawn.values())
+    learned = Scene(vertices, faces, colors.clone().requires_grad_(), camera())
+    drawn = Rasterizer()(learned, ("color", "face", "mask"))
+    assert (
+        drawn["color"].requires_grad and not drawn["face"].requires_grad and not drawn["mask"].requires_grad
+    )
