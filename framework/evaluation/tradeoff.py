@@ -22,6 +22,7 @@ from framework.evaluation.reference import COLUMNS, LogProbs, Reference, errors,
 from framework.evaluation.splits import evaluate
 from framework.metric import Metric
 from framework.model import Model, Predictor
+from framework.storage.progress import tracked
 from framework.uncertainty import Uncertainty
 
 
@@ -160,7 +161,8 @@ def tradeoff(
         if reference is not None:
             compared = reference_value(log_probs, reference, last)
         taken = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
-        for value, seeds, time in zip(values, own, taken, strict=True):
+        turns = list(zip(values, own, taken, strict=True))
+        for value, seeds, time in tracked(turns, "measuring errors", len(turns), f"values of {knob}"):
             numbers = averaged([measured(value, repeat) for repeat in range(repeats)]) if metrics else {}
             if compared is not None:
                 numbers |= errors(log_probs, value, seeds, compared)

@@ -23,6 +23,7 @@ from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, to_read
 from framework.target import Target
+from framework.training.batches import told
 
 
 class PredictOptions(Options):
@@ -72,7 +73,7 @@ def predictions(
     loader = DataLoader(dataset, batch_size=BLOCK, collate_fn=as_batch)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
-    for number, batch in enumerate(loader):
+    for number, batch in enumerate(told(loader, "predicting")):
         prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
         columns = _columns(target, prediction) | {"entropy_nats": prediction.entropy}
         for row in range(len(batch["index"])):

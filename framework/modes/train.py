@@ -4,8 +4,9 @@ from framework.configuration.config import Config
 from framework.reports.report import report_test, report_training
 from framework.runs.fit import fit
 from framework.runs.job import leave_value
-from framework.runs.run import first_rank, opened
+from framework.runs.run import opened
 from framework.runs.session import calibrate, for_training
+from framework.storage.progress import first_rank
 
 
 def run(config: Config) -> float:

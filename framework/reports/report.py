@@ -14,6 +14,7 @@ from framework.metric import Pictured
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table
 from framework.runs.run import Run
 from framework.runs.session import Session
+from framework.training.batches import told
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,13 +31,13 @@ def report_test(run: Run, session: Session) -> None:
     loader = blocks.test_dataloader()
     found = evaluate(
         session.predictor,
-        loader,
+        told(loader, "testing"),
         metrics,
         groups=data.groups,
         samples=settings.samples,
         seed=settings.seed,
         device=session.device,
-        outliers=() if outliers is None else blocks.of(outliers.splits().test),
+        outliers=() if outliers is None else told(blocks.of(outliers.splits().test), "testing on outliers"),
     )
     batch = next(iter(session.batches().test_dataloader()))
     spent = cost(session.predictor, batch, samples=settings.samples, device=session.device)

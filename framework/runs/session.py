@@ -36,9 +36,10 @@ from framework.objective import Objective
 from framework.prediction import Prediction
 from framework.runs.description import Description
 from framework.runs.loading import PREFIX, load_with_description, reader
-from framework.runs.run import Run, first_rank
+from framework.runs.run import Run
+from framework.storage.progress import first_rank
 from framework.target import Target
-from framework.training.batches import Batches
+from framework.training.batches import Batches, told
 from framework.training.checkpoint import WholeCheckpoints
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -269,7 +270,8 @@ def calibrate(session: Session) -> None:
     """Fit what is not trained by gradient, on the validation set."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
-    session.predictor.calibrate(on_device(session.blocks().val_dataloader(), session.device))
+    batches = told(session.blocks().val_dataloader(), "calibrating")
+    session.predictor.calibrate(on_device(batches, session.device))
 
 
 def keep_memory() -> None:
