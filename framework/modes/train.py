@@ -19,7 +19,7 @@ def run(config: Config) -> float:
         if not first_rank():
             return loss
         if epoch is not None:
-            report_training(run, kept_epoch=epoch, synthetic=session.data.synthetic)
+            report_training(run, session, kept_epoch=epoch)
         calibrate(session)
         session.save_model(run)
         report_test(run, session)

@@ -79,6 +79,17 @@ class Session:
     def settings(self) -> Settings:
         return self.config.settings
 
+    @property
+    def data_title(self) -> str:
+        """What pictures and tables call the data."""
+        data = self.data
+        return data.title or (data.groups[0] if len(data.groups) == 1 else self.parts["data"]["name"])
+
+    @property
+    def title(self) -> str:
+        """What pictures and tables call the data and the model."""
+        return f"{self.data_title} · {self.method}"
+
     def batches(self, data: Data | None = None) -> Batches:
         """Of the session's data, or of what stands in for them, as they are trained on."""
         chosen = self.settings
