@@ -164,15 +164,6 @@ def device_name(device: torch.device) -> str:
     return f"cpu ({models[0] if models else platform.machine()})"
 
 
-def machine(device: object, threads: object) -> str:
-    """Where run times were measured, for people: "cpu (AMD EPYC), 2 threads"."""
-    return (
-        f"{device}, {threads:g} thread{'s' * (threads != 1)}"
-        if isinstance(threads, int | float)
-        else f"{device}"
-    )
-
-
 def _resident_peak() -> float:
     """The most memory that was resident since the peak was last reset, bytes."""
     for line in Path("/proc/self/status").read_text().splitlines():

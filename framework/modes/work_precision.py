@@ -11,12 +11,11 @@ from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
 from framework.evaluation import reference
-from framework.evaluation.cost import machine
 from framework.evaluation.splits import on_device
 from framework.evaluation.tradeoff import first_knob, owners, rows, tradeoff
 from framework.metric import Metric
 from framework.reports.report import picture
-from framework.reports.table import Better, csv, results_table
+from framework.reports.table import Better, csv, machine, results_table
 from framework.runs.run import Run, opened
 from framework.runs.session import Session, for_trained
 

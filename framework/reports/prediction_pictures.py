@@ -119,7 +119,7 @@ def _landscape(session: Session) -> Figure:
     return landscapes(
         {"": probabilities(predictor.cpu(), plane.half_width)},
         plane,
-        title=f"{session.title}: predicted probability",
+        title=f"{session.title}: predictions over the inputs",
         synthetic=data.synthetic,
     )
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from framework.evaluation.cost import Cost, machine
+from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.metric import Pictured
-from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table
+from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.run import Run
 from framework.runs.session import Session
 from framework.training.batches import told

@@ -112,7 +112,7 @@ def viewing_circles(
         Line2D([], [], color=RED, marker="o", markersize=4, label="point prediction"),
         Line2D([], [], color=GREEN, marker="^", linestyle="", label="truth"),
     ]
-    if modes is not None:
+    if any(len(mode) > 1 for mode in modes or ()):
         handles.append(Line2D([], [], color=GREEN, marker="^", ls="", mfc="none", label="equally true"))
     note = f"The object from above: {directions[0]} (0°)" if directions else "0°"
     note += " is at the bottom, angles turn counter-clockwise."

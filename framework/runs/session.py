@@ -37,7 +37,7 @@ from framework.prediction import Prediction
 from framework.runs.description import Description
 from framework.runs.loading import PREFIX, load_with_description, reader
 from framework.runs.run import Run
-from framework.storage.progress import first_rank
+from framework.storage.progress import first_rank, output
 from framework.target import Target
 from framework.training.batches import Batches, told
 from framework.training.checkpoint import WholeCheckpoints
@@ -139,7 +139,7 @@ def begin(settings: Settings) -> Console:
         torch.set_num_threads(settings.threads)
     keep_memory()
     quiet()
-    return Console(quiet=not first_rank())
+    return output()
 
 
 def for_training(config: Config) -> Session:

@@ -12,6 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 Item = TypeVar("Item")
 SHORT, APART = 2.0, 30.0
 """Seconds: shorter work says nothing, and lines of a log are so far apart."""
+WIDE = 160
+"""Characters of a line of a log."""
 
 
 def first_rank() -> bool:
@@ -24,6 +26,12 @@ def first_rank() -> bool:
         if rank in os.environ and os.environ.get(ranks, "1") != "1":
             return os.environ[rank] == "0"
     return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
+
+
+def output() -> Console:
+    """Where people read results: a log has no edge to wrap at, and ranks other than the first print nothing."""
+    console = Console(quiet=not first_rank())
+    return console if console.is_terminal else Console(quiet=console.quiet, width=WIDE)
 
 
 @final

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.console import Console
-
 from framework.configuration.settings import store_experiment
 from framework.errors import ConfigError, did_you_mean
-from framework.evaluation.cost import machine
-from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
+from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, machine, results_table
 from framework.runs.job import RECORD
 from framework.runs.run import stored_config
 from framework.storage.plain_values import read_json
+from framework.storage.progress import output
 from framework.tracking.ended import mark_dead
 from framework.tracking.tracker import MlflowTracker
 
@@ -62,7 +60,7 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 
 def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     """Compare the finished jobs in `folder`: print the table, log it and a picture to the parent."""
-    console = _console()
+    console = output()
     for path in folder.glob("*/run.json"):
         if _status(path.parent) == "died":
             mark_dead(path.parent)  # a killed process could not close its run
@@ -129,7 +127,7 @@ def rank(
         **{key: key.lstrip("+").rpartition(".")[2] for key in keys},
     }
     columns |= {key: head for key, head in COST_COLUMNS.items() if any(row[key] is not None for row in rows)}
-    console = _console()
+    console = output()
     title = f"{len(trials)} trials in {folder}, best first"
     console.print(results_table(shown, columns, title=title, better={"value": better}))
     csv(shown, columns, folder / "ranking.csv")
@@ -203,11 +201,6 @@ def _better(
     return _DIRECTIONS[direction] if direction is not None else ways[metric]
 
 
-def _console() -> Console:
-    console = Console()
-    return console if console.is_terminal else Console(width=160)  # a log file has no edge to wrap at
-
-
 def _in_order(paths: Iterable[Path]) -> list[Path]:
     """By job number: 2 before 10."""
     return sorted(paths, key=lambda path: (len(path.parent.name), path.parent.name))
@@ -255,7 +248,7 @@ def _picture(
 
     headings, better = rows[0]["columns"], rows[0]["better"]
     key = next((key for key in headings if key in better), None)
-    if key is None or not all(key in row for row in compared):
+    if key is None or not all(key in row for row in compared) or not all("device" in row for row in rows):
         return []
     method, data, *varied = by
     said = [[row[method], *(f"{name.rpartition('.')[2]}={row[name]}" for name in varied)] for row in compared]
@@ -267,11 +260,7 @@ def _picture(
         better,
         title=f"{about}: {headings[key]} against run time",
         synthetic=any(row.get("synthetic") for row in compared),
-        machine="; ".join(
-            dict.fromkeys(
-                machine(row.get("device", "an unknown machine"), row.get("threads")) for row in rows
-            )
-        ),
+        machine="; ".join(dict.fromkeys(machine(row["device"], row["threads"]) for row in rows)),
         group=data if several else None,
     )
     stored = stored_config(Path(rows[0]["folder"])) or {}
