@@ -17,6 +17,8 @@ from framework.reports.sample_sheet import sample_sheet
 
 LARGE_ERROR = math.pi / 6  # radians; a viewpoint further off counts as wrong (Acc_{π/6} of thesis Table 3.3)
 RING = 0.5  # thickness of the ring that holds the densities, in radii of the viewing circle
+PREDICTED: dict[str, Any] = {"color": RED, "ls": ":", "linewidth": 1.2, "marker": "o", "markersize": 4}
+"""Dotted, so that a narrow density is seen below it."""
 DEGREES = ("0°", "90°", "180°", "270°")
 
 
@@ -109,7 +111,7 @@ def viewing_circles(
         Patch(color=BLUE, alpha=0.6, label="predicted density"),
         Line2D([], [], color=GREY, label="outer circle: the density written there"),
         Line2D([], [], color=GREY, linestyle=":", label="uniform density"),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="point prediction"),
+        Line2D([], [], **PREDICTED, label="point prediction"),
         Line2D([], [], color=GREEN, marker="^", linestyle="", label="truth"),
     ]
     if any(len(mode) > 1 for mode in modes or ()):
@@ -140,9 +142,9 @@ def _viewing_circle(
     for radius, line in ((1.0, "-"), (1 + RING, "-"), (1 + RING / (2 * math.pi * outer), ":")):
         axes.add_patch(Circle((0, 0), radius, fill=False, color=GREY, linestyle=line, zorder=3))
     for quarter, word in enumerate(words or DEGREES):
-        x, y = _position(quarter * math.pi / 2, 0.86 if words else 0.84)
+        x, y = _position(quarter * math.pi / 2, 0.86)
         turn = 90 * (quarter % 2) if words else 0
-        style = {"fontsize": 6.5, "color": GREY, "rotation": turn, "parse_math": False}
+        style = {"fontsize": 6.5 if words else 6, "color": GREY, "rotation": turn, "parse_math": False}
         axes.text(x, y, word, ha="center", va="center", **style)
 
 
@@ -152,7 +154,7 @@ def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] |
         x, y = _position(angle, 1 + RING + 0.1)
         axes.plot(x, y, color=GREEN, marker=inwards, markerfacecolor=face, markersize=8, zorder=5)
     x, y = _position(prediction, np.array([1.0, 1 + RING]))
-    axes.plot(x, y, color=RED, linewidth=1.6, marker="o", markevery=[0], markersize=4, zorder=5)
+    axes.plot(x, y, **PREDICTED, zorder=5)
 
 
 def _position(angle: Any, radius: Any) -> tuple[Any, Any]:
