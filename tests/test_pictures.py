@@ -21,9 +21,11 @@ from scipy.stats import vonmises
 from framework.distributions.density import Mixture
 from framework.figures.style import saved, titled_figure
 from framework.reports.prediction_pictures import around
+from framework.reports.table import aggregate
 from framework.reports.tradeoff_picture import Floor, error_against_run_time
 from framework.reports.training_curve import training_curve
 from framework.reports.viewing_circles import RING, choose, peaks, scale, viewing_circles
+from framework.sweeps import comparison
 from plugins.density_head.von_mises.density import VonMises
 
 ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
@@ -529,3 +531,30 @@ def test_tables_import_no_torch_costs_no_matplotlib_and_pictures_no_pyplot() -> 
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("pictures, suffix", [("svg", "svg"), (True, "png")])
+def test_a_sweep_is_drawn_as_its_jobs_are_and_names_data_machine_and_what_was_varied(
+    pictures: str | bool, suffix: str, tmp_path: Path
+) -> None:
+    (tmp_path / "config.yaml").write_text(f"pictures: {pictures}\n".lower())
+    rows = [
+        {"method": method, "data": data, "mlp.widths": widths, "seed": seed, "nll": 0.5 + 0.1 * seed}
+        | {"milliseconds_per_sample": 1.0, "device": "cpu (X)", "threads": threads, "synthetic": True}
+        | {"columns": {"nll": "NLL (nats)"}, "better": {"nll": "lower"}, "folder": str(tmp_path)}
+        for method, widths, threads in (("a", "[8]", 1), ("a", "[16]", 2), ("b", None, 2))
+        for data in ("faces", "cells")
+        for seed in (0, 1)
+    ]
+    by = ["method", "data", "mlp.widths"]
+    for data in (("faces",), ("faces", "cells")):
+        some = [row for row in rows if row["data"] in data]
+        (path,) = comparison._picture(aggregate(some, by), some, by, tmp_path)
+        assert path.name == f"comparison.{suffix}"
+        if suffix == "svg":
+            said = " ".join(re.findall("<!-- (.*?) -->", path.read_text(encoding="utf-8"), re.S))
+            title = "faces: NLL (nats)" if len(data) == 1 else "2 data sets: NLL (nats)"
+            assert f"{title} against run time (synthetic data)" in said
+            assert "on cpu (X), 1 thread; cpu (X), 2 threads" in said
+            assert "a, widths=[8]" in said and "a, widths=[16]" in said and "None" not in said
+            assert ("cells" in said) is (len(data) == 2)

@@ -205,10 +205,9 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
                     f"{files[0]} … {files[-1]}: {len(files)} files hold {len(dataset)} samples; "  # type: ignore[arg-type]
                     "mode=encode wants one of each. Split the files."
                 )
+            batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0)
             found: list[Tensor] = []
-            for batch in Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0).of(
-                dataset
-            ):
+            for batch in batches.of(dataset):
                 features = batch["input"]
                 if not encoders:
                     encoders = chain(config["encoder"], tuple(features.shape[1:]), data.columns)

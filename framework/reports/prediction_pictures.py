@@ -26,8 +26,8 @@ PICTURED = 128
 """How many test samples those that are shown are chosen from."""
 
 
-UNRESOLVED, DRAWS = 0.01, 10_000
-"""A grid whose mass is off by more does not resolve the density; so many draws then do."""
+UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10
+"""A grid whose mass is off by more does not resolve the density; so many draws, so many times, then do."""
 
 
 def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
@@ -131,16 +131,16 @@ def around(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
     """
     angles, log_density = circular_grid(density, points)
     width = 2 * math.pi / points
-    on_grid = DRAWS * width * log_density.double().exp()  # draws to expect
-    unresolved = (on_grid.sum(0) / DRAWS - 1).abs() > UNRESOLVED
+    on_grid = DRAWS * TIMES * width * log_density.double().exp()  # draws to expect
+    unresolved = (on_grid.sum(0) / (DRAWS * TIMES) - 1).abs() > UNRESOLVED
     if not bool(unresolved.any()):
         return angles, log_density
-    drawn = density.sample(torch.Size((DRAWS,))).squeeze(-1)
+    drawn = torch.cat([density.sample(torch.Size((DRAWS,))) for _ in range(TIMES)]).squeeze(-1)
     place = ((wrap(drawn).double() + math.pi) / width).round().long() % points
     found = torch.zeros_like(on_grid).scatter_add_(0, place, torch.ones_like(place, dtype=on_grid.dtype))
     # what the grid says stands unless the draws contradict it: tails stay smooth
     wrong = unresolved & ((found - on_grid).abs() > 5 * (on_grid + 1).sqrt())
-    return angles, torch.where(wrong, (found / (DRAWS * width)).log(), log_density.double())
+    return angles, torch.where(wrong, (found / (DRAWS * TIMES * width)).log(), log_density.double())
 
 
 def _caption(error: float, entropy: float, symmetry: int) -> str:

@@ -251,7 +251,10 @@ def _picture(
     if key is None or not all(key in row for row in compared) or not all("device" in row for row in rows):
         return []
     method, data, *varied = by
-    said = [[row[method], *(f"{name.rpartition('.')[2]}={row[name]}" for name in varied)] for row in compared]
+    said = [
+        [row[method], *(f"{name.rpartition('.')[2]}={row[name]}" for name in varied if row[name] is not None)]
+        for row in compared
+    ]
     several = len({row[data] for row in compared}) > 1
     about = f"{len({row[data] for row in compared})} data sets" if several else compared[0][data]
     figure = error_against_run_time(
