@@ -20,7 +20,7 @@ from scipy.stats import vonmises
 
 from framework.distributions.density import Mixture
 from framework.figures.style import saved, titled_figure
-from framework.reports.prediction_pictures import around
+from framework.reports.prediction_pictures import around, deviation
 from framework.reports.table import aggregate
 from framework.reports.tradeoff_picture import Floor, error_against_run_time
 from framework.reports.training_curve import training_curve
@@ -94,6 +94,18 @@ def test_samples_that_cannot_be_compared_are_refused() -> None:
     one = bumps((1, 0, 5))[:, None]
     with pytest.raises(ValueError, match="NaN"):
         choose(np.array([math.nan]), np.zeros(1), one)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.floats(-4, 4), st.floats(-4, 4), st.integers(0, 5))
+def test_an_error_is_to_the_nearest_true_angle(truth: float, point: float, symmetry: int) -> None:
+    """Against a loop over all that are true; where every angle is, nothing is an error."""
+    found = deviation(
+        *(torch.tensor([value], dtype=torch.float64) for value in (truth, point)), torch.tensor([symmetry])
+    )
+    turns = [truth + 2 * math.pi * turn / max(symmetry, 1) for turn in range(symmetry)] or [point]
+    wanted = min(abs(math.remainder(true - point, 2 * math.pi)) for true in turns)
+    assert found.item() == pytest.approx(wanted, abs=1e-12)
 
 
 # viewing circles
@@ -216,10 +228,10 @@ def test_no_density_falls_between_the_angles_where_it_is_drawn(
 
 
 def test_every_equally_true_angle_is_marked(tmp_path: Path) -> None:
-    modes = [np.array([0.0, 2.0, 4.0]), np.array([])]
-    figure = circles([bumps((1, 0, 5))] * 2, modes=modes)
-    triangles = [sum(isinstance(line.get_marker(), tuple) for line in axes.lines) for axes in figure.axes[:2]]
-    assert triangles == [4, 1]  # and the truth
+    modes = [np.array([0.0, 2.0, 4.0]), np.array([]), np.array([])]
+    figure = circles([bumps((1, 0, 5))] * 3, modes=modes, truths=np.array([0.0, 1.0, math.nan]))
+    triangles = [sum(isinstance(line.get_marker(), tuple) for line in axes.lines) for axes in figure.axes[:3]]
+    assert triangles == [4, 1, 0]  # and the truth, where there is one
     assert "equally true" in words(figure)
     drawn(figure, tmp_path)
 

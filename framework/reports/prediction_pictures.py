@@ -59,7 +59,7 @@ def _densities(session: Session) -> Figure:
             angles, log_density = around(first)
         entropy, truth, point = first.entropy(), batch["target"][:, 0], prediction.point[:, 0]
         symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
-        columns.append((log_density, entropy, angular_distance(truth, point), truth, point, symmetry))
+        columns.append((log_density, entropy, deviation(truth, point, symmetry), truth, point, symmetry))
         inputs.extend(batch["input"].cpu())
     joined = (torch.cat(some, -1).cpu().numpy() for some in zip(*columns, strict=True))
     log_density, entropy, error, truth, point, symmetry = joined
@@ -69,7 +69,7 @@ def _densities(session: Session) -> Figure:
         [data.picture(inputs[index]) for index in order],
         log_density[:, order],
         angles.cpu().numpy(),
-        truth[order],
+        np.where(symmetry == 0, np.nan, truth)[order],
         point[order],
         [_caption(error[index], entropy[index], symmetry[index]) for index in order],
         [_equally_true(truth[index], symmetry[index]) for index in order],
@@ -143,9 +143,16 @@ def around(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
     return angles, torch.where(wrong, (found / (DRAWS * TIMES * width)).log(), log_density.double())
 
 
+def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:
+    """Angular distance to the nearest angle that is as true as the annotated one, radians; 0 where all angles are."""
+    folds = symmetry.clamp(min=1)
+    return torch.where(symmetry == 0, 0.0, angular_distance(folds * truth, folds * point) / folds)
+
+
 def _caption(error: float, entropy: float, symmetry: int) -> str:
-    note = {0: ", no true direction", 1: ""}.get(symmetry, f", {symmetry}-fold symmetric")
-    return f"error {math.degrees(error):.0f}°, entropy {entropy:.2f} nats{note}"
+    said = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
+    note = f", {symmetry}-fold symmetric" if symmetry > 1 else ""
+    return f"{said}, entropy {entropy:.2f} nats{note}"
 
 
 def _equally_true(truth: float, symmetry: int) -> np.ndarray:

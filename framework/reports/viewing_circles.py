@@ -88,7 +88,7 @@ def viewing_circles(
     Args:
         images: of the samples, as `Data.picture` gives them.
         log_density: nats, at `angles`, a regular grid over the whole circle, radians.
-        truths, predictions: radians.
+        truths, predictions: radians; NaN where there is no true direction, which is not drawn.
         captions: below each panel.
         modes: for each sample all angles that are as true as its truth (of a symmetric object), radians.
         rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
@@ -150,6 +150,8 @@ def _viewing_circle(
 
 def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] | np.ndarray) -> None:
     for angle, face in (*((mode, "none") for mode in modes), (truth, GREEN)):
+        if math.isnan(angle):
+            continue
         inwards = (3, 0, math.degrees(angle))  # a triangle outside the outer circle
         x, y = _position(angle, 1 + RING + 0.1)
         axes.plot(x, y, color=GREEN, marker=inwards, markerfacecolor=face, markersize=8, zorder=5)
