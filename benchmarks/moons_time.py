@@ -64,7 +64,7 @@ def main() -> None:
         dict.fromkeys(LABELS, "lower"),
         title="Two moons: NLL and ECE against run time, 512-512 networks",
         synthetic=True,
-        note=f"batches of 500, one thread; {machine('torch')}",
+        machine=f"batches of 500, one thread; {machine('torch')}",
     )
     figure.savefig(HERE / "moons_time.png", dpi=110)
     for row in found:

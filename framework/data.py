@@ -76,6 +76,11 @@ class Data(ABC):
     """Whether an input is two numbers, a place in a plane, over which what a classifier says can be drawn."""
     varies: bool = True
     """Whether `augment` may change a batch."""
+    title: str = ""
+    """What pictures and tables call the data; where empty its only group, or else the plugin's name."""
+    directions: tuple[str, ...] = ()
+    """Where the first angle says from where an object is seen: words for 0°, 90°, 180° and 270°, seen from above
+    counter-clockwise. Pictures of other angles show degrees."""
     groups: tuple[str, ...]
     """Names by which results are also reported apart (object classes, say); one name where there is one."""
     synthetic: bool

@@ -1,6 +1,7 @@
 """mode=encode: parts are whole, each file is encoded once whatever stops or shares the work, nothing is mixed up."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from framework.configuration.schema import build, resolve
 from framework.configuration.settings import Settings
 from framework.errors import ConfigError, DataError
 from framework.modes.encode import collected, describe, encode, share
+from framework.storage import progress
 from tests.conftest import Done, Framework
 
 CONFIG = {
@@ -38,10 +40,13 @@ def alone(root, name):
     return encoder(clouds)[0].numpy()
 
 
-def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path):
+def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "SHORT", 0.0)
+    monkeypatch.setattr(progress, "APART", 0.0)
     collection = collected(root, tmp_path / "features", 4)
     describe(collection, CONFIG)
     assert encode(collection, CONFIG, range(3), SETTINGS) == 3
+    assert re.findall(r"encoding: (\d+) of 11 files", capsys.readouterr().err) == ["3", "4", "7", "8", "11"]
     names = (tmp_path / "features" / "files.txt").read_text().splitlines()
     assert names == sorted(f"{'ab'[number % 2]}/{number:02}.npy" for number in range(11))
     rows = np.concatenate([np.load(tmp_path / "features" / f"part-{part:06}.npy") for part in range(3)])

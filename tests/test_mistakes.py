@@ -85,7 +85,8 @@ bs=32 | Did you mean 'batch_size'?
 num_workers=2 | Did you mean 'workers'?
 threads=0 | threads = 0
 samples=0 | samples = 0
-pictures=perhaps | pictures = 'perhaps'
+pictures=perhaps | 'png', 'pdf' or 'svg'
+pictures=svgg | Did you mean 'svg'?
 resume=outputs/none | Give the folder of a run
 logger=mflow | Did you mean 'mlflow'?
 logger.url=x | Did you mean 'uri'?

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -17,9 +18,15 @@ from matplotlib.text import Annotation, Text
 from scipy.special import logsumexp
 from scipy.stats import vonmises
 
+from framework.distributions.density import Mixture
+from framework.figures.style import saved, titled_figure
+from framework.reports.prediction_pictures import around, deviation
+from framework.reports.table import aggregate
 from framework.reports.tradeoff_picture import Floor, error_against_run_time
 from framework.reports.training_curve import training_curve
-from framework.reports.viewing_circles import RING, choose, peaks, viewing_circles
+from framework.reports.viewing_circles import RING, choose, peaks, scale, viewing_circles
+from framework.sweeps import comparison
+from plugins.density_head.von_mises.density import VonMises
 
 ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
 
@@ -89,6 +96,18 @@ def test_samples_that_cannot_be_compared_are_refused() -> None:
         choose(np.array([math.nan]), np.zeros(1), one)
 
 
+@settings(deadline=None, max_examples=60)
+@given(st.floats(-4, 4), st.floats(-4, 4), st.integers(0, 5))
+def test_an_error_is_to_the_nearest_true_angle(truth: float, point: float, symmetry: int) -> None:
+    """Against a loop over all that are true; where every angle is, nothing is an error."""
+    found = deviation(
+        *(torch.tensor([value], dtype=torch.float64) for value in (truth, point)), torch.tensor([symmetry])
+    )
+    turns = [truth + 2 * math.pi * turn / max(symmetry, 1) for turn in range(symmetry)] or [point]
+    wanted = min(abs(math.remainder(true - point, 2 * math.pi)) for true in turns)
+    assert found.item() == pytest.approx(wanted, abs=1e-12)
+
+
 # viewing circles
 
 
@@ -120,7 +139,7 @@ def test_each_sample_has_its_image_band_truth_and_prediction(tmp_path: Path) -> 
     assert len(filled) == 4
     assert [axes.get_xlabel() for axes in filled] == [f"sample {index}" for index in range(4)]
     text = words(figure)
-    for word in ("front", "right", "back", "left", "certain", "failed", "no such sample"):
+    for word in ("0°", "90°", "180°", "270°", "certain", "failed", "no such sample"):
         assert word in text
     for word in ("predicted density", "truth", "point prediction", "uniform density", "counter-clockwise"):
         assert text.count(word) == 1  # the legend stands once
@@ -146,42 +165,82 @@ def test_angle_zero_is_at_the_bottom_and_angles_grow_counter_clockwise(
     assert len(marks) == 2
 
 
-def test_words_stand_where_their_angles_are() -> None:
-    axes = circles([bumps((1, 0, 5))]).axes[0]
-    where = {text.get_text(): text.get_position() for text in axes.texts}
-    assert where["front"][1] < -0.5 and where["back"][1] > 0.5
-    assert where["right"][0] > 0.5 and where["left"][0] < -0.5
+WORDS = ("ahead", "port", "astern", "starboard")
 
 
-def test_thickness_is_the_density_to_one_scale_and_cut_at_the_outer_circle() -> None:
-    soft, sharp = bumps((1, 1, 4)), bumps((1, 1, 400))
-    figure = circles([soft, sharp], outer=1.5)
-    soft_radius, sharp_radius = (np.hypot(*band(figure, panel).T) for panel in (0, 1))
-    peak = vonmises.pdf(0, 4)
-    assert soft_radius.max() == pytest.approx(1 + RING * peak / 1.5, rel=1e-3)
-    assert sharp_radius.max() == pytest.approx(1 + RING)
-    assert min(soft_radius.min(), sharp_radius.min()) == pytest.approx(1)
-    thick = [[line for line in axes.lines if line.get_linewidth() == 3] for axes in figure.axes[:2]]
-    shares = [np.isfinite(lines[0].get_xdata()).mean() for lines in thick]
-    assert shares[0] == 0  # nothing is cut, nothing is thick
-    over = vonmises.pdf(ANGLES, 400, loc=1) > 1.5
-    assert shares[1] == pytest.approx(over.mean(), abs=4 / 720)
-    assert "above 1.5 per radian" in words(figure)
+@pytest.mark.parametrize("directions", [(), WORDS])
+def test_words_stand_where_their_angles_are(directions: tuple[str, ...]) -> None:
+    """Words of the data's own, or degrees; never front and back of what has none."""
+    figure = circles([bumps((1, 0, 5))], directions=directions)
+    where = {text.get_text(): text.get_position() for text in figure.axes[0].texts}
+    bottom, right, top, left = directions or ("0°", "90°", "180°", "270°")
+    assert where[bottom][1] < -0.5 and where[top][1] > 0.5
+    assert where[right][0] > 0.5 and where[left][0] < -0.5
+    assert ("The object from above: ahead (0°) is at the bottom" in words(figure)) is bool(directions)
+    assert "0° is at the bottom, angles turn counter-clockwise" in words(figure).replace("(0°)", "0°")
+    assert not {"front", "back", "left", "right"} & set(words(figure).split())
+
+
+def test_thickness_is_the_density_whose_scale_each_panel_says() -> None:
+    """However sharp: none is cut, and the same height is the same density in panels of one scale."""
+    sharpness = (0, 4, 8, 400, 1e4)
+    figure = circles([bumps((1, ANGLES[500], sharp)) for sharp in sharpness])
+    for axes, sharp, outer in zip(figure.axes, sharpness, (1.5, 1.5, 1.5, 15, 60), strict=False):
+        (patch,) = [patch for patch in axes.patches if isinstance(patch, Polygon)]
+        radius = np.hypot(*patch.get_xy().T)
+        assert radius.max() == pytest.approx(1 + RING * vonmises.pdf(0, sharp) / outer, rel=1e-3)
+        assert radius.min() == pytest.approx(1)
+        assert f"{outer:g} per rad" in [text.get_text() for text in axes.texts]
+    assert "outer circle: the density written there" in words(figure)
+
+
+@pytest.mark.parametrize("peak", [0.0, 1.5, 1.6, 5.1, 14.9, 15.1, 40.0, 1e9, math.exp(700)])
+def test_a_scale_holds_its_peak_and_is_not_much_larger(peak: float) -> None:
+    assert peak <= scale(peak) <= max(1.5, 2.6 * peak)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [(1, 1.0, 4)],
+        [(1, 1.0 + 0.004, 1e4)],
+        [(1, 1.0 + 0.004, 1e8)],
+        [(1, -math.pi, 1e12)],
+        [(0.5, 1.004, 1e9), (0.5, -1, 3)],
+        [(0.3, 1.004, 1e9), (0.7, 2.008, 1e7)],
+    ],
+)
+def test_no_density_falls_between_the_angles_where_it_is_drawn(
+    parts: list[tuple[float, float, float]],
+) -> None:
+    """The mass is 1 in all, and within 3° of each needle its weight."""
+    weight, mean, sharp = torch.tensor(parts, dtype=torch.float64)[None].unbind(-1)  # of a batch of one
+    density = Mixture(weight.log(), VonMises(mean[..., None], sharp[..., None]))
+    torch.manual_seed(0)
+    angles, log_density = around(density)
+    mass = log_density.exp()[:, 0].numpy() * 2 * math.pi / len(angles)
+    assert mass.sum() == pytest.approx(1, abs=0.02)
+    for share, middle, concentration in parts:
+        if concentration > 1e3:
+            near = np.abs(np.angle(np.exp(1j * (angles.numpy() - middle)))) < 0.05
+            assert mass[near].sum() == pytest.approx(share, abs=0.06)
+    assert scale(float(log_density.exp().max())) <= 150
 
 
 def test_every_equally_true_angle_is_marked(tmp_path: Path) -> None:
-    modes = [np.array([0.0, 2.0, 4.0]), np.array([])]
-    figure = circles([bumps((1, 0, 5))] * 2, modes=modes)
-    triangles = [sum(isinstance(line.get_marker(), tuple) for line in axes.lines) for axes in figure.axes[:2]]
-    assert triangles == [4, 1]  # and the truth
+    modes = [np.array([0.0, 2.0, 4.0]), np.array([]), np.array([])]
+    figure = circles([bumps((1, 0, 5))] * 3, modes=modes, truths=np.array([0.0, 1.0, math.nan]))
+    triangles = [sum(isinstance(line.get_marker(), tuple) for line in axes.lines) for axes in figure.axes[:3]]
+    assert triangles == [4, 1, 0]  # and the truth, where there is one
     assert "equally true" in words(figure)
     drawn(figure, tmp_path)
 
 
-def test_a_density_at_one_angle_is_cut_visibly(tmp_path: Path) -> None:
+def test_a_density_at_one_angle_is_visible(tmp_path: Path) -> None:
     figure = circles([np.where(np.arange(720) == 3, 800.0, -math.inf)])
-    (thick,) = [line for line in figure.axes[0].lines if line.get_linewidth() == 3]
-    assert np.isfinite(thick.get_xdata()).sum() == 3
+    (line,) = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 700]
+    assert line.get_linewidth() > 0  # a band would have no area
+    assert 1 + 0.39 * RING < np.hypot(*line.get_xydata().T).max() <= 1 + RING
     drawn(figure, tmp_path)
 
 
@@ -204,6 +263,26 @@ def test_wrong_numbers_of_samples_and_nan_are_refused() -> None:
         circles([bumps((1, 0, 5))], captions=["one", "two"])
     with pytest.raises(ValueError, match="NaN"):
         circles([np.full(720, math.nan)])
+
+
+# file formats
+
+KINDS = {True: b"\x89PNG", False: b"\x89PNG", "png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
+
+
+@pytest.mark.parametrize("pictures", KINDS, ids=str)
+def test_a_figure_is_saved_in_the_format_asked_for_and_the_same_again(
+    pictures: bool | str, tmp_path: Path
+) -> None:
+    contents = []
+    for again in range(2):
+        (tmp_path / f"{again}.of two").mkdir()
+        figure = titled_figure((3.0, 2.0), "a · b", True)
+        figure.subplots().plot([1, 2], [3, 4])
+        path = saved(figure, tmp_path / f"{again}.of two" / "curve", pictures)
+        contents.append(path.read_bytes())
+        assert path.name == f"curve.{pictures if isinstance(pictures, str) else 'png'}"
+    assert contents[0] == contents[1] and contents[0].startswith(KINDS[pictures])
 
 
 # training curves
@@ -253,7 +332,13 @@ CURVES = [*FIRST, *SECOND, *curve("third", "members", [(4, math.inf, math.nan, 0
 
 
 def diagram(rows: list[dict], **changed) -> Figure:
-    options = {"better": {"error": "lower"}, "title": "", "synthetic": False, "time": "ms"}
+    options = {
+        "better": {"error": "lower"},
+        "title": "",
+        "synthetic": False,
+        "time": "ms",
+        "machine": "cpu (X), 2 threads",
+    }
     return error_against_run_time(rows, {"error": "error (nats)"}, **(options | changed))
 
 
@@ -267,7 +352,7 @@ def lines_with(figure: Figure, **wanted) -> list[Line2D]:
 
 def test_the_diagram_is_logarithmic_with_units_bars_and_knob_values(tmp_path: Path) -> None:
     floor = Floor(0.004, "below 0.004 nats the reference itself is uncertain")
-    figure = diagram(CURVES, title="Diagram", synthetic=True, floors={"error": floor}, note="one core")
+    figure = diagram(CURVES, title="Diagram", synthetic=True, floors={"error": floor}, note="by hand")
     (axes,) = figure.axes
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     assert "ms per sample" in axes.get_xlabel() and "nats" in axes.get_ylabel()
@@ -279,7 +364,7 @@ def test_the_diagram_is_logarithmic_with_units_bars_and_knob_values(tmp_path: Pa
     assert notes == ["1", "10", "100", "0.001", "1e-06: error 0"]
     text = words(figure)
     assert "first (samples)" in text and "second (tolerance)" in text and "third" not in text
-    assert text.count("one core") == 1
+    assert text.count("by hand") == 1
     assert "below 0.004 nats the reference itself is uncertain" in text
     assert "not drawn for want of a finite error and run time: 1" in text
     assert "Diagram (synthetic data)" in text
@@ -327,9 +412,11 @@ def test_several_numbers_have_a_panel_each(tmp_path: Path) -> None:
         title="t",
         synthetic=True,
         time="ms",
+        machine="cpu (X), 2 threads",
     )
     shown = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_ylabel() for axes in shown] == list(labels.values())
+    assert {axes.get_xlabel() for axes in shown} == {"run time (ms per sample)\non cpu (X), 2 threads"}
     assert [axes.get_yscale() for axes in shown] == ["log", "linear", "log", "log"]
     assert figure.get_suptitle() == "t (synthetic data)"
     assert words(figure).count("first (samples)") == 1
@@ -400,7 +487,8 @@ def test_comparison_gives_methods_colours_and_groups_markers(tmp_path: Path) -> 
         "c",
         "car",
         "bus",
-        "not beaten in its class",
+        "not beaten beyond noise in its class (Pareto)",
+        "noise: errors within 2 joint standard errors, run times within 5 %",
         "finite error and run time: 1",
         "(synthetic data)",
     ):
@@ -455,3 +543,30 @@ def test_tables_import_no_torch_costs_no_matplotlib_and_pictures_no_pyplot() -> 
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("pictures, suffix", [("svg", "svg"), (True, "png")])
+def test_a_sweep_is_drawn_as_its_jobs_are_and_names_data_machine_and_what_was_varied(
+    pictures: str | bool, suffix: str, tmp_path: Path
+) -> None:
+    (tmp_path / "config.yaml").write_text(f"pictures: {pictures}\n".lower())
+    rows = [
+        {"method": method, "data": data, "mlp.widths": widths, "seed": seed, "nll": 0.5 + 0.1 * seed}
+        | {"milliseconds_per_sample": 1.0, "device": "cpu (X)", "threads": threads, "synthetic": True}
+        | {"columns": {"nll": "NLL (nats)"}, "better": {"nll": "lower"}, "folder": str(tmp_path)}
+        for method, widths, threads in (("a", "[8]", 1), ("a", "[16]", 2), ("b", None, 2))
+        for data in ("faces", "cells")
+        for seed in (0, 1)
+    ]
+    by = ["method", "data", "mlp.widths"]
+    for data in (("faces",), ("faces", "cells")):
+        some = [row for row in rows if row["data"] in data]
+        (path,) = comparison._picture(aggregate(some, by), some, by, tmp_path)
+        assert path.name == f"comparison.{suffix}"
+        if suffix == "svg":
+            said = " ".join(re.findall("<!-- (.*?) -->", path.read_text(encoding="utf-8"), re.S))
+            title = "faces: NLL (nats)" if len(data) == 1 else "2 data sets: NLL (nats)"
+            assert f"{title} against run time (synthetic data)" in said
+            assert "on cpu (X), 1 thread; cpu (X), 2 threads" in said
+            assert "a, widths=[8]" in said and "a, widths=[16]" in said and "None" not in said
+            assert ("cells" in said) is (len(data) == 2)

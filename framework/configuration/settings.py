@@ -145,7 +145,8 @@ class Settings(_Strict):
     batch_size: Positive = 64
     workers: NotNegative = 0
     samples: Positive = 1000
-    pictures: bool = True
+    pictures: Literal[True, False, "png", "pdf", "svg"] = True
+    """True is png."""
     checkpoint: str | None = None
     resume: str | None = "auto"
     experiment_name: str | None = None

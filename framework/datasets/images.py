@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,8 +13,6 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
-from rich.console import Console
-from rich.progress import Progress
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -23,6 +20,7 @@ from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.storage import reading
+from framework.storage.progress import tracked
 
 READERS = min(8, os.cpu_count() or 1)
 """So many threads decode at once."""
@@ -190,7 +188,7 @@ def load(
     """Make a data set of the crops that can be read ("input", their `fields`, "index"), and list the others' faults.
 
     In memory everything is decoded now. Otherwise only the files' headers are read, and damage further on
-    shows when a crop is used. A progress bar says that `what` is read, on a terminal.
+    shows when a crop is used.
     """
     faults: dict[int, DataError] = {}
     shape = (len(crops), crops[0].channels, crops[0].side, crops[0].side) if crops and in_memory else (0,)
@@ -205,11 +203,8 @@ def load(
         except DataError as error:
             faults[index] = error
 
-    with (
-        Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar,
-        ThreadPoolExecutor(READERS) as readers,
-    ):
-        for _ in bar.track(readers.map(visit, range(len(crops))), len(crops), description=f"Reading {what}"):
+    with ThreadPoolExecutor(READERS) as readers:
+        for _ in tracked(readers.map(visit, range(len(crops))), f"reading {what}", len(crops), "images"):
             pass
     good = [index for index in range(len(crops)) if index not in faults]
     kept = {name: field[good] if faults else field for name, field in fields.items()}

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 COLUMNS = {
-    "error_nats": "error nats",
-    "bias_nats": "bias nats",
-    "sample_error_nats": "one sample's error nats",
-    "log_likelihood_nats": "log-likelihood nats",
+    "error_nats": "error (nats)",
+    "bias_nats": "bias (nats)",
+    "sample_error_nats": "one sample's error (nats)",
+    "log_likelihood_nats": "log-likelihood (nats)",
 }
 """What `errors` tells, with the headings."""
 BETTER: Mapping[str, Literal["higher", "lower"]] = {

@@ -17,11 +17,12 @@ from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
 from framework.evaluation.cost import device_name, seconds
-from framework.evaluation.pareto import front
+from framework.evaluation.pareto import TIMES_APART, front, standard_error
 from framework.evaluation.reference import COLUMNS, LogProbs, Reference, errors, reference_value
 from framework.evaluation.splits import evaluate
 from framework.metric import Metric
 from framework.model import Model, Predictor
+from framework.storage.progress import tracked
 from framework.uncertainty import Uncertainty
 
 
@@ -160,7 +161,8 @@ def tradeoff(
         if reference is not None:
             compared = reference_value(log_probs, reference, last)
         taken = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
-        for value, seeds, time in zip(values, own, taken, strict=True):
+        turns = list(zip(values, own, taken, strict=True))
+        for value, seeds, time in tracked(turns, "measuring errors", len(turns), f"values of {knob}"):
             numbers = averaged([measured(value, repeat) for repeat in range(repeats)]) if metrics else {}
             if compared is not None:
                 numbers |= errors(log_probs, value, seeds, compared)
@@ -216,7 +218,8 @@ def rows(
     """A row per method and value, for a result table; every number that has a unit has it in its key.
 
     Args:
-        better: the metrics to tell of, and which way they are better; each gets a column "<key>_pareto".
+        better: the metrics to tell of, and which way they are better; each gets a column "<key>_pareto", true
+            on the front beyond noise (`framework.evaluation.pareto.front`).
     """
     told = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
     found: list[dict[str, object]] = []
@@ -225,7 +228,9 @@ def rows(
         best = {}
         for key, way in better.items():
             sign = 1 if way == "lower" else -1
-            best[f"{key}_pareto"] = front([sign * point.numbers[key] for point in curve.points], times)
+            found_errors = [sign * point.numbers[key] for point in curve.points]
+            noise = [standard_error(point.numbers, key, curve.repeats) for point in curve.points]
+            best[f"{key}_pareto"] = front(found_errors, times, noise, TIMES_APART)
         circumstances: dict[str, object] = {"repeats": curve.repeats}
         if curve.reference is not None:
             circumstances["reference_value"] = curve.reference.value

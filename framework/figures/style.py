@@ -1,7 +1,9 @@
-"""Colours, markers and titles of every figure."""
+"""Colours, markers, titles and file formats of every figure."""
 
 import textwrap
+from pathlib import Path
 
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -20,3 +22,16 @@ def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Fig
         title = f"{title} (synthetic data)"
     figure.suptitle(textwrap.fill(title, int(size[0] * 10)), fontsize=12, parse_math=False)
     return figure
+
+
+def saved(figure: Figure, path: Path, pictures: bool | str) -> Path:
+    """Write the figure to `path` with the suffix of its format: what the setting `pictures` names, or else PNG.
+
+    The same figure gives the same bytes; text of a PDF stays text (TrueType), of an SVG becomes outlines.
+    """
+    kind = pictures if isinstance(pictures, str) else "png"
+    path = path.with_name(f"{path.name}.{kind}")
+    dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    with rc_context({"pdf.fonttype": 42, "svg.hashsalt": path.stem}):
+        figure.savefig(path, dpi=110, metadata=dated.get(kind))
+    return path

@@ -24,6 +24,7 @@ from framework.runs.session import begin, record_citations
 from framework.runs.user_files import UNREADABLE, to_read
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
+from framework.storage.progress import Work
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
@@ -192,29 +193,32 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
     data: Data = build("data", config["data"])
     encoders: list[Encoder] = []
     written = 0
-    for number in mine:
-        if collection.path(number).is_file():
-            continue
-        files = collection.files(number)
-        dataset = data.read(files)
-        if len(dataset) != len(files):  # type: ignore[arg-type]
-            raise DataError(
-                f"{files[0]} … {files[-1]}: {len(files)} files hold {len(dataset)} samples; "  # type: ignore[arg-type]
-                "mode=encode wants one of each. Split the files."
-            )
-        batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0).of(dataset)
-        found: list[Tensor] = []
-        for batch in batches:
-            features = batch["input"]
-            if not encoders:
-                encoders = chain(config["encoder"], tuple(features.shape[1:]), data.columns)
-            for encoder in encoders:
-                features = encoder(features)
-            found.append(features)
-        content = io.BytesIO()
-        np.save(content, torch.cat(found).numpy(), allow_pickle=False)
-        write_whole(collection.path(number), content.getvalue())
-        written += 1
+    with Work("encoding", sum(len(collection.files(number)) for number in mine), "files") as work:
+        for number in mine:
+            files = collection.files(number)
+            if collection.path(number).is_file():
+                work.advance(len(files))
+                continue
+            dataset = data.read(files)
+            if len(dataset) != len(files):  # type: ignore[arg-type]
+                raise DataError(
+                    f"{files[0]} … {files[-1]}: {len(files)} files hold {len(dataset)} samples; "  # type: ignore[arg-type]
+                    "mode=encode wants one of each. Split the files."
+                )
+            batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0)
+            found: list[Tensor] = []
+            for batch in batches.of(dataset):
+                features = batch["input"]
+                if not encoders:
+                    encoders = chain(config["encoder"], tuple(features.shape[1:]), data.columns)
+                for encoder in encoders:
+                    features = encoder(features)
+                found.append(features)
+                work.advance(len(features))
+            content = io.BytesIO()
+            np.save(content, torch.cat(found).numpy(), allow_pickle=False)
+            write_whole(collection.path(number), content.getvalue())
+            written += 1
     return written
 
 

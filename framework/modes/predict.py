@@ -24,6 +24,7 @@ from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, to_read
 from framework.target import Target
+from framework.training.batches import told
 
 
 class PredictOptions(Options):
@@ -73,7 +74,7 @@ def predictions(
     loader = DataLoader(dataset, batch_size=BLOCK, collate_fn=as_batch)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
-    for number, batch in enumerate(loader):
+    for number, batch in enumerate(told(loader, "predicting")):
         draw, frame = Draw(settings.seed, number), data.frame(batch)
         prediction = predicted(predictor, batch, settings.samples, draw)
         if frame is not None:

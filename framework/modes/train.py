@@ -4,8 +4,9 @@ from framework.configuration.config import Config
 from framework.reports.report import report_test, report_training
 from framework.runs.fit import fit
 from framework.runs.job import leave_value
-from framework.runs.run import first_rank, opened
+from framework.runs.run import opened
 from framework.runs.session import calibrate, for_training
+from framework.storage.progress import first_rank
 
 
 def run(config: Config) -> float:
@@ -18,7 +19,7 @@ def run(config: Config) -> float:
         if not first_rank():
             return loss
         if epoch is not None:
-            report_training(run, kept_epoch=epoch, synthetic=session.data.synthetic)
+            report_training(run, session, kept_epoch=epoch)
         calibrate(session)
         session.save_model(run)
         report_test(run, session)

@@ -15,7 +15,7 @@ from framework.evaluation.splits import on_device
 from framework.evaluation.tradeoff import first_knob, owners, rows, tradeoff
 from framework.metric import Metric
 from framework.reports.report import picture
-from framework.reports.table import Better, csv, results_table
+from framework.reports.table import Better, csv, machine, results_table
 from framework.runs.run import Run, opened
 from framework.runs.session import Session, for_trained
 
@@ -35,7 +35,7 @@ class WorkPrecisionOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Write work_precision.csv and .png; print the table with Pareto points marked."""
+    """Write work_precision.csv and a picture; print the table with Pareto points marked."""
     options = config.options(WorkPrecisionOptions)
     session = for_trained(config)
     with opened(session.config) as run:
@@ -86,17 +86,17 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
         found,
         {key: AXIS if key == ERROR else headings[key] for key in better},
         better,
-        title=f"{name} on {', '.join(data.groups)}: {'metrics' if measured else 'error'} against run time along {knob}",
+        title=f"{session.title}: {'metrics' if measured else 'error'} against run time along {knob}",
         synthetic=data.synthetic,
         floors=floors,
-        note=f"{curve.device}, {curve.threads} threads",
+        machine=f"{machine(curve.device, curve.threads)}, batches of {curve.batch_size}",
     )
-    where = picture(run, figure, "work_precision.png")
+    where = picture(run, figure, "work_precision")
     columns = {"method": "method", "value": knob, **headings, "milliseconds_per_sample": "ms / sample"}
     for key in better:
         columns[f"{key}_pareto"] = "Pareto" if len(better) == 1 else f"Pareto: {headings[key]}"
     console = session.console
-    console.print(results_table(found, columns, title=f"{name}: {curve.samples} samples"))
+    console.print(results_table(found, columns, title=f"{session.title}, {curve.samples} test samples"))
     console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)
 
 

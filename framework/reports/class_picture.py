@@ -77,7 +77,8 @@ def classified(
         Patch(color=RED, alpha=0.5, label="wrong, and the likeliest"),
         Patch(color=BLUE, alpha=0.3, label="other"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    note = "Bars and numbers: predicted probability of the likeliest classes, and of the true one"
+    figure.legend(handles=handles, title=note, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 

@@ -27,6 +27,7 @@ class Plane:
         points, labels: of the two inputs, and their classes.
         outliers: inputs of no class, (count, 2); none where there are none.
         names: of the classes.
+        axes: names of the two inputs.
         half_width: the square shown reaches from minus to plus this around 0.
     """
 
@@ -35,6 +36,7 @@ class Plane:
     outliers: Float[np.ndarray, "others 2"]
     names: tuple[str, ...]
     half_width: float
+    axes: tuple[str, str] = ("first input", "second input")
 
 
 def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
@@ -81,6 +83,8 @@ def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, sy
             place.contour(lines, lines, found, levels=[0.5], colors="black", linewidths=0.8)
         _points(place, plane)
         place.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
+        place.set_xlabel(plane.axes[0], parse_math=False)
+        place.set_ylabel(plane.axes[1], parse_math=False)
         place.set_title(caption, fontsize=10, parse_math=False)
     for place in axes.flat[len(panels) :]:
         place.set_visible(False)

@@ -11,9 +11,10 @@ from rich.console import Console
 from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.metric import Pictured
-from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, results_table
+from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.run import Run
 from framework.runs.session import Session
+from framework.training.batches import told
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,13 +31,13 @@ def report_test(run: Run, session: Session) -> None:
     loader = blocks.test_dataloader()
     found = evaluate(
         session.predictor,
-        loader,
+        told(loader, "testing"),
         metrics,
         groups=data.groups,
         samples=settings.samples,
         seed=settings.seed,
         device=session.device,
-        outliers=() if outliers is None else blocks.of(outliers.splits().test),
+        outliers=() if outliers is None else told(blocks.of(outliers.splits().test), "testing on outliers"),
     )
     batch = next(iter(session.batches().test_dataloader()))
     spent = cost(session.predictor, batch, samples=settings.samples, device=session.device)
@@ -55,17 +56,16 @@ def report_test(run: Run, session: Session) -> None:
     if settings.pictures:
         from framework.reports.prediction_pictures import prediction_pictures
 
-        for name, figure in prediction_pictures(session, results["method"]):
+        for name, figure in prediction_pictures(session):
             picture(run, figure, name)
         for metric in found.metrics:
             if isinstance(metric, Pictured):
-                figure = metric.figure(results["experiment"], synthetic=synthetic)
-                picture(run, figure, f"{metric.picture}.png")
+                picture(run, metric.figure(session.title, synthetic=synthetic), metric.picture)
     rows = [
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
     ]
-    title = f"{results['experiment']} on {results['data']}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
+    title = f"{session.title}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
     session.console.print(
         results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
     )
@@ -77,8 +77,8 @@ def _results(
 ) -> dict[str, Any]:
     return {
         "method": session.method,
-        "experiment": run.settings.experiment_name or "no experiment",
-        "data": ", ".join(session.data.groups),
+        "experiment": run.settings.experiment_name,
+        "data": session.data_title,
         "seed": run.settings.seed,
         **{key: _plain(value) for key, value in found.total.items()},
         "groups": {
@@ -96,7 +96,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def report_training(run: Run, *, kept_epoch: int, synthetic: bool) -> None:
+def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
     """The training curve, from the journal; nothing where pictures are not wanted."""
     if not run.settings.pictures:
         return
@@ -116,24 +116,26 @@ def report_training(run: Run, *, kept_epoch: int, synthetic: bool) -> None:
         [loss for _, loss in train],
         validation,
         best_epoch=kept_epoch + 1,
-        title=run.settings.experiment_name or "training",
-        synthetic=synthetic,
+        title=f"{session.title}: training",
+        synthetic=session.data.synthetic,
     )
-    picture(run, figure, "training_curve.png")
+    picture(run, figure, "training_curve")
 
 
 def picture(run: Run, figure: "Figure", name: str) -> Path:
-    """Save a figure into the run folder and send it to the store."""
-    path = run.folder / "figures" / name
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=110)
+    """Save a figure into the run folder, in the format the settings name, and send it to the store."""
+    from framework.figures.style import saved
+
+    folder = run.folder / "figures"
+    folder.mkdir(exist_ok=True)
+    path = saved(figure, folder / name, run.settings.pictures)
     run.tracker.log_artifact(path, "figures")
     return path
 
 
 def _next_steps(run: Run, spent: Cost, console: Console) -> None:
     lines = [
-        f"measured on {spent.device}, {spent.threads} threads, batches of {spent.batch_size}; "
+        f"measured on {machine(spent.device, spent.threads)}, batches of {spent.batch_size}; "
         f"one sample alone takes {spent.latency_milliseconds:.2f} ms",
         f"run folder:    {run.folder}   (figures/, results.json, citations.bib, checkpoints/model.ckpt)",
         f"all runs:      {run.tracker.url}",

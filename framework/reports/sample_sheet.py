@@ -37,8 +37,9 @@ def sample_sheet(
         axes.set(xticks=[], yticks=[], frame_on=False)
     found: list[np.ndarray] = []
     for line, (heading, count) in zip(panels.reshape(len(rows), -1, across), rows.items(), strict=True):
-        line[0, 0].set_ylabel(heading, fontsize=11, weight="bold")
-        if count == 0:
-            line[0, 0].text(0.5, 0.5, "no such sample", ha="center", va="center", color=GREY)
+        if count:
+            line[0, 0].set_ylabel(heading, fontsize=11, weight="bold")
+        else:  # lying, since a flat row has no room for it upright
+            line[0, 0].text(0, 0.5, f"{heading}: no such sample", ha="left", va="center", color=GREY)
         found += list(line[:, :count].T)
     return figure, found

@@ -152,6 +152,11 @@ def format_number(value: int | float, spread: int | float = math.nan) -> str:
     return f"{round(value, decimals):.{kept}f} ± {round(spread, decimals):.{kept}f}"
 
 
+def machine(device: object, threads: object) -> str:
+    """Where run times were measured, for people: "cpu (AMD EPYC), 2 threads"."""
+    return f"{device}, {threads} thread{'' if threads == 1 else 's'}"
+
+
 def _plain(value: int | float) -> str:
     if isinstance(value, Integral) and abs(value) < 1e15:
         if abs(value) < 1e5:

@@ -1,6 +1,7 @@
 """Error against run time: a panel a metric, a colour a method; curves along a knob, or results side by side."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from framework.evaluation.pareto import front
+from framework.evaluation.pareto import NOISE, TIMES_APART, front, standard_error
 from framework.figures.style import COLOURS, GREY, MARKERS, titled_figure
 from framework.reports.table import SPREADS, Better, Row
 
@@ -52,8 +53,8 @@ def error_against_run_time(
     *,
     title: str,
     synthetic: bool,
+    machine: str,
     time: str = "milliseconds_per_sample",
-    x_label: str = "run time (ms per sample)",
     group: str | None = None,
     floors: Mapping[str, Floor] | None = None,
     note: str = "",
@@ -61,16 +62,17 @@ def error_against_run_time(
     """Some numbers of each result against its run time, which is logarithmic; so is an error without negative values.
 
     Rows of a method that have a "knob" are joined in their order, and the knob's "value" stands beside each point.
-    Bars are a row's "<key>_std" or "<key>_sem". Rings mark the points that no other of the same group beats: errors
-    on different groups do not compare. On a logarithmic axis 0 sits on the lower edge and says so.
+    Bars are a row's "<key>_std" or "<key>_sem". Rings mark the front of `framework.evaluation.pareto`, beyond noise, of
+    each group: errors on different groups do not compare. On a logarithmic axis 0 sits on the lower edge and says so.
 
     Args:
         rows: as for `framework.reports.table`, each with its "method".
         labels: key → label of its axis.
         better: which way a key is better; "lower" is an error.
+        machine: where the run times were measured, and with how many threads; it stands on every time axis.
         time, group: keys; without `group` all rows are one. Up to 14 methods and 12 groups look different.
         floors: of keys; shaded up to there.
-        note: what the run times were measured on.
+        note: below the picture.
     """
     across = min(ACROSS, len(labels))
     down = -(-len(labels) // across)
@@ -79,11 +81,14 @@ def error_against_run_time(
     panels = list(figure.subplots(down, across, squeeze=False).flat)
     for axes in panels[len(labels) :]:
         axes.set_visible(False)
+    width = int(11 * size[0] / across)  # letters
+    x_label = "\n".join(["run time (ms per sample)", *textwrap.wrap(f"on {machine}", width)])
     series = _series([row for row in rows if any(_drawable(row, key, time) for key in labels)], group)
     floors = floors or {}
     words = []
     for axes, (key, label) in zip(panels, labels.items(), strict=False):
-        axes.set(xscale="log", xlabel=x_label, ylabel=label)
+        axes.set(xscale="log", ylabel=label)
+        axes.set_xlabel(x_label, parse_math=False)
         words.append(_panel(axes, series, key, time, lower=better.get(key) == "lower", floor=floors.get(key)))
         left_out = len(rows) - sum(_drawable(row, key, time) for row in rows)
         if left_out:
@@ -154,8 +159,14 @@ def _panel(
             said += ["error 0"] if nothing else []
             notes += [(x, y, ": ".join(said), one.style["color"])] if said else []
     for kind in dict.fromkeys(one.group for one in series):
-        own = np.concatenate([line for one, line in zip(series, places, strict=True) if one.group == kind])
-        best = front((own[:, 1] * (1 if lower else -1)).tolist(), own[:, 0].tolist())
+        some = [place for place, one in enumerate(series) if one.group == kind]
+        own = np.concatenate([places[place] for place in some])
+        noise = [
+            standard_error(row, key, row.get("n", row.get("repeats")))
+            for place in some
+            for row in kept[place]
+        ]
+        best = front((own[:, 1] * (1 if lower else -1)).tolist(), own[:, 0].tolist(), noise, TIMES_APART)
         axes.plot(*own[best].T, **PARETO, clip_on=False)
     _plain_ticks(axes.xaxis)
     if axes.get_yscale() == "log":
@@ -174,13 +185,18 @@ def _legends(
         marker = one.style["marker"] if group is None else "o"
         label = f"{one.method} ({knobs})" if knobs else one.method
         handles.insert(0, Line2D([], [], **{**one.style, "marker": marker}, label=label))
-    beaten = "not beaten by another point" if group is None else f"not beaten in its {group}"
+    beaten = "not beaten beyond noise" + ("" if group is None else f" in its {group}")
     handles.append(Line2D([], [], **PARETO, label=f"{beaten} (Pareto)"))
     handles += [Patch(color=SHADE, label=meaning) for meaning in shaded]
-    columns = 2 if shaded else int(figure.get_figwidth() / 2.5)
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    columns = max(1, int(figure.get_figwidth() / (0.7 + 0.08 * longest)))  # inches
     style: Style = {"fontsize": 9, "frameon": False}
     legend = figure.legend(
-        handles=handles, loc="outside lower center", ncols=columns, title=note or None, **style
+        handles=handles,
+        loc="outside lower center",
+        ncols=columns,
+        title="; ".join(filter(None, [NOISE, note])),
+        **style,
     )
     legend.get_title().set(fontsize=7, color=GREY, parse_math=False)
     if group is not None:

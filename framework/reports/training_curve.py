@@ -9,6 +9,9 @@ from matplotlib.ticker import MaxNLocator
 
 from framework.figures.style import BLUE, GREEN, RED, titled_figure
 
+FEW = 30
+"""With fewer points each is marked: a line through one is nothing."""
+
 
 def training_curve(
     epochs: Sequence[int | float],
@@ -29,7 +32,8 @@ def training_curve(
     """
     figure = titled_figure((7.0, 4.3), title, synthetic)
     axes = figure.subplots()
-    axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training")
+    few = {"marker": "o", "markersize": 3.5} if len(train) < FEW else {}
+    axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training, single batches", **few)
     seen = np.array(validation, dtype=np.float64).reshape(-1, 2)
     axes.plot(*seen.T, color=RED, linewidth=1.5, marker="o", markersize=3.5, label="validation")
     values = [value for value in (*train, *seen[:, 1]) if math.isfinite(value)]
@@ -43,6 +47,7 @@ def training_curve(
     if best_epoch is not None:
         axes.axvline(best_epoch, color=GREEN, linestyle="--", label=f"kept weights: epoch {best_epoch:g}")
     axes.set(xlabel="epoch", ylabel=y_label)
+    axes.set_xlim(0, 1.03 * max([1, *epochs, *seen[:, 0]]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)

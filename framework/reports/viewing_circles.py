@@ -17,6 +17,9 @@ from framework.reports.sample_sheet import sample_sheet
 
 LARGE_ERROR = math.pi / 6  # radians; a viewpoint further off counts as wrong (Acc_{π/6} of thesis Table 3.3)
 RING = 0.5  # thickness of the ring that holds the densities, in radii of the viewing circle
+PREDICTED: dict[str, Any] = {"color": RED, "ls": ":", "linewidth": 1.2, "marker": "o", "markersize": 4}
+"""Dotted, so that a narrow density is seen below it."""
+DEGREES = ("0°", "90°", "180°", "270°")
 
 
 def choose(
@@ -57,6 +60,12 @@ def peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
     return np.maximum(starts, 1)  # an arc that is the whole circle starts nowhere
 
 
+def scale(peak: float) -> float:
+    """What the outer circle stands for, per radian: 1.5, 3, 6, 15, 30, ..., the first not below the peak."""
+    steps = (step * 10.0**power for power in range(308) for step in (1.5, 3.0, 6.0))
+    return next(step for step in steps if step >= peak)
+
+
 def viewing_circles(
     images: Sequence[np.ndarray],
     log_density: Float[np.ndarray, "points samples"],
@@ -69,24 +78,21 @@ def viewing_circles(
     rows: Mapping[str, int],
     title: str,
     synthetic: bool,
-    outer: float = 1.5,
-    directions: tuple[str, str, str, str] = ("front", "right", "back", "left"),
+    directions: Sequence[str] = (),
 ) -> Figure:
     """Predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6.
 
-    The circle is the object seen from above, its front (angle 0) at the bottom, angles counter-clockwise. A
-    density is a band outside the circle, as thick as the density is high and to one scale in all panels; an
-    outer circle cuts it, and is drawn thick where it does.
+    Angle 0 is at the bottom, angles turn counter-clockwise. A density is a band outside the circle, as thick as the
+    density is high; it ends within an outer circle, which stands for the density that is written beside it.
 
     Args:
         images: of the samples, as `Data.picture` gives them.
         log_density: nats, at `angles`, a regular grid over the whole circle, radians.
-        truths, predictions: radians.
+        truths, predictions: radians; NaN where there is no true direction, which is not drawn.
         captions: below each panel.
         modes: for each sample all angles that are as true as its truth (of a symmetric object), radians.
         rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
-        outer: density at the outer circle, per radian; the uniform density is 0.16.
-        directions: words for 0°, 90°, 180° and 270°.
+        directions: words for 0°, 90°, 180° and 270° from which an object is seen; without them these angles.
     """
     lengths = (log_density.shape[1], sum(rows.values()), len(images), len(captions))
     if len(set(lengths)) != 1:
@@ -97,27 +103,28 @@ def viewing_circles(
     size = {"least": 3, "width": 2.5, "heights": (2.75,), "flat": (0.6875,), "margin": 1.3}
     figure, panels = sample_sheet(rows, **size, title=title, synthetic=synthetic)
     for sample, (axes,) in enumerate(panels):
-        _viewing_circle(axes, images[sample], density[:, sample], angles, outer, directions)
+        _viewing_circle(axes, images[sample], density[:, sample], angles, directions)
         _marks(axes, truths[sample], predictions[sample], () if modes is None else modes[sample])
         caption = "\n".join(textwrap.fill(part, 36) for part in captions[sample].splitlines())
         axes.set_xlabel(caption, fontsize=8, labelpad=1, parse_math=False)
     handles = [
         Patch(color=BLUE, alpha=0.6, label="predicted density"),
-        Line2D([], [], color="black", linewidth=3, label=f"cut off: above {outer:g} per radian"),
+        Line2D([], [], color=GREY, label="outer circle: the density written there"),
         Line2D([], [], color=GREY, linestyle=":", label="uniform density"),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="point prediction"),
+        Line2D([], [], **PREDICTED, label="point prediction"),
         Line2D([], [], color=GREEN, marker="^", linestyle="", label="truth"),
     ]
-    if modes is not None:
+    if any(len(mode) > 1 for mode in modes or ()):
         handles.append(Line2D([], [], color=GREEN, marker="^", ls="", mfc="none", label="equally true"))
-    note = f"The object from above: {directions[0]} (0°) is at the bottom, angles turn counter-clockwise."
+    note = f"The object from above: {directions[0]} (0°)" if directions else "0°"
+    note += " is at the bottom, angles turn counter-clockwise."
     legend = figure.legend(handles=handles, title=note, loc="outside lower center", ncols=3, frameon=False)
     legend.get_title().set_parse_math(False)
     return figure
 
 
 def _viewing_circle(
-    axes: Axes, image: np.ndarray, density: np.ndarray, angles: np.ndarray, outer: float, words: Sequence[str]
+    axes: Axes, image: np.ndarray, density: np.ndarray, angles: np.ndarray, words: Sequence[str]
 ) -> None:
     height, width = image.shape[:2]
     # corners stay inside the circle, and the sides leave room for the words
@@ -125,28 +132,31 @@ def _viewing_circle(
     axes.imshow(image, extent=(-half * width, half * width, -half * height, half * height))
     limit = 1 + RING + 0.2
     axes.set(xlim=(-limit, limit), ylim=(-limit, limit))
+    outer = scale(density.max())
     around, value = np.append(angles, angles[0]), np.append(density, density[0])
-    band = np.append(1 + RING * np.minimum(value / outer, 1), np.ones_like(value))
+    band = np.append(1 + RING * value / outer, np.ones_like(value))
     axes.fill(*_position(np.append(around, around[::-1]), band), color=BLUE, alpha=0.6, linewidth=0)
-    cut = density > outer
-    cut |= np.roll(cut, 1) | np.roll(cut, -1)  # so that a single angle is a visible arc
-    edge = np.where(np.append(cut, cut[0]), 1 + RING, np.nan)
-    axes.plot(*_position(around, edge), color="black", linewidth=3, zorder=4)
+    # a single angle has no area, but a line
+    axes.plot(*_position(around, 1 + RING * value / outer), color=BLUE, linewidth=0.6)
+    axes.text(limit, 1.3, f"{outer:g} per rad", fontsize=6.5, color=GREY, ha="right", va="bottom")
     for radius, line in ((1.0, "-"), (1 + RING, "-"), (1 + RING / (2 * math.pi * outer), ":")):
         axes.add_patch(Circle((0, 0), radius, fill=False, color=GREY, linestyle=line, zorder=3))
-    for quarter, word in enumerate(words):
+    for quarter, word in enumerate(words or DEGREES):
         x, y = _position(quarter * math.pi / 2, 0.86)
-        style = {"fontsize": 6.5, "color": GREY, "rotation": 90 * (quarter % 2), "parse_math": False}
+        turn = 90 * (quarter % 2) if words else 0
+        style = {"fontsize": 6.5 if words else 6, "color": GREY, "rotation": turn, "parse_math": False}
         axes.text(x, y, word, ha="center", va="center", **style)
 
 
 def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] | np.ndarray) -> None:
     for angle, face in (*((mode, "none") for mode in modes), (truth, GREEN)):
+        if math.isnan(angle):
+            continue
         inwards = (3, 0, math.degrees(angle))  # a triangle outside the outer circle
         x, y = _position(angle, 1 + RING + 0.1)
         axes.plot(x, y, color=GREEN, marker=inwards, markerfacecolor=face, markersize=8, zorder=5)
     x, y = _position(prediction, np.array([1.0, 1 + RING]))
-    axes.plot(x, y, color=RED, linewidth=1.6, marker="o", markevery=[0], markersize=4, zorder=5)
+    axes.plot(x, y, **PREDICTED, zorder=5)
 
 
 def _position(angle: Any, radius: Any) -> tuple[Any, Any]:

@@ -12,8 +12,9 @@ from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models
 from framework.runs.loading import fill, weights
-from framework.runs.run import Run, first_rank
+from framework.runs.run import Run
 from framework.runs.session import Session
+from framework.storage.progress import first_rank
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import WholeCheckpoints, latest_good, read
 from framework.training.fitting import fit_at_once, mean_loss

@@ -19,6 +19,7 @@ from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_yaml
+from framework.storage.progress import first_rank
 from framework.tracking.run_info import read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
@@ -62,18 +63,6 @@ class Run:
     @property
     def checkpoints(self) -> Path:
         return self.folder / "checkpoints"
-
-
-def first_rank() -> bool:
-    """Whether this process keeps the run's record: the only one, or the first of several that train together.
-
-    A launcher (Lightning, torchrun, srun) says which rank this is and of how many. A rank without a number of ranks is
-    somebody else's variable.
-    """
-    for rank, ranks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS")):
-        if rank in os.environ and os.environ.get(ranks, "1") != "1":
-            return os.environ[rank] == "0"
-    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
 
 
 def stored_config(folder: Path) -> dict[str, Any] | None:

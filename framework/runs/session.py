@@ -36,9 +36,10 @@ from framework.objective import Objective
 from framework.prediction import Prediction
 from framework.runs.description import Description
 from framework.runs.loading import PREFIX, load_with_description, reader
-from framework.runs.run import Run, first_rank
+from framework.runs.run import Run
+from framework.storage.progress import first_rank, output
 from framework.target import Target
-from framework.training.batches import Batches
+from framework.training.batches import Batches, told
 from framework.training.checkpoint import WholeCheckpoints
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -77,6 +78,17 @@ class Session:
     @property
     def settings(self) -> Settings:
         return self.config.settings
+
+    @property
+    def data_title(self) -> str:
+        """What pictures and tables call the data."""
+        data = self.data
+        return data.title or (data.groups[0] if len(data.groups) == 1 else self.parts["data"]["name"])
+
+    @property
+    def title(self) -> str:
+        """What pictures and tables call the data and the model."""
+        return f"{self.data_title} · {self.method}"
 
     def batches(self, data: Data | None = None) -> Batches:
         """Of the session's data, or of what stands in for them, as they are trained on."""
@@ -127,7 +139,7 @@ def begin(settings: Settings) -> Console:
         torch.set_num_threads(settings.threads)
     keep_memory()
     quiet()
-    return Console(quiet=not first_rank())
+    return output()
 
 
 def for_training(config: Config) -> Session:
@@ -269,7 +281,8 @@ def calibrate(session: Session) -> None:
     """Fit what is not trained by gradient, on the validation set."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
-    session.predictor.calibrate(on_device(session.blocks().val_dataloader(), session.device))
+    batches = told(session.blocks().val_dataloader(), "calibrating")
+    session.predictor.calibrate(on_device(batches, session.device))
 
 
 def keep_memory() -> None:

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from framework.data import Data
 from framework.errors import DataError
+from framework.storage.progress import tracked
 
 UNREADABLE = "unreadable.txt"
 """The files that were left out, a line each."""
@@ -48,7 +49,9 @@ def to_read(
     _tell(console, "ignored, being of another kind", [file for file in files if file not in set(kept)])
     if config.get("unreadable") != "skip" and not config.get("skip_unreadable"):
         return kept, []
-    bad = [file for file in kept if not readable(data, file)]
+    bad = [
+        file for file in tracked(kept, "looking for damage", len(kept), "files") if not readable(data, file)
+    ]
     _tell(console, "left out, since they cannot be read", bad)
     if len(bad) == len(kept):
         raise DataError(f"None of {len(kept)} files can be read. Give files that the data set reads.")

@@ -2,18 +2,15 @@
 
 import json
 import shutil
-import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress
-
 from framework.errors import DataError
 from framework.storage.files import alone
 from framework.storage.plain_values import read_json
+from framework.storage.progress import tracked
 
 MARK = "synthetic.json"
 PAINTERS = 2
@@ -59,13 +56,10 @@ def read_mark(root: Path) -> dict[str, Any] | None:
 
 
 def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
-    """Call `draw` with 0 … count - 1, some at once; a progress bar says that `what` is drawn, on a terminal."""
-    with (
-        Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar,
-        ThreadPoolExecutor(PAINTERS) as painters,
-    ):
+    """Call `draw` with 0 … count - 1, some at once; `what` is drawn."""
+    with ThreadPoolExecutor(PAINTERS) as painters:
         try:
-            for _ in bar.track(painters.map(draw, range(count)), count, description=f"Drawing {what}"):
+            for _ in tracked(painters.map(draw, range(count)), f"drawing {what}", count, "files"):
                 pass
         except BaseException:
             painters.shutdown(cancel_futures=True)

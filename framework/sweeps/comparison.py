@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.console import Console
-
 from framework.configuration.settings import store_experiment
 from framework.errors import ConfigError, did_you_mean
-from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, results_table
+from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, machine, results_table
 from framework.runs.job import RECORD
+from framework.runs.run import stored_config
 from framework.storage.plain_values import read_json
+from framework.storage.progress import output
 from framework.tracking.ended import mark_dead
 from framework.tracking.tracker import MlflowTracker
 
@@ -59,8 +59,8 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 
 
 def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
-    """Compare the finished jobs in `folder`: print the table, write comparison.csv and .png, log them to the parent."""
-    console = _console()
+    """Compare the finished jobs in `folder`: print the table, log it and a picture to the parent."""
+    console = output()
     for path in folder.glob("*/run.json"):
         if _status(path.parent) == "died":
             mark_dead(path.parent)  # a killed process could not close its run
@@ -83,7 +83,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
         csv(compared, columns, folder / "comparison.csv")
         files.append(folder / "comparison.csv")
-        files.extend(_picture(compared, rows[0]["columns"], better, by, folder))
+        files.extend(_picture(compared, rows, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
     _close_parent(folder, files, compared)
 
@@ -127,7 +127,7 @@ def rank(
         **{key: key.lstrip("+").rpartition(".")[2] for key in keys},
     }
     columns |= {key: head for key, head in COST_COLUMNS.items() if any(row[key] is not None for row in rows)}
-    console = _console()
+    console = output()
     title = f"{len(trials)} trials in {folder}, best first"
     console.print(results_table(shown, columns, title=title, better={"value": better}))
     csv(shown, columns, folder / "ranking.csv")
@@ -201,11 +201,6 @@ def _better(
     return _DIRECTIONS[direction] if direction is not None else ways[metric]
 
 
-def _console() -> Console:
-    console = Console()
-    return console if console.is_terminal else Console(width=160)  # a log file has no edge to wrap at
-
-
 def _in_order(paths: Iterable[Path]) -> list[Path]:
     """By job number: 2 before 10."""
     return sorted(paths, key=lambda path: (len(path.parent.name), path.parent.name))
@@ -241,29 +236,38 @@ def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
 
 
 def _picture(
-    rows: Sequence[Mapping[str, Any]],
-    headings: Mapping[str, str],
-    better: Better,
-    by: Sequence[str],
-    folder: Path,
+    compared: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path
 ) -> list[Path]:
-    """Of the first column that says which way it is better, against run time; none where a row lacks it."""
+    """Of the first column that says which way it is better, against run time; none where a row lacks it.
+
+    Args:
+        compared: means of the `rows`, one for each value of the keys `by`: method, data, and what was varied.
+    """
+    from framework.figures.style import saved
     from framework.reports.tradeoff_picture import error_against_run_time
 
+    headings, better = rows[0]["columns"], rows[0]["better"]
     key = next((key for key in headings if key in better), None)
-    if key is None or not all(key in row for row in rows):
+    if key is None or not all(key in row for row in compared) or not all("device" in row for row in rows):
         return []
+    method, data, *varied = by
+    said = [
+        [row[method], *(f"{name.rpartition('.')[2]}={row[name]}" for name in varied if row[name] is not None)]
+        for row in compared
+    ]
+    several = len({row[data] for row in compared}) > 1
+    about = f"{len({row[data] for row in compared})} data sets" if several else compared[0][data]
     figure = error_against_run_time(
-        rows,
+        [{**row, "method": ", ".join(words)} for row, words in zip(compared, said, strict=True)],
         {key: headings[key]},
         better,
-        title=f"{headings[key][:1].upper()}{headings[key][1:]} against run time",
-        synthetic=any(row.get("synthetic") for row in rows),
-        group=by[1] if len(by) > 1 else None,
+        title=f"{about}: {headings[key]} against run time",
+        synthetic=any(row.get("synthetic") for row in compared),
+        machine="; ".join(dict.fromkeys(machine(row["device"], row["threads"]) for row in rows)),
+        group=data if several else None,
     )
-    path = folder / "comparison.png"
-    figure.savefig(path, dpi=110)
-    return [path]
+    stored = stored_config(Path(rows[0]["folder"])) or {}
+    return [saved(figure, folder / "comparison", stored.get("pictures", True))]
 
 
 def _parent(folder: Path, logger: Mapping[str, Any], run_id: str | None) -> MlflowTracker:

@@ -12,6 +12,7 @@ from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
 from framework.distributions.noise import hashed
 from framework.errors import ConfigError, DataError
+from framework.storage.progress import tracked
 
 Position = tuple[int, int]
 """(epoch, first batch within it), both from 0."""
@@ -186,3 +187,9 @@ class Batches(pl.LightningDataModule):
             epoch, first = epoch.started - 1, processed
         # Overfitting wants the same few batches every time.
         return (0 if trainer.overfit_batches else epoch), first
+
+
+def told(loader: DataLoader[Batch], what: str) -> Iterator[Batch]:
+    """Its batches; meanwhile the user is told how many samples `what` is done for."""
+    samples: int = len(loader.dataset)  # type: ignore[arg-type]
+    return tracked(loader, what, samples, "samples", lambda batch: len(batch["input"]))

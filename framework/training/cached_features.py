@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError
-from framework.training.batches import Batches
+from framework.training.batches import Batches, told
 
 LARGEST = 8 * 2**30
 """Bytes of features of one split that are held in memory; more are computed in every epoch."""
@@ -75,7 +75,7 @@ class CachedFeatures(Data):
         count: int = len(dataset)  # pyright: ignore[reportArgumentType]
         fields: dict[str, Tensor] = {}
         row = 0
-        for batch in self.batches.of(dataset):
+        for batch in told(self.batches.of(dataset), "computing features"):
             found = {**batch, "input": self.features(batch["input"])}
             for name, some in found.items():
                 if name not in fields:

@@ -211,7 +211,7 @@ class KeepCheckpoints(pl.Callback):
 
 
 class Report(pl.Callback):
-    """Sends losses and the learning rate to the tracker."""
+    """Sends losses and the learning rate to the tracker, every so many steps and at the end of an epoch."""
 
     def __init__(self, tracker: Tracker, every_steps: int) -> None:
         self.tracker = tracker
@@ -220,7 +220,7 @@ class Report(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if trainer.global_step % self.every_steps == 0 and trainer.is_global_zero:
+        if (trainer.global_step % self.every_steps == 0 or trainer.is_last_batch) and trainer.is_global_zero:
             assert isinstance(pl_module, Training)
             rate = trainer.optimizers[0].param_groups[0]["lr"]
             self.tracker.log_metrics(

@@ -164,6 +164,7 @@ class PointCloudFolder(LabelledClouds):
                 "training."
             )
         root = Path(self.root).expanduser()
+        self.title = root.resolve().name
         listed = folders.listed(root)
         kept, packed = loaded(listed, root, self.reading, "point_cloud_folder", self.unreadable)
         splits = self._drawn(kept)

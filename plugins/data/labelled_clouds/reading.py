@@ -6,7 +6,6 @@ depends on, so that a second run starts at once.
 
 import hashlib
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +15,6 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int, Int64
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -30,6 +27,7 @@ from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.storage import cache
 from framework.storage.arrays import archive
 from framework.storage.files import replacing
+from framework.storage.progress import tracked
 from framework.storage.reading import guarded, read_bytes
 
 VERSION = 1
@@ -199,12 +197,11 @@ def _key(files: Sequence[Path], root: Path, how: Reading) -> str:
 def _read_all(files: Sequence[Path], how: Reading) -> tuple[Packed, dict[int, str]]:
     """The clouds of the files that can be read, and by number what is wrong with the others."""
     clouds, faults = [], {}
-    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
-        for number in bar.track(range(len(files)), description="Reading clouds"):
-            try:
-                clouds.append(cloud(files[number], how))
-            except DataError as error:
-                faults[number] = str(error)
+    for number, file in enumerate(tracked(files, "reading clouds", len(files), "files")):
+        try:
+            clouds.append(cloud(file, how))
+        except DataError as error:
+            faults[number] = str(error)
     return Packed.of(clouds, len(how.all_columns)), faults
 
 

@@ -94,6 +94,7 @@ class Pascal3D(Data):
   year = {2014}
 }"""
     target = Target("angle", ("azimuth", "elevation", "tilt"))
+    directions = ("front", "left side", "back", "right side")
 
     suffixes = images.SUFFIXES
 
@@ -116,6 +117,8 @@ class Pascal3D(Data):
         self.variation = variation
         self.drawing = drawing
         self.input_shape = (3, framing.image_size, framing.image_size)
+        named = self.categories if len(self.categories) < 4 else (f"{len(self.categories)} classes",)
+        self.title = " ".join(["pascal3d", *named])
 
     def prepare(self) -> None:
         roots = self._roots()

@@ -69,6 +69,7 @@ class Tabular(Data):
         self.input_shape = (len(self.columns),)
         self.plane = len(self.columns) == 2
         self.groups = table.groups
+        self.title = Path(self.path or "").stem
         self.skipped = table.skipped
 
     @cached_property

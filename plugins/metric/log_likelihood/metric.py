@@ -49,7 +49,7 @@ class LogLikelihood(Moments):
   pages   = {359--378},
   year    = {2007}
 }"""
-    columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood"}
+    columns: ClassVar[dict[str, str]] = {"log_likelihood": "log-likelihood (nats)"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
 
     def update(self, prediction: Prediction) -> None:
@@ -78,7 +78,7 @@ class NegativeLogLikelihood(Moments):
   pages   = {107--114},
   year    = {1952}
 }"""
-    columns: ClassVar[dict[str, str]] = {"nll": "NLL"}
+    columns: ClassVar[dict[str, str]] = {"nll": "NLL (nats)"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"nll": "lower"}
 
     def update(self, prediction: Prediction) -> None:

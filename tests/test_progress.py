@@ -1,0 +1,73 @@
+"""What long work says: nothing soon, a bar on a terminal, lines in a log, and no word in ranks other than the first."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from framework.storage.progress import APART, SHORT, Work, tracked
+
+
+class Clock:
+    """Seconds that pass when a test says so."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def said(seconds: float, steps: int, *, terminal: bool = False, quiet: bool = False) -> str:
+    """What work of so many equal steps says that takes so long in all."""
+    clock, out = Clock(), io.StringIO()
+    console = Console(file=out, force_terminal=terminal, width=100, quiet=quiet)
+    with Work("reading [b]", steps, "files", console=console, clock=clock) as work:
+        for _ in range(steps):
+            clock.now += seconds / steps
+            work.advance()
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("steps", [1, 4, 1000])
+def test_short_work_and_other_ranks_say_nothing(terminal: bool, steps: int) -> None:
+    assert said(0.99 * SHORT, steps, terminal=terminal) == ""
+    assert said(1e4, steps, terminal=terminal, quiet=True) == ""
+
+
+def test_a_log_gets_a_line_every_half_minute() -> None:
+    assert said(0.99 * APART, 100) == ""
+    lines = said(126, 504).splitlines()  # a step is a quarter of a second
+    assert len(lines) == 4
+    assert lines[0] == "reading [b]: 120 of 504 files in 30 s"
+    assert lines[-1] == "reading [b]: 480 of 504 files in 120 s"
+    assert len(said(10 * APART, 5).splitlines()) == 5  # seldom heard of: each time
+
+
+def test_a_terminal_gets_a_bar_that_goes_away() -> None:
+    found = said(10 * SHORT, 10, terminal=True)
+    assert "reading [b]" in found and "10/10" in found and "files" in found
+    assert found.endswith("\x1b[2K")  # the line is wiped, whatever comes next stands in its place
+
+
+def test_items_pass_through_and_count_by_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, told = Clock(), []
+    monkeypatch.setattr("framework.storage.progress.time.monotonic", clock)
+    monkeypatch.setattr(Work, "advance", lambda self, count: told.append((self.what, self.total, count)))
+    assert list(tracked(["a", "bcd"], "adding", 4, "letters", len)) == ["a", "bcd"]
+    assert told == [("adding", 4, 1), ("adding", 4, 3)]
+
+
+@pytest.mark.parametrize(
+    ("variables", "first"),
+    [({}, True), ({"RANK": "1", "WORLD_SIZE": "2"}, False), ({"RANK": "0", "WORLD_SIZE": "2"}, True)],
+)
+def test_only_the_first_rank_speaks(
+    variables: dict[str, str], first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "SLURM_NTASKS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert Work("testing", 1, "samples").console.quiet is not first
