@@ -64,4 +64,13 @@ def test_a_command_of_a_readme_composes(
 
 
 def test_there_are_many() -> None:
-    assert len(ALL) > 80
+    assert len(ALL) > 70
+
+
+def test_the_readme_leads_to_every_plugin_and_every_benchmark() -> None:
+    text = READMES[0].read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 120
+    wanted = [*ROOT.glob("plugins/*/*/README.md"), *ROOT.glob("benchmarks/*.md")]
+    assert not [str(page) for page in wanted if f"({page.relative_to(ROOT)})" not in text]
+    linked = re.findall(r"\]\(((?!https)[^)]*)\)", text)
+    assert not [path for path in linked if not (ROOT / path).exists()]
