@@ -38,7 +38,7 @@ class Renderer(ABC):
     cuts, what is beyond is drawn, or nothing; a scene out of view gives the background. Where two surfaces are equally
     far, the lower face index wins.
 
-    A picture may be differentiable in whatever of its scene requires a gradient; a renderer says in what.
+    "color" may have a gradient in what of the scene requires one: `differentiable` says in what it has.
     """
 
     group: ClassVar[str] = "renderer"
@@ -48,6 +48,10 @@ class Renderer(ABC):
     """What it can draw, of: "color" (height, width, channels) float32 in [0, 1], background 0; "depth" (height, width)
     float32, metres along the optical axis, background inf; "face" (height, width) int32, index of the visible
     face, background -1; "mask" (height, width) bool."""
+
+    differentiable: ClassVar[frozenset[str]] = frozenset()
+    """In what "color" has a gradient, that of pictures of areas and not of single points, of: "vertices", "colors",
+    "rotation", "translation", "focal", "principal"."""
 
     @abstractmethod
     def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:

@@ -12,15 +12,15 @@ from framework.geometry.rotation import viewpoint_rotation
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion.
+    """A pinhole camera without distortion: OpenCV's, whose matrix K is ((fx, 0, cx), (0, fy, cy), (0, 0, 1)).
 
     A world point X is seen at pixel (fx x/z + cx, fy y/z + cy), where (x, y, z) = rotation @ X + translation.
 
     Attributes:
         rotation: world to camera, determinant +1.
         translation: metres.
-        focal: (fx, fy), pixels, > 0.
-        principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2).
+        focal: (fx, fy), pixels, > 0; a tensor where it is to be differentiated in.
+        principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2). Likewise.
         height, width: image size, pixels.
         near: nothing nearer than this is seen, metres, > 0.
     """
@@ -32,6 +32,18 @@ class Camera:
     height: int
     width: int
     near: float = 1e-3
+
+    def projected(
+        self, points: Float[Tensor, "*points 3"]
+    ) -> tuple[Float[Tensor, "*points 2"], Float[Tensor, "*points"]]:
+        """Pixels (column, row) at which world points are seen, and their depths along the optical axis, metres. Of a
+        depth that is not above 0 the pixel means nothing."""
+        seen = points @ self.rotation.to(points).T + self.translation.to(points)
+        focal, principal = (
+            torch.as_tensor(part, dtype=points.dtype, device=points.device)
+            for part in (self.focal, self.principal)
+        )
+        return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
 
 
 def look_from(

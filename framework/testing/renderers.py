@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -29,7 +30,13 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "nearer hides farther": (0.0, _hiding),
         "sphere: depth, metres": (2e-3, _sphere),
         "one pixel, one row": (0.0, _small),
+        "where the camera says": (0.0, _places),
+        "what the near plane cuts": (2e-3, _cut),
+        "gradient: 1 - cosine": (1e-2, partial(_gradient, of_length=False)),
+        "gradient: length": (0.05, partial(_gradient, of_length=True)),
     }
+    if not build().differentiable:
+        checks = {name: check for name, check in checks.items() if not name.startswith("gradient")}
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield examined(
@@ -255,3 +262,123 @@ def _small(renderer: Renderer, worst: Worst) -> None:
             worst.same(f"{name} of {height} × {width}", tuple(value.shape), shape)
             if isinstance(value, Tensor) and value.is_floating_point() and name == "color":
                 worst.finite(f"{name} of {height} × {width}", value)
+
+
+def _places(renderer: Renderer, worst: Worst) -> None:
+    """A triangle smaller than a pixel around a pixel's centre, at the depth and place that `Camera.projected` says."""
+    if "mask" not in renderer.channels:
+        worst.count(False, "draws no mask")
+        return
+    seen = camera()
+    focal, principal = (torch.tensor(part, dtype=torch.float64) for part in (seen.focal, seen.principal))
+    around = torch.tensor([[-0.4, -0.3], [0.4, -0.3], [0.0, 0.45]], dtype=torch.float64)
+    for row in range(3, SIZE[0], 7):
+        for column in range(2, SIZE[1], 9):
+            depth = 1.0 + (3 * row + column) % 5
+            pixels = torch.tensor([column, row], dtype=torch.float64) + around
+            inside = (
+                torch.cat([(pixels - principal) / focal, torch.ones(3, 1, dtype=torch.float64)], -1) * depth
+            )
+            world = (inside - seen.translation.double()) @ seen.rotation.double()
+            place, far = seen.projected(world)
+            worst.count(
+                bool((place - pixels).abs().max() > 1e-4), f"pixel {row, column}: projected to {place}"
+            )
+            worst.count(bool((far - depth).abs().max() > 1e-4), f"pixel {row, column}: depth {far}")
+            faces = torch.tensor([[0, 1, 2], [0, 2, 1]])  # from either side
+            mask = renderer(Scene(world.float(), faces, None, seen), ("mask",))["mask"]
+            found = mask.nonzero().tolist()
+            worst.count(found != [[row, column]], f"pixel {row, column}: drawn at {found}")
+
+
+def _cut(renderer: Renderer, worst: Worst) -> None:
+    """A floor that goes on behind the camera: its depth, relative, where it is drawn; or nothing is drawn."""
+    if "depth" not in renderer.channels:
+        worst.count(False, "draws no depth")
+        return
+    seen = replace(camera(), rotation=torch.eye(3), translation=torch.zeros(3), near=0.5)
+    vertices = torch.tensor([[-90.0, 1, -50], [90, 1, -50], [90, 1, 50], [-90, 1, 50]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])
+    depth = renderer(Scene(vertices, faces, None, seen), ("depth",))["depth"].double()
+    if not depth.isfinite().any():
+        return
+    down = (torch.arange(SIZE[0], dtype=torch.float64) - seen.principal[1]) / seen.focal[1]
+    true = (1 / down).where(down > 0, math.inf)[:, None].expand(SIZE)
+    clear = (true > 0.6) & (true < 40)
+    off = (depth / true - 1).abs().nan_to_num(math.inf)
+    worst.see(
+        off.where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m, wanted {true[at].item():.6g}"
+    )
+    worst.count(depth.isfinite() & (true > 60), "pixels above the floor's end are drawn")
+
+
+PART = 4
+"""Pictures along each axis, moved by parts of a pixel, whose mean stands for one of areas."""
+
+
+def _gradient(renderer: Renderer, worst: Worst, *, of_length: bool) -> None:
+    """Of a weighted sum of pixels, against its differences; in each parameter in which the renderer is differentiable
+    one direction. Weights that change slowly from pixel to pixel leave the grid of pixels no say."""
+    scene = sphere()
+    row, column = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
+    weight = torch.stack(
+        [(row / 9 + channel).sin() * (column / 11 - channel).cos() for channel in range(3)], -1
+    )
+    seen = scene.camera
+    assert scene.colors is not None
+    given = {
+        "vertices": scene.vertices.double(),
+        "colors": scene.colors.double(),
+        "rotation": seen.rotation.double(),
+        "translation": seen.translation.double(),
+        "focal": torch.tensor(seen.focal, dtype=torch.float64),
+        "principal": torch.tensor(seen.principal, dtype=torch.float64),
+    }
+    turn = torch.tensor([[0.0, -1, 0.3], [1, 0, -0.2], [-0.3, 0.2, 0]], dtype=torch.float64)
+    shape = given["vertices"]
+    ways = {
+        "vertices": 0.4 * shape[:, [1, 2, 0]].square() + torch.tensor([0.2, 0.1, 0.3], dtype=torch.float64),
+        "colors": shape.flip(-1).sin(),
+        "rotation": turn @ given["rotation"],
+        "translation": torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64),
+        "focal": torch.tensor([10.0, 8.0], dtype=torch.float64),
+        "principal": torch.tensor([3.0, -4.0], dtype=torch.float64),
+    }
+
+    def loss(step: torch.Tensor, name: str, parts: int) -> torch.Tensor:
+        at = {key: value + step * ways[key] if key == name else value for key, value in given.items()}
+        offsets = (torch.arange(parts) + 0.5) / parts - 0.5
+        drawn = [
+            renderer(
+                Scene(
+                    at["vertices"],
+                    scene.faces,
+                    at["colors"],
+                    replace(
+                        seen,
+                        rotation=at["rotation"],
+                        translation=at["translation"],
+                        focal=at["focal"],
+                        principal=at["principal"] + torch.stack([x, y]),
+                    ),
+                )
+            )["color"]
+            for x in offsets
+            for y in offsets
+        ]
+        return (torch.stack(drawn).mean(0) * weight).sum()
+
+    found, wanted = [], []
+    for name in sorted(renderer.differentiable):
+        step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+        found.append(torch.autograd.grad(loss(step, name, PART), step)[0].item())
+        with torch.no_grad():
+            ends = [loss(torch.tensor(sign * 0.05, dtype=torch.float64), name, 4 * PART) for sign in (1, -1)]
+        wanted.append((ends[0] - ends[1]).item() / 0.1)
+    one, other = torch.tensor(found), torch.tensor(wanted)
+    said = ", ".join(
+        f"{name} {a:.4g} for {b:.4g}" for name, a, b in zip(sorted(ways), found, wanted, strict=False)
+    )
+    length = float(one.norm() / other.norm())
+    cosine = float((one @ other) / one.norm() / other.norm())
+    worst.see(torch.tensor([abs(length - 1) if of_length else 1 - cosine]), lambda at: said)

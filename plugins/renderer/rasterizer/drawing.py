@@ -1,5 +1,6 @@
 """One picture of one scene as a differentiable operation on tensors: compiled kernels forwards and backwards."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ class View:
 
     Attributes:
         faces: (faces, 3) int32 or int64.
+        beside: gives `gradient.neighbours` of them, when they are asked for.
         near: metres.
         size: (height, width), pixels.
         cull: leave out faces seen from behind.
@@ -27,6 +29,7 @@ class View:
     """
 
     faces: np.ndarray
+    beside: Callable[[], np.ndarray]
     near: float
     size: tuple[int, int]
     cull: bool
@@ -151,10 +154,11 @@ def backward(
                 drawn.seen,
                 drawn.screen,
                 view.faces,
+                view.beside(),
+                colors,
                 lens,
                 drawn.face,
                 drawn.depth,
-                drawn.color,
                 drawn.box,
                 along_color,
                 of_seen,

@@ -13,10 +13,28 @@ from typing import no_type_check
 
 import numpy as np
 
-from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled
+from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled, weights_in_space
 
+MOST_FACES = 1000
+"""That lie between two neighbouring pixels, at most."""
 FLATTEST = 1e-12
 """Of Σ m, relative to its terms: what is flatter is seen edge-on, and has no slope that says anything."""
+
+
+def neighbours(faces):
+    """The face beyond each edge of each face, (faces, 3), edge i from corner i to the next; -1 where there is none, or
+    more than one."""
+    start, end = faces.astype(np.int64), np.roll(faces, -1, 1).astype(np.int64)
+    key = (np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)).ravel()
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    same = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
+    # exactly two alike in a row
+    first = np.flatnonzero(same[1:-1] & ~same[:-2] & ~same[2:])
+    beside = np.full(len(key), -1, np.int64)
+    beside[order[first]] = order[first + 1] // 3
+    beside[order[first + 1]] = order[first] // 3
+    return beside.reshape(-1, 3)
 
 
 @compiled
@@ -115,8 +133,8 @@ def interior(seen, faces, colors, lens, face, box, along_color, along_depth, of_
 
 @compiled
 @no_type_check
-def boundary(seen, screen, faces, lens, face, depth, color, box, along_color, of_seen, of_lens):
-    """Add to `of_seen` and `of_lens` what edges hand over where they move."""
+def boundary(seen, screen, faces, beside, colors, lens, face, depth, box, along_color, of_seen, of_lens):
+    """Add to `of_seen` and `of_lens` what edges hand over where they move; `beside` as `neighbours` says."""
     height, width = face.shape
     top, bottom = max(box[0] - 1, 0), min(box[1] + 1, height)
     left, right = max(box[2] - 1, 0), min(box[3] + 1, width)
@@ -130,7 +148,20 @@ def boundary(seen, screen, faces, lens, face, depth, color, box, along_color, of
                     continue
                 if parted(depth[row, column], depth[other_row, other_column], footprint):
                     pixels = (row, column, other_row, other_column)
-                    pair(pixels, seen, screen, faces, lens, face, depth, color, along_color, of_seen, of_lens)
+                    pair(
+                        pixels,
+                        seen,
+                        screen,
+                        faces,
+                        beside,
+                        colors,
+                        lens,
+                        face,
+                        depth,
+                        along_color,
+                        of_seen,
+                        of_lens,
+                    )
 
 
 @compiled
@@ -142,55 +173,88 @@ def parted(depth, other, footprint):
 
 @compiled
 @no_type_check
-def pair(pixels, seen, screen, faces, lens, face, depth, color, along_color, of_seen, of_lens):
+def pair(pixels, seen, screen, faces, beside, colors, lens, face, depth, along_color, of_seen, of_lens):
     """What one pair of neighbouring pixels sees of the edge between them, if there is one."""
     row, column, other_row, other_column = pixels
     if depth[other_row, other_column] < depth[row, column]:  # the nearer one first
         row, column, other_row, other_column = other_row, other_column, row, column
+    # on the way from one pixel to the other, from face to face, to where the nearer surface ends or turns away
     index = face[row, column]
-    a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-    if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
-        return  # cut by the near plane
-    # whichever way round the face is seen, its inside is on the positive side of its edges
-    turn = 1.0 if side(screen, a, b, screen[c, 1] / SUBPIXELS, screen[c, 0] / SUBPIXELS) > 0 else -1.0
-    # where the way from one pixel to the other leaves the nearer face: the least crossing of its three edges
-    share, first, second = 2.0, -1, -1
-    for corner in range(3):
-        a, b = faces[index, corner], faces[index, (corner + 1) % 3]
-        inside = turn * side(screen, a, b, row, column)
-        outside = turn * side(screen, a, b, other_row, other_column)
-        if outside < 0 <= inside:
-            crossing = inside / (inside - outside)
-            if crossing < share:
-                share, first, second = crossing, a, b
-    if first < 0:
-        return
-    if face[other_row, other_column] >= 0:
-        # a surface that goes on is no edge: the farther one must lie behind the crossing by more than it may rise
-        ray_x = (column + share * (other_column - column) - lens[2]) / lens[0]
-        ray_y = (row + share * (other_row - row) - lens[3]) / lens[1]
-        near = depth_at(seen, faces, index, ray_x, ray_y)
-        far = np.float64(depth[other_row, other_column])
-        beyond = depth_at(seen, faces, face[other_row, other_column], ray_x, ray_y)
-        if not far - near > 2 * abs(far - beyond) + far / min(lens[0], lens[1]):
+    facing = turn(screen, faces, index)
+    for _ in range(MOST_FACES):
+        corner, share = leaves(screen, faces, index, facing, row, column, other_row, other_column)
+        if corner < 0 or share >= 1:
             return
-    handed = 0.0
-    for channel in range(color.shape[2]):
-        slope = np.float64(along_color[row, column, channel]) + along_color[other_row, other_column, channel]
-        handed += 0.5 * slope * (color[row, column, channel] - color[other_row, other_column, channel])
-    if handed == 0:
-        return
+        following = beside[index, corner]
+        if following < 0 or turn(screen, faces, following) * facing <= 0:
+            break
+        index = following
+    first, second = faces[index, corner], faces[index, (corner + 1) % 3]
     in_row = other_row == row
     axis = 0 if in_row else 1
     # the crossing's place between the edge's ends, along the other axis
     start, end = screen[first, 1 - axis], screen[second, 1 - axis]
     if start == end:
         return
-    part = ((row if in_row else column) * SUBPIXELS - start) / (end - start)
-    part = min(max(part, 0.0), 1.0)
+    part = min(max(((row if in_row else column) * SUBPIXELS - start) / (end - start), 0.0), 1.0)
+    of_first, of_second = (1 - part) * screen[first, 2], part * screen[second, 2]
+    near = 1.0 / (of_first + of_second)
+    behind = face[other_row, other_column]
+    ray_x = (column + share * (other_column - column) - lens[2]) / lens[0]
+    ray_y = (row + share * (other_row - row) - lens[3]) / lens[1]
+    w0 = w1 = w2 = 0.0
+    a = b = c = 0
+    if behind >= 0:
+        # a surface that goes on is no edge: the farther one must lie behind the crossing by more than it may rise
+        far = np.float64(depth[other_row, other_column])
+        beyond = depth_at(seen, faces, behind, ray_x, ray_y)
+        if not far - near > 2 * abs(far - beyond) + far / min(lens[0], lens[1]):
+            return
+        a, b, c = faces[behind, 0], faces[behind, 1], faces[behind, 2]
+        w0, w1, w2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
+    handed = 0.0
+    for channel in range(colors.shape[1]):
+        # colours where the edge is: towards it that of a surface that turns away changes fast
+        step = near * (of_first * colors[first, channel] + of_second * colors[second, channel])
+        if behind >= 0:
+            step -= w0 * colors[a, channel] + w1 * colors[b, channel] + w2 * colors[c, channel]
+        # the area that changes hands is part of the pixel in which the edge lies
+        slope = (
+            along_color[row, column, channel]
+            if share < 0.5
+            else along_color[other_row, other_column, channel]
+        )
+        handed += np.float64(slope) * step
     outwards = handed * ((other_column - column) + (other_row - row))
     along(seen, first, axis, outwards * (1 - part), lens, of_seen, of_lens)
     along(seen, second, axis, outwards * part, lens, of_seen, of_lens)
+
+
+@compiled
+@no_type_check
+def turn(screen, faces, index):
+    """Twice the area of a face on the screen, above 0 where its inside is on the positive side of its edges (`side`);
+    0 of one that the near plane cuts."""
+    a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+    if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
+        return 0.0
+    return (screen[b, 0] - screen[a, 0]) * (screen[c, 1] - screen[a, 1]) - (screen[c, 0] - screen[a, 0]) * (
+        screen[b, 1] - screen[a, 1]
+    )
+
+
+@compiled
+@no_type_check
+def leaves(screen, faces, index, facing, row, column, other_row, other_column):
+    """By which edge the way from a pixel to another leaves a face, and at which share of the way; -1 if by none."""
+    share, found = np.inf, -1
+    for corner in range(3):
+        a, b = faces[index, corner], faces[index, (corner + 1) % 3]
+        inside = side(screen, a, b, row, column)
+        outside = side(screen, a, b, other_row, other_column)
+        if (inside - outside) * facing > 0 and inside / (inside - outside) < share:
+            share, found = inside / (inside - outside), corner
+    return found, share
 
 
 @compiled

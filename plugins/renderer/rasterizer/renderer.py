@@ -1,6 +1,8 @@
 """A differentiable rasteriser on one CPU core; the contract is framework.renderer's."""
 
+import weakref
 from collections.abc import Collection
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -14,6 +16,7 @@ from framework.geometry.camera import Camera
 from framework.renderer import Renderer, Scene
 from plugins.renderer.rasterizer import raster
 from plugins.renderer.rasterizer.drawing import Gradient, Picture, View
+from plugins.renderer.rasterizer.gradient import neighbours
 
 CHANNELS = ("color", "depth", "face", "mask")
 
@@ -36,6 +39,7 @@ class Rasterizer(Renderer):
     """
 
     channels = frozenset(CHANNELS)
+    differentiable = frozenset(("vertices", "colors", "rotation", "translation", "focal", "principal"))
     bibtex = """@article{pineda1988parallel,
   author = {Pineda, Juan},
   title = {A parallel algorithm for polygon rasterization},
@@ -64,6 +68,7 @@ class Rasterizer(Renderer):
         self.cull = cull
         self.gradient: Gradient = gradient
         self.supersampling = supersampling
+        self._known: tuple[weakref.ref[Tensor], int, np.ndarray] | None = None
 
     def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
         check_channels(channels)
@@ -90,7 +95,7 @@ class Rasterizer(Renderer):
         wanted = frozenset(channels)
         times = self.supersampling if "color" in wanted else 1
         once = wanted - {"color"} if times > 1 else wanted
-        given = (scene.camera, vertices, faces, colors, lens)
+        given = (scene, vertices, faces, colors, lens)
         drawn = self._drawn(*given, once, 1) if once else {}
         if times > 1:
             drawn |= self._drawn(*given, frozenset({"color"}), times)
@@ -98,7 +103,7 @@ class Rasterizer(Renderer):
 
     def _drawn(
         self,
-        camera: Camera,
+        scene: Scene,
         vertices: Tensor,
         faces: np.ndarray,
         colors: Tensor | None,
@@ -107,9 +112,11 @@ class Rasterizer(Renderer):
         times: int,
     ) -> dict[str, Tensor]:
         """The channels, with so many samples a pixel along each axis."""
+        camera = scene.camera
         size = (camera.height * times, camera.width * times)
         near = max(float(camera.near), raster.NEAREST)
-        view = View(faces, near, size, self.cull, channels, self.gradient)
+        beside = partial(self._neighbours, scene.faces, faces)
+        view = View(faces, beside, near, size, self.cull, channels, self.gradient)
         if times > 1:  # the middle of pixel 0 is that of its samples
             lens = torch.cat([lens[:2] * times, (lens[2:] + 0.5) * times - 0.5])
         shown = colors if "color" in channels else None
@@ -118,6 +125,12 @@ class Rasterizer(Renderer):
         if times > 1:
             drawn["color"] = avg_pool2d(drawn["color"].movedim(-1, 0), times).movedim(0, -1)
         return {name: drawn[name] for name in channels}
+
+    def _neighbours(self, tensor: Tensor, faces: np.ndarray) -> np.ndarray:
+        """Of the faces that came as `tensor`; kept for the next picture of the same mesh, which may have moved."""
+        if self._known is None or self._known[0]() is not tensor or self._known[1] != tensor._version:
+            self._known = (weakref.ref(tensor), tensor._version, neighbours(faces))
+        return self._known[2]
 
 
 def check_channels(channels: Collection[str]) -> None:
