@@ -1,9 +1,11 @@
-"""What the contract of density heads is worth: python benchmarks/check.py [seeds, 50 by default]
+"""What the contract of density heads is worth: python benchmarks/check.py [seeds, 50 by default] [more]
 
 Finds the planted faults of tests/planted_faults.py, and counts false alarms: every row of every head that is shipped,
-over seeds of everything that is drawn. Writes check.md beside this file.
+over seeds of everything that is drawn. Writes check.md beside this file. With `more` it goes on where that file ends,
+which is fair as long as the code is the same.
 """
 
+import re
 import sys
 import time
 from pathlib import Path
@@ -17,18 +19,19 @@ from framework.testing import finding
 from framework.testing.contract import contract
 from tests.planted_faults import ALL_FAULTS
 
+PAGE = Path(__file__).with_suffix(".md")
 
-def faults() -> tuple[list[str], int]:
-    """A line of the table for each planted fault, and how many were found."""
-    lines, found = [], 0
+
+def faults() -> list[str]:
+    """A line of the table for each planted fault."""
+    lines = []
     for fault in ALL_FAULTS:
         failed = list(dict.fromkeys(one.name for one in fault.findings() if not one.holds))
-        found += bool(failed)
         lines.append(
             f"| {fault.name} | {len(fault.target.names)} {fault.target.kind} | {', '.join(failed) or '**missed**'} |"
         )
         sys.stdout.write(lines[-1] + "\n")
-    return lines, found
+    return lines
 
 
 def alarms(seed: int) -> list[str]:
@@ -47,12 +50,13 @@ def alarms(seed: int) -> list[str]:
     return failed
 
 
-def write(lines: list[str], found: int, seeds: int, failed: dict[str, list[int]], seconds: float) -> None:
+def write(lines: list[str], seeds: int, failed: dict[str, list[int]], minutes: float) -> None:
     rows = sum(len(contract("density_head", name).rows) for name in installed("density_head"))
     told = [f"- seeds {', '.join(map(str, at))}: {what}" for what, at in failed.items()]
+    found = sum("**missed**" not in line for line in lines)
     text = f"""# What `mode=check` finds in density heads
 
-`python benchmarks/check.py`: {machine("torch")} {seconds / 60:.0f} minutes.
+`python benchmarks/check.py`: {machine("torch")} {minutes:.0f} minutes.
 
 **Planted faults: {found} of {len(lines)} found ({100 * found / len(lines):.1f} %).** A sound head is changed in one
 thing; the third column names every property that fails.
@@ -65,20 +69,41 @@ thing; the third column names every property that fails.
 
 {chr(10).join(told)}
 """
-    Path(__file__).with_suffix(".md").write_text(text.rstrip() + "\n", encoding="utf-8")
+    PAGE.write_text(text.rstrip() + "\n", encoding="utf-8")
+
+
+def written() -> tuple[list[str], int, dict[str, list[int]], float]:
+    """What an earlier run has written: as `write` takes it."""
+    text = PAGE.read_text(encoding="utf-8")
+    lines = [
+        line
+        for line in text.splitlines()
+        if line.startswith("| ") and not line.startswith(("| fault", "| ---"))
+    ]
+    (seeds,) = re.findall(r"shipped heads × (\d+) seeds", text)
+    (minutes,) = re.findall(r"(\d+) minutes\.$", text, re.MULTILINE)
+    told = re.findall(r"^- seeds ([\d, ]+): (.*)$", text, re.MULTILINE)
+    return (
+        lines,
+        int(seeds),
+        {what: [int(seed) for seed in at.split(", ")] for at, what in told},
+        float(minutes),
+    )
 
 
 def main() -> None:
     torch.set_num_threads(1)
     start = time.perf_counter()
-    lines, found = faults()
-    failed: dict[str, list[int]] = {}
-    for seed in range(int(sys.argv[1]) if len(sys.argv) > 1 else 50):
+    if "more" in sys.argv:
+        lines, first, failed, before = written()
+    else:
+        lines, first, failed, before = faults(), 0, {}, 0.0
+    for seed in range(first, int(sys.argv[1]) if len(sys.argv) > 1 else 50):
         for one in alarms(seed):
             sys.stdout.write(f"seed {seed}: {one}\n")
             failed.setdefault(one.partition(" FAILS")[0], []).append(seed)
         # after each seed, so that what was found is kept when it is ended
-        write(lines, found, seed + 1, failed, time.perf_counter() - start)
+        write(lines, seed + 1, failed, before + (time.perf_counter() - start) / 60)
 
 
 if __name__ == "__main__":

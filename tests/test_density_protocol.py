@@ -34,6 +34,7 @@ from framework.distributions.protocol import (
     peaks,
     pick,
     scales,
+    slope,
     tempered,
     value_set,
 )
@@ -224,6 +225,7 @@ def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow
             if "power" not in kind:  # which is of the density, not of what is inside
                 draws(kind, made, density)
             closed_forms(kind, made, density, value)
+            bounds(made, density, value)
             never_silently_exact(density, theirs[kind], value)
             if row.target.kind != "class":
                 here = marginal(density, 0)
@@ -376,6 +378,26 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
         elif kind == "moved there and back":
             close(humps, wanted[0])
     assert (value_set(density) is density) if kind == "with a set" else value_set(density) is None
+
+
+def bounds(made: Made, density: Distribution, value: Tensor) -> None:
+    """slope: where the parts know theirs, the density's own, and what it promises of the density elsewhere."""
+    found = slope(density, value)
+    if any(slope(part, made.value) is None for part in made.parts):
+        assert found is None
+        return
+    close(found.log_prob, density.log_prob(value), 1e-12)
+    with torch.enable_grad():
+        leaf = value.clone().requires_grad_()
+        (wanted,) = torch.autograd.grad(density.log_prob(leaf).sum(), leaf)
+    close(found.pull, wanted)
+    for size in (1e-3, 0.1, 1.0, 3.0):
+        d = size * torch.randn(value.shape, dtype=value.dtype, generator=torch.Generator().manual_seed(5))
+        angles = made.target.kind == "angle"
+        away = 2 * (d / 2).sin().square() if angles else d.square() / 2
+        gain = (found.pull * (d.sin() if angles else d) - found.stiffness * away).sum(-1)
+        scale = 1 + found.log_prob.abs() + (found.stiffness.abs() * away).sum(-1)
+        assert (density.log_prob(value + d) - found.log_prob >= gain - 1e-12 * scale).all()
 
 
 def features(drawn: Tensor, made: Made) -> Tensor:

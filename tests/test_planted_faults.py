@@ -1,9 +1,18 @@
 """`mode=check` finds every planted fault, and nothing in the sound heads that they are planted in."""
 
 import pytest
+import torch
 
+from framework.configuration.schema import build, resolve
+from framework.distributions.density import Mixture
 from framework.target import Target
-from framework.testing.finding import require
+from framework.testing.adaptive import boxes
+from framework.testing.finding import Worst, require
+from framework.testing.heads import HeadSubject
+from framework.testing.precision import reference
+from plugins.density_head.latent.decoder import LatentDecoder
+from plugins.density_head.latent.rows import ROWS
+from plugins.density_head.von_mises.density import VonMises
 from tests.planted_faults import ALL_FAULTS
 from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE, THREE, TWO, Fault
 
@@ -26,3 +35,40 @@ def test_the_sound_head_passes_and_every_property_has_a_fault_of_its_own(target:
     findings = list(Fault("none", target, {}).findings())
     require(*findings)
     assert {finding.name for finding in findings} <= ALONE
+
+
+@pytest.mark.parametrize("name", ["scvae", "cvae"])
+def test_the_rounding_of_a_network_is_no_error_and_a_coarser_one_is(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row, forward = ROWS[name][0], LatentDecoder.forward
+    config = resolve("density_head", {"name": name, **row.config})
+    subject = HeadSubject(row, lambda: build("density_head", config, target=row.target))
+
+    def error() -> float:
+        worst = Worst()
+        reference(subject, worst, torch.float32)
+        return worst.error
+
+    assert error() < 2e-6
+
+    def coarse(decoder: LatentDecoder, raw: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        found = forward(decoder, raw, z)
+        return found * (1 + 3e-5) if found.dtype == torch.float32 else found
+
+    monkeypatch.setattr(LatentDecoder, "forward", coarse)
+    assert error() > 2e-6
+
+
+def test_ridges_that_no_peak_lies_on_are_integrated() -> None:
+    """Narrow in one number and broad in the other, of little weight, far from the main one; across it and along."""
+    location = torch.tensor([[[2.93, 0.47], [1.69, 1.83]], [[0.6, 0.3], [-2.5, -0.8]]], dtype=torch.float64)
+    concentration = torch.tensor(
+        [[[1.5e4, 1.0], [3.3e4, 1.0]], [[1.0, 1e8], [1e5, 1.0]]], dtype=torch.float64
+    )
+    weights = torch.tensor([[2e-3, 1.0], [1.0, 5e-4]], dtype=torch.float64).log()
+    density = Mixture(weights, VonMises(location, concentration))
+    found = boxes(density)
+    torch.testing.assert_close(
+        found.mean(torch.ones_like(found.log_prob)), torch.ones(2, dtype=torch.float64), atol=1e-6, rtol=0
+    )

@@ -10,6 +10,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    Slope,
     about,
     arc,
     cdf,
@@ -21,6 +22,7 @@ from framework.distributions.protocol import (
     peaks,
     pick,
     scales,
+    slope,
     tempered,
 )
 
@@ -240,6 +242,26 @@ def _(density: Reshaped) -> Normals | None:
     if parts is None:
         return None
     return Normals(*(number.reshape(*density.batch_shape, number.shape[-1]) for number in parts))
+
+
+@slope.register
+def _(density: Stacked, value: Tensor) -> Slope | None:
+    parts = [slope(one, part) for one, part in density.apart(value)]
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    log_prob, *others = zip(*known, strict=True)
+    return Slope(torch.stack(log_prob, -1), *(torch.stack(each, -2) for each in others))
+
+
+@slope.register
+def _(density: Reshaped, value: Tensor) -> Slope | None:
+    flat, shape = density.inner(value)
+    found = slope(density.density, flat)
+    if found is None:
+        return None
+    log_prob, *others = found
+    return Slope(log_prob.reshape(shape), *(each.reshape(*shape, *density.event_shape) for each in others))
 
 
 @peaks.register

@@ -9,6 +9,7 @@ from torch.distributions import Categorical, Distribution, Independent, Multivar
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    Slope,
     about,
     estimate,
     exactly,
@@ -18,6 +19,7 @@ from framework.distributions.protocol import (
     normals,
     one_normal,
     pick,
+    slope,
     take,
     tempered,
 )
@@ -83,6 +85,15 @@ def _(density: Independent, index: Tensor) -> Distribution:
         return pick.dispatch(Distribution)(density, index)
     loc, scale = (take(parameter, index) for parameter in (base.loc, base.scale))
     return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+
+@slope.register
+def _(density: Independent, value: Tensor) -> Slope | None:
+    base = density.base_dist
+    if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
+        return None
+    stiffness = base.scale.square().reciprocal().expand(torch.broadcast_shapes(value.shape, base.scale.shape))
+    return Slope(density.log_prob(value), (base.loc - value) * stiffness, stiffness)
 
 
 @about.register

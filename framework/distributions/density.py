@@ -9,10 +9,12 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, circular, grid
+from framework.distributions.highest import crossings, highest
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    Slope,
     about,
     arc,
     cdf,
@@ -24,6 +26,7 @@ from framework.distributions.protocol import (
     peaks,
     pick,
     scales,
+    slope,
     take,
     with_error,
 )
@@ -45,6 +48,9 @@ __all__ = [
 circular_entropy = entropy_of_one
 CHUNK = 2**20
 """Component densities evaluated at once without gradient, when one density is asked at many points."""
+
+CROSSED = 16
+"""Most components of which every two are looked at together for the mode."""
 
 
 class Mixture(Distribution):
@@ -113,14 +119,17 @@ class Mixture(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """The likeliest class; or the component mode at which the density is highest (exact where they are apart)."""
+        """The likeliest class; of one component its mode; otherwise a top of the density (`highest`)."""
+        event = len(self.event_shape)
+        if self.log_weights.shape[-1] == 1:
+            return self.components.mode.squeeze(-1 - event)
         if self.has_enumerate_support:
             support = self.enumerate_support()
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
-        modes = self.components.mode.movedim(-1 - len(self.event_shape), 0)  # (K, *batch, *event)
-        best = self.log_prob(modes).argmax(0)
-        index = best.reshape(1, *best.shape, *(1,) * len(self.event_shape))
-        return modes.gather(0, index.expand(1, *best.shape, *self.event_shape)).squeeze(0)
+        modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
+        if self.event_shape.numel() > 1 and len(modes) <= CROSSED:
+            return highest(self, torch.cat([modes, crossings(self.components, modes)]))
+        return highest(self, modes)
 
     @property
     def mean(self) -> Tensor:
@@ -262,6 +271,17 @@ def _(density: Mixture, value: Tensor) -> Tensor | None:
         return None
     found = mahalanobis(density.components, value.unsqueeze(-2))
     return None if found is None else found.squeeze(-1)
+
+
+@slope.register
+def _(density: Mixture, value: Tensor) -> Slope | None:
+    parts = slope(density.components, value.unsqueeze(-1 - len(density.event_shape)))
+    if parts is None:
+        return None
+    log_terms = density.log_weights + parts.log_prob
+    share = log_terms.softmax(-1).unsqueeze(-1)
+    means = (torch.where(share > 0, share * part, 0.0).sum(-2) for part in parts[1:])
+    return Slope(torch.logsumexp(log_terms, -1), *means)
 
 
 @peaks.register

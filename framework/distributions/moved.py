@@ -9,6 +9,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.protocol import (
     Estimate,
     Normals,
+    Slope,
     about,
     cdf,
     estimate,
@@ -19,6 +20,7 @@ from framework.distributions.protocol import (
     peaks,
     pick,
     scales,
+    slope,
     take,
     tempered,
 )
@@ -143,6 +145,15 @@ def _(density: Moved) -> Normals | None:
 @mahalanobis.register
 def _(density: Moved, value: Tensor) -> Tensor | None:
     return mahalanobis(density.density, density.inner(value))
+
+
+@slope.register
+def _(density: Moved, value: Tensor) -> Slope | None:
+    found = slope(density.density, density.inner(value))
+    if found is None:
+        return None
+    pull, stiffness = found.pull / density.scale, found.stiffness / density.scale.square()
+    return Slope(found.log_prob - density.log_volume, pull, stiffness)
 
 
 @peaks.register

@@ -290,6 +290,26 @@ def scales(density: Distribution) -> Tensor:
     return (-density.log_prob(places).double()).exp() / math.sqrt(2 * math.pi)
 
 
+class Slope(NamedTuple):
+    """log_prob (*sample, *batch), its gradient `pull` and a `stiffness`, both (*sample, *batch, *event)."""
+
+    log_prob: Tensor
+    pull: Tensor
+    stiffness: Tensor
+
+
+@singledispatch
+def slope(density: Distribution, value: Tensor) -> Slope | None:
+    """A bound from below that touches log p at `value` y (*sample, *batch, *event); None: not known, the default.
+
+    With pull g and stiffness h, of reals log p(y + d) ≥ log p(y) + Σ (g d - h d²/2), h > 0, and of angles
+    log p(y + d) ≥ log p(y) + Σ (g sin d - h (1 - cos d)), whatever d. A mixture has both as means over its components,
+    weighted by what each has of p(y) (Jensen), so a step to the bound's top never leads down (Dempster, Laird & Rubin
+    1977).
+    """
+    return None
+
+
 class ValueSet(ABC):
     """The values, one set for each item of the batch, among which the target is said to lie."""
 

@@ -10,7 +10,7 @@ from torch.distributions import Categorical, Distribution, constraints
 
 from framework.distributions.circular import Circular, grid, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import Estimate, estimate, peaks, tempered, with_error
+from framework.distributions.protocol import Estimate, Slope, estimate, peaks, slope, tempered, with_error
 from framework.errors import UserError
 
 POINTS, MOST_POINTS = 1024, 2**15
@@ -202,6 +202,15 @@ class CircularPower(Distribution):
         """Angles of the grid, (points, *batch, 1), the first at the mode."""
         turn = grid(points, dtype=self.start.dtype, device=self.start.device) + math.pi
         return self.start + turn.reshape(points, *(1,) * self.start.dim())
+
+
+@slope.register
+def _(density: CircularPower, value: Tensor) -> Slope | None:
+    found = slope(density.density, value)
+    if found is None:
+        return None
+    pull, stiffness = (part / density.temperature.to(part) for part in found[1:])
+    return Slope(density.power_of(found.log_prob), pull, stiffness)
 
 
 @estimate.register

@@ -15,10 +15,13 @@ from framework.distributions.protocol import peaks
 
 RULES = {1: (10, 6), 2: (8, 5)}
 """Gauss-Legendre points a side; a box whose two sums differ is split."""
-TOLERANCE = {1: 1e-10, 2: 1e-6}
+TOLERANCE = {1: 1e-10, 2: 1e-8}
 ROUNDS = {1: 60, 2: 40}
 MOST = {1: 128, 2: 48}
 """Boxes of a batch row split in one round."""
+MOST_PEAKS = 64
+HIDDEN = 2.0
+"""A box is split where its integrand is known to be so many times what it is at the highest node."""
 REACH = 36.0
 """Values are mode + a sinh(s), a the density's own width: of reals to sinh 36 = 2e15 widths, of angles half a turn."""
 
@@ -160,12 +163,13 @@ def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
 def boxes(density: Distribution) -> Boxes:
     """The density of one or two numbers, batch_shape (rows,), in boxes on which two rules agree.
 
-    Peaks are found by candidates: the mode, `peaks`, draws, and for angles a sweep of the circle. A box is also split
-    while a candidate in it is far above the box's mean density.
+    Peaks are found by candidates: the mode, `peaks` and draws. A box is also split while it hides one, or a ridge.
     """
-    candidates = [density.mode.unsqueeze(0), peaks(density)[:64], density.sample(torch.Size((24,)))]
-    seen = torch.cat([part.double() for part in candidates])
+    humps = peaks(density)[:MOST_PEAKS].double()
+    drawn = density.sample(torch.Size((24,))).double()
+    seen = torch.cat([density.mode.unsqueeze(0).double(), humps, drawn])
     way = _Map(density, seen)
+    humps = way.back(humps)
     numbers = way.mode.shape[1]
     height = way.log_prob(seen)
     place = way.back(seen)
@@ -174,7 +178,7 @@ def boxes(density: Distribution) -> Boxes:
     length = way.ends[1] - way.ends[0]
     low = way.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
     high = way.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
-    parts = _summed(way, low, high, place, height)
+    parts = _summed(way, low, high, place, height, humps)
     # float32 does not agree with itself to more digits
     tolerance = TOLERANCE[numbers] if density.log_prob(density.mode).dtype == torch.float64 else 1e-4
     for _ in range(ROUNDS[numbers]):
@@ -183,14 +187,10 @@ def boxes(density: Distribution) -> Boxes:
             break
         split = min(split, MOST[numbers])
         order = parts[3].argsort(0, descending=True)
-        low, high = (_taken(part, order[:split]) for part in parts[:2])
-        middle = (low + high) / 2
-        lows, highs = [], []
-        for corner in product((False, True), repeat=numbers):
-            upper = torch.tensor(corner)
-            lows.append(torch.where(upper, middle, low))
-            highs.append(torch.where(upper, high, middle))
-        fresh = _summed(way, torch.cat(lows), torch.cat(highs), place, height)
+        low, high, across = (_taken(parts[index], order[:split]) for index in (0, 1, 4))
+        middle = torch.where(across, (low + high) / 2, math.nan)
+        halves = torch.cat([low, middle.fmax(low)]), torch.cat([middle.fmin(high), high])
+        fresh = _summed(way, *halves, place, height, humps)
         parts = tuple(
             torch.cat([_taken(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
         )
@@ -215,22 +215,80 @@ def _nodes(way: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, T
 
 
 def _summed(
-    way: _Map, low: Tensor, high: Tensor, place: Tensor, height: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Borders, masses (box, rows) and how urgent it is to split each."""
-    sums = []
-    for points in RULES[low.shape[-1]]:
+    way: _Map, low: Tensor, high: Tensor, place: Tensor, height: Tensor, humps: Tensor
+) -> tuple[Tensor, ...]:
+    """Borders and masses (box, rows), how urgent it is to split each, and the number in which (box, rows, number).
+
+    Urgent are boxes whose two sums differ, and those where a candidate, or what is known of a peak, is far above every
+    node.
+    """
+    numbers = low.shape[-1]
+    sums, highest, rough = [], torch.zeros_like(low[..., 0]), torch.zeros_like(low)
+    for points in RULES[numbers]:
         _, log_prob, weight = _nodes(way, low, high, points)
-        sums.append((weight * log_prob.exp()).sum(1))
-    gap = (sums[0] - sums[1]).abs()
-    # a candidate far above what the box has for its mean: a peak between the nodes
+        share = weight * log_prob.exp()
+        sums.append(share.sum(1))
+        even = share / _rule(points, numbers)[1][:, None]  # had the node the whole box
+        highest = torch.maximum(highest, even.nan_to_num().amax(1))
+        if points == RULES[numbers][0]:
+            rough = _roughness(even.nan_to_num(), points, numbers)
+    size = (high - low).prod(-1)
     inside = ((place.unsqueeze(1) >= low) & (place.unsqueeze(1) <= high)).all(-1)  # (candidate, box, rows)
     _, volume = way.to(place)
-    peak = torch.where(inside, (height.exp() * volume).unsqueeze(1), 0.0).amax(0) * (high - low).prod(-1)
-    hidden = torch.where(peak > 16 * sums[0].abs(), peak.clamp(max=1.0), 0.0)
-    wide = (high - low).amax(-1) > 1e-13  # narrower ones hold a peak that float64 does not resolve
-    urgency = torch.maximum(gap, hidden)
-    return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0)
+    peak = torch.where(inside, (height.exp() * volume).unsqueeze(1), 0.0).amax(0) * size
+    # beside a peak split in its longest number, across a ridge
+    known = torch.cat([peak.unsqueeze(0), _known(way, low, high, humps) * size])
+    hidden, which = torch.where(known > HIDDEN * highest, known.clamp(max=1.0), 0.0).max(0)
+    longest = (high - low).argmax(-1)
+    number = torch.where(which < 2, longest, which - 2)
+    number = torch.where(hidden > 0, number, rough.argmax(-1))
+    across = torch.nn.functional.one_hot(number, numbers).bool()
+    # narrower ones hold a peak that float64 does not resolve
+    wide = (high - low).where(across, 0.0).amax(-1) > 1e-13
+    urgency = torch.maximum((sums[0] - sums[1]).abs(), hidden)
+    return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0), across
+
+
+def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
+    """How much of the integrand (box, node, rows) the two highest polynomials of each number hold, (box, rows, number):
+    where it is most, nodes are too few."""
+    if numbers == 1:
+        return torch.zeros_like(integrand[:, :1]).movedim(1, -1)
+    grid = integrand.unflatten(1, (points, points))
+    highest = _highest_polynomials(points)
+    return torch.stack(
+        [
+            torch.einsum("kn,bnmr->bkmr", highest, grid).abs().sum((1, 2)),
+            torch.einsum("kn,bmnr->bkmr", highest, grid).abs().sum((1, 2)),
+        ],
+        -1,
+    )
+
+
+def _highest_polynomials(points: int) -> Tensor:
+    """Node values → coefficients of the Legendre polynomials of the two highest degrees, (2, points)."""
+    node, weight = np.polynomial.legendre.leggauss(points)
+    values = np.polynomial.legendre.legvander(node, points - 1)[:, -2:]
+    found = weight[:, None] * values * np.arange(2 * points - 3, 2 * points, 2)
+    return torch.from_numpy(np.ascontiguousarray(found.T))
+
+
+def _known(way: _Map, low: Tensor, high: Tensor, humps: Tensor) -> Tensor:
+    """The highest integrand that the density's peaks tell of, (what, box, rows): at the box's nearest point to one; of
+    two numbers also with one number there and the other in the middle, since a peak narrow in one number and broad in
+    the other is a ridge, and crosses boxes that have no peak in them."""
+    numbers = low.shape[-1]
+    near = humps.unsqueeze(1).clamp(low, high)  # (peak, box, rows, number)
+    middle = ((low + high) / 2).expand_as(near)
+    probes = [near]
+    for number in range(numbers if numbers > 1 else 0):
+        here = torch.arange(numbers) == number
+        probes.append(torch.where(here, near, middle))
+    found = []
+    for probe in probes:
+        value, volume = way.to(probe.flatten(0, 1))
+        found.append((way.log_prob(value).exp() * volume).reshape(near.shape[:-1]).nan_to_num().amax(0))
+    return torch.stack(found)
 
 
 def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:

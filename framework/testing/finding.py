@@ -8,10 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 SEED = 20260
+
+
+def seed(number: int) -> None:
+    """Seeds what a check draws, which is all on the processor."""
+    # Not torch.manual_seed: for every device that is not in use it formats the stack, 0.5 ms in all.
+    torch.default_generator.manual_seed(number)
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,8 @@ class Worst:
         index = int(flat.argmax())  # that of the first NaN, if there is one
         if not flat[index].item() <= self.error and not math.isnan(self.error):
             self.error = flat[index].item()
-            at = tuple(int(number) for number in torch.unravel_index(torch.tensor(index), error.shape))
+            # torch's own imports a symbolic algebra, 0.4 s
+            at = tuple(int(number) for number in np.unravel_index(index, error.shape))
             self.case = case if isinstance(case, str) else case(at)
 
     def count(self, wrong: Tensor | bool, case: str) -> None:
@@ -129,7 +137,7 @@ def at_most(seconds: float) -> Iterator[None]:
 def examined(name: str, limit: float, look: Callable[[Worst], None], *, seconds: float = 20.0) -> Finding:
     """The finding of one check: whatever it raises, or its not ending, is an infinite error."""
     worst = Worst()
-    torch.manual_seed(SEED)
+    seed(SEED)
     try:
         with at_most(seconds):
             look(worst)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from framework.testing.finding import SEED, Worst
+from framework.testing.finding import SEED, Worst, seed
 from framework.testing.heads import HeadSubject, as_type, seeded
 
 
@@ -27,7 +27,7 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
                 value[4:] = seeded(head, raw[4:]).sample()
 
         def loss(raw: Tensor = raw, value: Tensor = value) -> Tensor:
-            torch.manual_seed(SEED)
+            seed(SEED)
             return head.loss(raw, value)
 
         arguments = {"raw numbers": raw}
@@ -66,9 +66,9 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
                 )
 
 
-def _directions(argument: Tensor, raw: bool, size: float, seed: int) -> Iterator[tuple[str, Tensor]]:
+def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterator[tuple[str, Tensor]]:
     """A random direction of length 1, and of few raw numbers each by itself."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(number)
     direction = torch.randn(argument.shape, dtype=argument.dtype, generator=generator)
     if size <= 3:  # far out, numbers of very different reach are not stepped along together
         yield "", direction / (direction.norm(dim=-1, keepdim=True) if raw else direction.norm())

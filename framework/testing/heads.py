@@ -3,10 +3,10 @@
 What the head's densities must satisfy is in framework.testing.densities.
 """
 
-import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from framework.distributions.circular import Circular
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import median
 from framework.target import Target
-from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.finding import SEED, Finding, Worst, examined, seed
 from framework.testing.rows import HeadRow
 
 BATCH_SHAPES = ((), (4,), (3, 2), (0,))
@@ -50,13 +50,19 @@ class HeadSubject:
 
     def make(self) -> DensityHead:
         """A fresh head in evaluation mode."""
-        torch.manual_seed(SEED)
+        seed(SEED)
         return self.build().eval()
+
+    @cached_property
+    def size(self) -> int:
+        """How many raw numbers a head reads."""
+        with torch.random.fork_rng(devices=[]):
+            return self.make().size
 
     def raws(self, *batch: int) -> Tensor:
         """Seeded normal raw numbers (*batch, size), float32."""
         generator = torch.Generator().manual_seed(SEED)
-        return torch.randn(*batch, self.make().size, generator=generator)
+        return torch.randn(*batch, self.size, generator=generator)
 
     def values(self, *batch: int) -> Tensor:
         """Seeded targets: angles over several turns, reals of size 1, labels."""
@@ -68,8 +74,8 @@ class HeadSubject:
             with torch.no_grad():
                 head, raw, value = self.make(), self.raws(4), self.values(4)
                 found = []
-                for seed in (0, 1):
-                    torch.manual_seed(seed)
+                for number in (0, 1):
+                    seed(number)
                     found.append(head(raw).log_prob(value))
             return not torch.equal(*found)
         except Exception:  # the checks themselves say what
@@ -96,6 +102,7 @@ def values(target: Target, batch: tuple[int, ...]) -> Tensor:
 def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     """Every property of the head itself, cheapest first."""
     from framework.testing.gradients import gradient, proper
+    from framework.testing.precision import precision, reference
 
     checks = (
         ("batch shapes", 0.0, _shapes),
@@ -110,9 +117,9 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("calibrate does not harm", 1e-5, _calibrated),
         ("loss gradient", 1e-6, gradient),
         ("loss is least for its own density", 6.0, proper),
-        ("float32 against float64", 32.0, _precision),
-        ("log_prob, float64", 1e-12, lambda subject, worst: _reference(subject, worst, torch.float64)),
-        ("log_prob, float32", 2e-6, lambda subject, worst: _reference(subject, worst, torch.float32)),
+        ("float32 against float64", 32.0, precision),
+        ("log_prob, float64", 1e-12, lambda subject, worst: reference(subject, worst, torch.float64)),
+        ("log_prob, float32", 2e-6, lambda subject, worst: reference(subject, worst, torch.float32)),
     )
     for name, limit, check in checks:
         if name in subject.row.leave_out or (name.startswith("log_prob") and subject.row.cases is None):
@@ -194,7 +201,7 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
     raw, value = subject.raws(4), subject.values(4)
 
     def everything(head: DensityHead) -> dict[str, Tensor]:
-        torch.manual_seed(SEED)
+        seed(SEED)
         density = head.eval()(raw)
         return {
             "log_prob": density.log_prob(value),
@@ -219,10 +226,10 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
         head, raw, value = subject.make(), subject.raws(4), subject.values(4)
         raw[[0, 1, 3]] *= factor
         with torch.no_grad():
-            torch.manual_seed(SEED)
+            seed(SEED)
             density = head(raw)
             found.append({"log_prob": density.log_prob(value)[2], "mode": density.mode[2].float()})
-            torch.manual_seed(SEED)
+            seed(SEED)
             found[-1]["loss"] = head.train().loss(raw, value)[2]
     for name, alone in found[0].items():
         gap = (found[1][name] - alone).abs() > 1e-5 * alone.abs().clamp(min=1)
@@ -243,12 +250,12 @@ def _round_trip(subject: HeadSubject, worst: Worst) -> None:
         head.calibrate(raw, value)
         for name, parameter in head.named_parameters():
             worst.same_bits(f"parameter {name} after calibrate", parameter, before[name])
-        torch.manual_seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
+        seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
         other = subject.build().eval()
         other.load_state_dict(head.state_dict())
-        torch.manual_seed(SEED)
+        seed(SEED)
         first = head(raw).log_prob(value)
-        torch.manual_seed(SEED)
+        seed(SEED)
         worst.same_bits("log_prob of the stored state", other(raw).log_prob(value), first)
 
 
@@ -258,12 +265,12 @@ def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
     with torch.no_grad():
         found = {}
         for number in (1, 2):
-            torch.manual_seed(SEED)
+            seed(SEED)
             density = head(raw) if number == 1 else Mixture(torch.zeros(4, 1), head(raw.unsqueeze(-2)))
             found[number] = {"log_prob": density.log_prob(value), "mode": density.mode}
-            torch.manual_seed(SEED)
+            seed(SEED)
             found[number]["entropy"] = density.entropy()
-            torch.manual_seed(SEED)
+            seed(SEED)
             found[number]["sample"] = density.sample(torch.Size((3,)))
         for name, alone in found[1].items():
             worst.same_bits(name, found[2][name], alone)
@@ -318,64 +325,10 @@ def _calibrated(subject: HeadSubject, worst: Worst) -> None:
     worst.see(loss, f"{before.item():.6g} before, {after.item():.6g} after")
 
 
-def _precision(subject: HeadSubject, worst: Worst) -> None:
-    """log_prob in float32 against the same head in float64, at the same numbers; error in float32 epsilons.
-
-    Relative to max(1, |log p|) and to what a rounding of the raw numbers or of an angle changes, Σ|r ∂log p/∂r| +
-    Σ max(|φ|, π)|∂log p/∂φ|: what is left is cancellation inside.
-    """
-    single = subject.make()
-    double = copy.deepcopy(single).double()
-    for size in (1e-8, 1e-3, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6):
-        raw = size * subject.raws(64)
-        with torch.no_grad():
-            at_mode = seeded(single, raw).mode
-        for where, value in (("the mode", at_mode), ("a random value", subject.values(64))):
-            with torch.no_grad():
-                found = seeded(single, raw).log_prob(value).double()
-            exact_raw = raw.double().requires_grad_()
-            arguments = [exact_raw]
-            if value.is_floating_point():
-                value = value.double().requires_grad_()
-                arguments.append(value)
-            exact = seeded(double, exact_raw).log_prob(value)
-            slopes = torch.autograd.grad(exact.sum(), arguments)
-            scale = exact.detach().abs().clamp(min=1) + (slopes[0] * exact_raw).abs().sum(-1).detach()
-            if len(slopes) > 1:
-                least = math.pi if subject.row.target.kind == "angle" else 0.0
-                scale = scale + (slopes[1].abs() * value.detach().abs().clamp(min=least)).sum(-1)
-            error = (found - exact.detach()).abs() / scale / torch.finfo(torch.float32).eps
-            worst.see(
-                error,
-                lambda at, size=size, where=where, found=found, exact=exact: (
-                    f"at {where}, raw numbers of size {size:g}: {found[at].item():.9g}, "
-                    f"in float64 {exact[at].item():.9g}"
-                ),
-            )
-
-
 def seeded(head: DensityHead, raw: Tensor) -> Distribution:
     """The density with the same random numbers, if it draws any, each time."""
-    torch.manual_seed(SEED)
+    seed(SEED)
     return head(raw)
-
-
-def _reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
-    """log_prob of the row's cases; error relative to max(1, |reference|)."""
-    assert subject.row.cases is not None
-    head = subject.make().double()
-    cases = list(subject.row.cases(head))
-    head = head.to(dtype)
-    for case in cases:
-        with torch.no_grad():
-            found = seeded(head, case.raw.to(dtype)).log_prob(as_type(case.value, dtype)).double()
-        error = (found - case.log_prob).abs() / case.log_prob.abs().clamp(min=1)
-        worst.see(
-            error,
-            lambda at, case=case, found=found: (
-                f"{case.name}: {found[at].item():.9g}, reference {case.log_prob[at].item():.9g}"
-            ),
-        )
 
 
 def as_type(value: Tensor, dtype: torch.dtype) -> Tensor:

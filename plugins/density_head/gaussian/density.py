@@ -10,6 +10,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.protocol import (
     Normals,
+    Slope,
     about,
     estimate,
     exactly,
@@ -19,6 +20,7 @@ from framework.distributions.protocol import (
     normals,
     one_normal,
     pick,
+    slope,
     take,
     tempered,
 )
@@ -141,6 +143,19 @@ def _(density: Gaussian, index: Tensor) -> Gaussian:
         size = coefficients.shape[-1]
         coefficients = take(coefficients.flatten(-2), index).unflatten(-1, (size, size))
     return Gaussian(take(density.location, index), take(density.scale, index), coefficients)
+
+
+@slope.register
+def _(density: Gaussian, value: Tensor) -> Slope:
+    residual = value - density.location
+    stiffness = density.scale.square().reciprocal().expand(residual.shape)
+    if density.coefficients is None:
+        return Slope(density.log_prob(value), -residual * stiffness, stiffness)
+    # Σ⁻¹ = Aᵀ A, A = (I - φ)/σ; a diagonal that exceeds it has the sums of its rows' sizes (Gershgorin)
+    identity = torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
+    root = (identity - density.coefficients) / density.scale.unsqueeze(-1)
+    pull = -(root.mT @ (root @ residual.unsqueeze(-1))).squeeze(-1)
+    return Slope(density.log_prob(value), pull, (root.mT @ root).abs().sum(-1).expand(residual.shape))
 
 
 @about.register

@@ -11,6 +11,7 @@ from framework.distributions.density import merged
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
+    Slope,
     about,
     arc,
     estimate,
@@ -19,6 +20,7 @@ from framework.distributions.protocol import (
     peaks,
     pick,
     scales,
+    slope,
     tempered,
 )
 from framework.distributions.tempering import tempered_classes
@@ -105,6 +107,18 @@ def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
     if inside is None or below is None:
         return None
     return (1 - density.weight) * inside + density.weight * below
+
+
+@slope.register
+def _(density: Floored, value: Tensor) -> Slope | None:
+    if isinstance(density.support, Circular) and density.support.ranges is not None:
+        return None  # where the floor itself has a slope
+    found = slope(density.density, value)
+    if found is None:
+        return None
+    log_prob, above = density.floored(value, found.log_prob)
+    share = (above - log_prob).exp().unsqueeze(-1)
+    return Slope(log_prob, share * found.pull, share * found.stiffness)
 
 
 @peaks.register

@@ -7,6 +7,7 @@ from torch.distributions import Distribution, constraints, register_kl
 
 from framework.distributions.circular import circular
 from framework.distributions.protocol import (
+    Slope,
     about,
     arc,
     estimate,
@@ -14,6 +15,7 @@ from framework.distributions.protocol import (
     marginal,
     median,
     pick,
+    slope,
     take,
     tempered,
     turn,
@@ -87,6 +89,13 @@ def _(density: VonMises, index: int) -> VonMises:
 @pick.register
 def _(density: VonMises, index: Tensor) -> VonMises:
     return VonMises(take(density.location, index), take(density.concentration, index))
+
+
+@slope.register
+def _(density: VonMises, value: Tensor) -> Slope:
+    # the bound is the density: κ cos(φ + d - μ) = κ cos(φ-μ) cos d - κ sin(φ-μ) sin d
+    log_prob, pull, stiffness = functions.slope(value, density.location, density.concentration)
+    return Slope(log_prob.sum(-1), pull, stiffness)
 
 
 @about.register

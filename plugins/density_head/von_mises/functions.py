@@ -160,6 +160,13 @@ def _value_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tup
     return height - concentration * (2 * square), concentration * (2 * product), deviation - 2 * square
 
 
+def slope(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """log p, -κ sin(φ-μ) and κ cos(φ-μ), without gradient."""
+    square, product = half_products(value, mean)
+    log_prob = log_height(concentration) - concentration * (2 * square)
+    return log_prob, -2 * concentration * product, concentration * (1 - 2 * square)
+
+
 def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     """-2κ sin²((φ-μ)/2), which is κ(cos(φ-μ) - 1)."""
     sine, _ = half_angle(value, mean)

@@ -1,0 +1,92 @@
+"""Log-densities of a head to their last digits: against the row's reference, and in float32 against float64."""
+
+import copy
+import math
+
+import torch
+from torch import Tensor
+
+from framework.density_head import DensityHead
+from framework.testing.finding import Worst
+from framework.testing.heads import HeadSubject, as_type, seeded
+
+
+def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
+    """log_prob of the row's cases; error relative to max(1, |reference|).
+
+    A head that computes with parameters of its own cannot but round on the way, once for each: what that changes, to
+    first order, is no error of its. One without is given its numbers exactly, and must not lose them.
+    """
+    assert subject.row.cases is not None
+    head = subject.make().double()
+    cases = list(subject.row.cases(head))
+    change = [torch.zeros_like(case.log_prob) for case in cases]
+    if dtype != torch.float64 and any(part.requires_grad for part in head.parameters()):
+        change = [rounded(subject, head, case.raw, case.value, parameters=True)[1] for case in cases]
+    head = head.to(dtype)
+    for case, allowed in zip(cases, change, strict=True):
+        with torch.no_grad():
+            found = seeded(head, case.raw.to(dtype)).log_prob(as_type(case.value, dtype)).double()
+        gap = (found - case.log_prob).abs() - torch.finfo(dtype).eps * allowed
+        error = gap.clamp(min=0) / case.log_prob.abs().clamp(min=1)
+        worst.see(
+            error,
+            lambda at, case=case, found=found: (
+                f"{case.name}: {found[at].item():.9g}, reference {case.log_prob[at].item():.9g}"
+            ),
+        )
+
+
+def precision(subject: HeadSubject, worst: Worst) -> None:
+    """log_prob in float32 against the same head in float64, at the same numbers; error in float32 epsilons.
+
+    Relative to max(1, |log p|) and to what a rounding of the raw numbers or of an angle changes: what is left is
+    cancellation inside.
+    """
+    single = subject.make()
+    double = copy.deepcopy(single).double()
+    for size in (1e-8, 1e-3, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6):
+        raw = size * subject.raws(64)
+        with torch.no_grad():
+            at_mode = seeded(single, raw).mode
+        for where, value in (("the mode", at_mode), ("a random value", subject.values(64))):
+            with torch.no_grad():
+                found = seeded(single, raw).log_prob(value).double()
+            exact, change = rounded(subject, double, raw.double(), value)
+            scale = exact.abs().clamp(min=1) + change
+            error = (found - exact).abs() / scale / torch.finfo(torch.float32).eps
+            worst.see(
+                error,
+                lambda at, size=size, where=where, found=found, exact=exact: (
+                    f"at {where}, raw numbers of size {size:g}: {found[at].item():.9g}, "
+                    f"in float64 {exact[at].item():.9g}"
+                ),
+            )
+
+
+def rounded(
+    subject: HeadSubject, head: DensityHead, raw: Tensor, value: Tensor, parameters: bool = False
+) -> tuple[Tensor, Tensor]:
+    """log_prob of a float64 head, and what a relative rounding of its numbers changes, Σ|r ∂log p/∂r| + Σ max(|φ|,
+    π)|∂log p/∂φ|, with the same of the parameters where asked; in units of the rounding."""
+    arguments = {"raw": raw.clone().requires_grad_()}
+    if value.is_floating_point():
+        arguments["value"] = value.double().requires_grad_()
+    log_prob = seeded(head, arguments["raw"]).log_prob(arguments.get("value", value))
+    own = [part for part in head.parameters() if part.requires_grad] if parameters else []
+    change = torch.zeros_like(log_prob)
+    slopes = torch.autograd.grad(log_prob.sum(), list(arguments.values()), retain_graph=bool(own))
+    least = {"value": math.pi if subject.row.target.kind == "angle" else 0.0}
+    for (name, argument), slope in zip(arguments.items(), slopes, strict=True):
+        size = argument.detach().abs().clamp(min=least.get(name, 0.0))
+        change = change + (slope.abs() * size).sum(-1)
+    if own:  # shared by all rows of the batch
+        for row, one in enumerate(log_prob):
+            of_one = torch.autograd.grad(one, own, retain_graph=True, allow_unused=True)
+            parts = [
+                (slope * part).abs().sum()
+                for part, slope in zip(own, of_one, strict=True)
+                if slope is not None
+            ]
+            change[row] = change[row] + sum(parts)
+    return log_prob.detach(), change.detach()

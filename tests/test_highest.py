@@ -1,0 +1,142 @@
+"""The mode of a mixture: a top of the density, against brute force."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal
+
+from framework.distributions.batch_shapes import Stacked
+from framework.distributions.density import Mixture
+from plugins.density_head.gaussian.density import Gaussian
+from plugins.density_head.von_mises.density import VonMises
+
+ITEMS = 40
+KINDS = ("angles", "reals", "torch's normals", "correlated reals")
+
+
+def mixture(kind: str, numbers: int, components: int, seed: int, dtype: torch.dtype) -> Mixture:
+    """Components from far apart to one on another, from broad to narrow, of unequal weights."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.randn(ITEMS, *shape, dtype=torch.float64, generator=generator)
+
+    center = 2 * drawn(1, 1).abs() * drawn(components, numbers)
+    log_scale = 1.2 * drawn(components, numbers) - 1
+    weights = drawn(components).to(dtype)
+    center, scale = center.to(dtype), log_scale.exp().to(dtype)
+    if kind == "angles":
+        return Mixture(weights, VonMises(center, scale.square().reciprocal()))
+    if kind == "reals":
+        return Mixture(weights, Gaussian(center, scale))
+    if kind == "torch's normals":
+        return Mixture(
+            weights, Independent(Normal(center, scale, validate_args=False), 1, validate_args=False)
+        )
+    coefficients = drawn(components, numbers, numbers).tril(-1).to(dtype)
+    return Mixture(weights, Gaussian(center, scale, coefficients))
+
+
+def everywhere(density: Distribution, kind: str) -> Tensor:
+    """The greatest log-density on a grid and about the components, (items,)."""
+    ends, points = (math.pi, 3001) if kind == "angles" else (12.0, 6001)
+    numbers = density.event_shape[0]
+    axis = torch.linspace(-ends, ends, points if numbers == 1 else 101, dtype=torch.float64)
+    grid = torch.cartesian_prod(*[axis] * numbers).reshape(-1, 1, numbers).expand(-1, ITEMS, numbers)
+    with torch.no_grad():
+        return density.log_prob(grid).amax(0)
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    st.sampled_from(KINDS),
+    st.sampled_from([1, 2, 4]),
+    st.integers(1, 6),
+    st.integers(0, 2**31),
+    st.sampled_from([torch.float32, torch.float64]),
+)
+def test_the_mode_is_no_lower_than_any_component_s_nor_than_what_is_near(
+    kind: str, numbers: int, components: int, seed: int, dtype: torch.dtype
+) -> None:
+    density = mixture(kind, numbers, components, seed, dtype)
+    mode = density.mode
+    assert mode.shape == (ITEMS, numbers) and mode.dtype == dtype
+    height = density.log_prob(mode)
+    modes = density.components.mode.movedim(1, 0)
+    assert (height >= density.log_prob(modes)).all()
+    if components == 1:
+        assert torch.equal(mode, modes[0])
+        return
+    # correlated numbers are climbed in small steps: they promise no more than not to be lower
+    if kind != "correlated reals" or numbers == 1:
+        wide = mixture(kind, numbers, components, seed, torch.float64)
+        directions = torch.randn(
+            64, 1, numbers, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+        )
+        limit = 1e-5 if numbers == 1 else 2e-3  # nats; the steps that it takes are counted
+        for size in (1e-4, 1e-2, 0.1):
+            near = wide.log_prob(mode.double() + size * directions)
+            assert (near - wide.log_prob(mode.double()) < limit).all()
+
+
+@pytest.mark.parametrize("numbers", [1, 2])
+@pytest.mark.parametrize("kind", KINDS[:2])
+def test_hardly_any_density_is_higher_elsewhere(kind: str, numbers: int) -> None:
+    """Of mixtures of five, by a grid; the best component's mode is often 1e-3 nats too low."""
+    missed = before = 0
+    seeds = range(10 if numbers == 1 else 3)
+    for seed in seeds:
+        density = mixture(kind, numbers, 5, seed, torch.float64)
+        highest = everywhere(density, kind)
+        missed += int((highest - density.log_prob(density.mode) > 1e-6).sum())
+        modes = density.components.mode.movedim(1, 0)
+        before += int((highest - density.log_prob(modes).amax(0) > 1e-3).sum())
+    assert missed <= (0 if numbers == 1 else 1)
+    assert before >= len(seeds)
+
+
+def test_two_overlapping_components_have_their_mode_between_them() -> None:
+    """0.9 deviations on either side of 0 one hump at 0, 2 deviations two; across the seam of the circle too."""
+    apart = torch.tensor([[[-0.9], [0.9]], [[-2.0], [2.0]]], dtype=torch.float64)
+    density = Mixture(torch.zeros(2, 2), Gaussian(apart, torch.ones_like(apart)))
+    assert density.mode[0].abs() < 1e-5
+    root = torch.tensor(1.0)
+    for _ in range(200):  # m = 2 tanh 2m, the fixed point
+        root = 2 * torch.tanh(2 * root)
+    torch.testing.assert_close(density.mode[1].abs(), root.double().reshape(1), atol=1e-6, rtol=0)
+    seam = torch.tensor([[[math.pi - 0.09], [-math.pi + 0.09]]], dtype=torch.float64)
+    angle = Mixture(torch.zeros(1, 2), VonMises(seam, torch.full_like(seam, 100.0))).mode
+    torch.testing.assert_close(angle.abs(), torch.full_like(angle, math.pi), atol=1e-6, rtol=0)
+
+
+def test_crossing_ridges_are_highest_where_they_cross() -> None:
+    """One narrow in the first number, one in the second: neither's mode is near the top."""
+    center = torch.tensor([[[0.0, 1.0], [1.0, 0.0]]], dtype=torch.float64)
+    scale = torch.tensor([[[0.01, 2.0], [2.0, 0.01]]], dtype=torch.float64)
+    mode = Mixture(torch.zeros(1, 2), Gaussian(center, scale)).mode
+    torch.testing.assert_close(mode, torch.zeros_like(mode), atol=1e-3, rtol=0)
+
+
+def test_members_that_agree_keep_their_mode_to_the_last_bit() -> None:
+    one = VonMises(torch.tensor([[0.3, -3.0]]), torch.tensor([[1e4, 0.0]]))
+    assert torch.equal(Mixture(torch.zeros(1, 3), Stacked([one] * 3)).mode, one.mode)
+
+
+def test_a_density_that_knows_no_slope_keeps_the_best_component_s_mode() -> None:
+    class Silent(Distribution):
+        arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+        support = Normal.support
+        mode = torch.tensor([[[0.0], [1.0], [1.2]]])
+
+        def __init__(self) -> None:
+            super().__init__(torch.Size((1, 3)), torch.Size((1,)), validate_args=False)
+
+        def log_prob(self, value: Tensor) -> Tensor:
+            return -(value - self.mode).square().sum(-1)
+
+    density = Mixture(torch.zeros(1, 3), Silent())
+    assert torch.equal(density.mode, torch.tensor([[1.0]]))
