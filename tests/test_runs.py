@@ -261,8 +261,9 @@ print(tuple(density.batch_shape), model.training, "hydra" in sys.modules, "mlflo
 
 def test_a_run_imports_only_what_it_names(stranger_site: Path, tmp_path: Path) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    done = listed(*QUIET, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
+    done = listed(*TINY, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
     assert done.code == 0, done.out
+    assert stored_statuses(Done(0, "", tmp_path / "run")) == ["FINISHED"], "another process has sent it"
     plugins = {".".join(name.split(".")[1:3]) for name in done.modules if name.startswith("plugins.")}
     assert plugins - {"encoder", "metric"} == {"encoder.mlp", "metric.log_likelihood", "metric.angular"}
     assert not {"mlflow", "numba", "trimesh", "sklearn", "kornia"} & {

@@ -17,17 +17,19 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib.machinery import PathFinder
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy
 from werkzeug.serving import make_server
 
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
-from framework.tracking import sender
+from framework.tracking import sender, store_process
 from framework.tracking import tracker as tracking
 from framework.tracking.ended import mark_dead, sync
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
+    Destination,
     RunInfo,
     Sidecar,
     default_uri,
@@ -84,8 +86,11 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def build(folder: Path, run_id: str | None = None, **changes: object) -> MlflowTracker:
-    arguments = {"uri": None, "experiment": "some/experiment", "run_name": "some run", "parent": None}
-    return MlflowTracker(folder, run_id=run_id, **{**arguments, **changes})
+    """A tracker that sends from this process, where a test can meddle with MLflow."""
+    named = {"uri": None, "experiment": "some/experiment", "run_name": "some run", "parent": None}
+    destination = Destination(run_id=run_id, **{key: changes.pop(key, value) for key, value in named.items()})  # type: ignore[arg-type]
+    options: dict[str, Any] = {"opening_patience": 30.0, "open_store": mlflow_store.MlflowStore, **changes}
+    return MlflowTracker(folder, destination, **options)
 
 
 def client(folder: Path) -> MlflowClient:
@@ -112,6 +117,13 @@ def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < end, "it never happened"
         time.sleep(0.01)
+
+
+def ended(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
 
 
 def losses(steps: Sequence[int]) -> list[tuple[int, float]]:
@@ -675,13 +687,59 @@ def test_a_store_that_does_not_answer_does_not_hold_up_the_start(
         return opened(info)
 
     monkeypatch.setattr(mlflow_store, "_opened", hangs)
-    tracker = build(folder, opening_patience=0.0)
+    tracker = build(folder, opening_patience=0.01)
     tracker.open()
     assert "no answer yet" in caplog.text
     log(tracker, range(5))
     answer.set()
     tracker.close("FINISHED")
     assert history(folder) == losses(range(5))
+
+
+# The process that sends
+
+
+def sending_process(tracker: MlflowTracker) -> subprocess.Popen[bytes]:
+    assert tracker._process is not None
+    while (process := tracker._process._process) is None:  # between two of them
+        time.sleep(0.01)
+    return process
+
+
+def test_what_sends_dies_and_another_goes_on(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = build(folder, open_store=None, opening_patience=0.0)
+    tracker.open()
+    assert tracker.run_id is None, "nobody waits for the store"
+    first = sending_process(tracker)
+    tracker.log_metrics({"a name [°]": 1.0}, 0, 0)
+    until(lambda: "MLflow takes no name like 'a name [°]'" in caplog.text)
+    log(tracker, range(10))
+    first.kill()
+    log(tracker, range(10, 20))
+    until(lambda: "the sending process has ended" in caplog.text)
+    until(lambda: sending_process(tracker) is not first)
+    second = sending_process(tracker)
+    tracker.close("FINISHED")
+    assert history(folder) == losses(range(20))
+    assert status(folder) == "FINISHED"
+    assert second.returncode == 0
+
+
+def test_what_sends_and_hangs_is_ended_with_the_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(store_process, "_COMMAND", ("sleep", "100"))
+    tracker = build(folder, open_store=None, opening_patience=0.01, patience=0.1)
+    tracker.open()
+    assert "no answer yet" in caplog.text
+    log(tracker, range(5))
+    process = sending_process(tracker)
+    tracker.close("FAILED")
+    assert process.returncode == -9
+    assert "mode=sync" in caplog.text
+    sync(folder)
+    assert history(folder) == losses(range(5))
+    assert status(folder) == "FAILED"
 
 
 # A process that dies, and one that goes on
@@ -693,9 +751,7 @@ from pathlib import Path
 from framework.tracking import run_info
 from framework.tracking.tracker import MlflowTracker
 
-tracker = MlflowTracker(
-    Path(sys.argv[1]), uri=None, experiment="some/experiment", run_name="r", parent=None, run_id=None
-)
+tracker = MlflowTracker(Path(sys.argv[1]), run_info.Destination(None, "some/experiment", "r"))
 tracker.open()
 for step in range(100):
     tracker.log_metrics({"loss": step / 7}, step, 0)
@@ -710,6 +766,7 @@ def die(self, **changes):
     os.kill(os.getpid(), signal.SIGKILL)
 
 run_info.Sidecar.update = die
+print(tracker._process._process.pid, flush=True)
 for step in range(100, 150):
     tracker.log_metrics({"loss": step / 7}, step, 0)
 time.sleep(60)
@@ -722,8 +779,11 @@ def died(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> Path:
     folder = tmp_path_factory.mktemp("died") / "outputs" / "some experiment" / "run"
     folder.mkdir(parents=True)
     shutil.copy(empty_store, folder.parents[1] / "mlflow.db")
-    done = subprocess.run([sys.executable, "-c", DYING, folder], timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", DYING, folder], timeout=120, check=False, stdout=subprocess.PIPE
+    )
     assert done.returncode == -9
+    until(lambda: ended(int(done.stdout)))  # the sending process does not outlive it
     return folder
 
 
@@ -954,7 +1014,7 @@ def test_four_processes_begin_at_once_where_there_is_no_store(tmp_path: Path) ->
 import os, sys
 from pathlib import Path
 import framework.tracking.mlflow_store
-from framework.tracking.run_info import read_run_info
+from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.tracker import MlflowTracker
 
 children = []
@@ -963,8 +1023,7 @@ for number in range(4):
     if child == 0:
         folder = Path(sys.argv[1]) / str(number)
         tracker = MlflowTracker(
-            folder, uri=None, experiment="new/experiment", run_name=str(number), parent=None, run_id=None,
-            opening_patience=300.0, patience=300.0,
+            folder, Destination(None, "new/experiment", str(number)), opening_patience=300.0, patience=300.0,
         )
         tracker.open()
         reached = tracker.run_id is not None and not tracker._sender._away_since

@@ -19,7 +19,7 @@ from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_yaml
-from framework.tracking.run_info import read_run_info
+from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
@@ -149,15 +149,13 @@ def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
     if config.settings.logger.name == "none":
         return NoTracker(config.folder, resumed=resumed)
+    parent = os.environ.get(PARENT)
+    named = run_name(config.settings, config.mode, config.overrides)
     return MlflowTracker(
         config.folder,
-        uri=config.settings.logger.uri,
-        experiment=store_experiment(config.values),
-        run_name=run_name(config.settings, config.mode, config.overrides),
-        parent=os.environ.get(PARENT),
-        wait=SYNCED_WITHIN if PARENT in os.environ else 0.0,
-        run_id=run_id,
+        Destination(config.settings.logger.uri, store_experiment(config.values), named, parent, run_id),
         resumed=resumed,
+        wait=0.0 if parent is None else SYNCED_WITHIN,
     )
 
 

@@ -15,7 +15,8 @@ from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate
 from framework.runs.job import RECORD
 from framework.storage.plain_values import read_json
 from framework.tracking.ended import mark_dead
-from framework.tracking.tracker import MlflowTracker
+from framework.tracking.run_info import Destination
+from framework.tracking.tracker import MlflowTracker, mlflow_store
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
 PARENT_OF = "what a sweep keeps of its parent run"
@@ -269,11 +270,9 @@ def _picture(
 def _parent(folder: Path, logger: Mapping[str, Any], run_id: str | None) -> MlflowTracker:
     return MlflowTracker(
         folder,
-        uri=logger.get("uri"),
-        experiment=logger["experiment"],
-        run_name=f"sweep {folder.name}",
-        parent=None,
-        run_id=run_id,
+        Destination(logger.get("uri"), logger["experiment"], f"sweep {folder.name}", run_id=run_id),
+        opening_patience=30.0,  # its jobs are told its id
+        open_store=mlflow_store(),  # which sends what they leave, too
     )
 
 
