@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -21,14 +22,20 @@ from typing import Any
 
 import pytest
 import sqlalchemy
+from pandas import DataFrame
 from werkzeug.serving import make_server
 
+from framework.configuration.assembly import build_data, build_predictor, resolve_all
+from framework.configuration.settings import Settings
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
+from framework.runs.description import Description
+from framework.runs.loading import PREFIX, load
 from framework.tracking import sender, store_process
 from framework.tracking import tracker as tracking
 from framework.tracking.ended import mark_dead, sync
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
+    MODEL,
     Destination,
     RunInfo,
     Sidecar,
@@ -40,6 +47,7 @@ from framework.tracking.run_info import (
 )
 from framework.tracking.sender import Record, Sender, Store, batches
 from framework.tracking.tracker import MlflowTracker, NoTracker
+from framework.training.checkpoint import WholeCheckpoints
 
 
 @contextmanager
@@ -54,8 +62,11 @@ def metadata_read_as_before() -> Iterator[None]:
     PathFinder.find_distributions = reader
 
 
-with metadata_read_as_before():
+with metadata_read_as_before(), warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # MLflow's, about itself
     from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
+    from mlflow.pyfunc import load_model
 
     from framework.tracking import mlflow_store
     from framework.tracking.mlflow_store import run_folder
@@ -1251,6 +1262,75 @@ def test_the_folder_of_a_run_or_a_copy_of_its_checkpoints(
     with pytest.raises(CheckpointError, match="There is no tracking store"):
         run_folder(run_id, "sqlite:///missing.db")
     assert not (tmp_path / "missing.db").exists()
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DataFrame]:
+    """A checkpoint of a model that reads a table, and rows for it."""
+    folder = tmp_path_factory.mktemp("trained")
+    lines = [f"{row},{row % 7},{1e6 * row}" for row in range(40)]
+    (folder / "table.csv").write_text("width,height,mass\n" + "\n".join(lines))
+    parts = resolve_all(
+        {
+            "data": {"name": "tabular", "path": str(folder / "table.csv"), "target": "mass", "kind": "real"},
+            "encoder": {"mlp": {"name": "mlp", "widths": [4]}},
+            "density_head": {"name": "gaussian"},
+        }
+    )
+    data = build_data(parts)
+    data.prepare()
+    predictor = build_predictor(parts, data.target, data.input_shape, 0, data.columns)
+    content = {
+        "framework": Description.of(parts, data, "mine", Settings(seed=3, samples=10)).stored(),
+        "state_dict": {f"{PREFIX}{name}": value for name, value in predictor.state_dict().items()},
+    }
+    WholeCheckpoints().save_checkpoint(content, folder / "model.ckpt")
+    return folder / "model.ckpt", DataFrame({"height": [1.0, 5.0], "width": [3, 40]})
+
+
+def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
+    folder: Path, trained: tuple[Path, DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    checkpoint, rows = trained
+    tracker = build(folder, run_name="mine, seed=3")
+    tracker.open()
+    facts = {"root": "table.csv", "sha256": "ab" * 32, "train": "28", "synthetic": "false"}
+    tracker.log_dataset("tabular", "training", facts)
+    (folder / "model.ckpt").write_bytes(checkpoint.read_bytes())
+    tracker.log_artifact(folder / "model.ckpt", MODEL)
+    tracker.close("FINISHED")
+    for _ in range(2):  # a sending that was cut short begins again
+        run = client(folder).get_run(identity(folder))
+        (used,), (made,) = run.inputs.dataset_inputs, run.outputs.model_outputs
+        assert (used.dataset.name, used.dataset.digest, used.tags[0].value) == (
+            "tabular",
+            "ab" * 18,
+            "training",
+        )
+        assert json.loads(used.dataset.profile) == facts
+        model = client(folder).get_logged_model(made.model_id)
+        assert (model.name, str(model.status), model.source_run_id) == ("mine", "READY", run.info.run_id)
+        info = read_run_info(folder)
+        assert info is not None
+        Sidecar(folder, info).update(sent=0)
+        sync(folder)
+    stored = [path.name for path in (folder.parents[1] / "artifacts").rglob("*") if path.is_file()]
+    assert sorted(stored) == ["MLmodel", "model.ckpt"], "the weights lie in the store once"
+
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(folder))
+    served = load_model(f"models:/{made.model_id}")
+    answer = served.predict(rows)
+    density = load(checkpoint)(rows)
+    assert list(answer) == ["mass", "entropy_nats", "mass_mode"]
+    assert answer["mass_mode"].tolist() == density.mode.flatten().tolist()
+    assert answer["entropy_nats"].tolist() == density.entropy().tolist()
+    with pytest.raises(MlflowException, match=r"reads a column 'height', which is not given\."):
+        served.predict(rows[["width"]])
+
+    shutil.move(folder, tmp_path / "moved")
+    copy = run_folder(run.info.run_id, default_uri(folder))
+    assert load(copy)(rows).mode.equal(density.mode)
 
 
 def test_a_run_without_checkpoints_is_said(folder: Path) -> None:

@@ -42,13 +42,18 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     data = reader(description)
 
     def ready(model: nn.Module, given: tuple[Any]) -> Tensor:
-        inputs = data.inputs(*given)
-        own = next(model.parameters(), inputs)
-        # bytes are pixels, which encoders scale; any other number is one of the model's own type
-        return inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
+        return inputs_of(predictor, data, *given)
 
     predictor.register_forward_pre_hook(ready)
     return predictor
+
+
+def inputs_of(predictor: Predictor, data: Data, given: Any) -> Tensor:
+    """What a predictor reads, of what a user gives; errors as `Data.inputs`."""
+    inputs = data.inputs(given)
+    own = next(predictor.parameters(), inputs)
+    # bytes are pixels, which encoders scale; any other number is one of the model's own type
+    return inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
 
 
 def reader(description: Description) -> Data:

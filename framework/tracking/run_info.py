@@ -21,6 +21,8 @@ from framework.storage.reading import guarded, read_bytes
 _log = logging.getLogger(__name__)
 
 SIDECAR = "run.json"
+MODEL = "model:"
+"""The place of a checkpoint that the store keeps as the run's model, and not in a folder of its files."""
 _SQLITE = "sqlite:///"
 
 

@@ -66,8 +66,15 @@ class Tracker(ABC):
         """Record numbers, NaN and infinities among them."""
 
     @abstractmethod
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        """Record what the run reads; `context` says for what, "training" say, `facts` are of `Data.fingerprint`."""
+
+    @abstractmethod
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Record a file or a directory, under `folder` in the store. Leave it there: it is read later."""
+        """Record a file or a directory, under `folder` in the store. Leave it there: it is read later.
+
+        A checkpoint under `MODEL` (`run_info`) becomes the model of the run, which the store can serve.
+        """
 
     @abstractmethod
     def drop_after(self, step: int) -> None:
@@ -119,6 +126,9 @@ class NoTracker(Tracker):
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
+
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        """Nothing: nobody could search them."""
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
         """Nothing: the file is where it is."""
@@ -219,6 +229,9 @@ class MlflowTracker(Tracker):
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
         self._notice()
+
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        self._log(dataset=name, context=context, facts=dict(facts))
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
         path = path.absolute()
