@@ -140,9 +140,18 @@ def test_a_signal_saves_and_says_so(
     assert "resume=" in stopped.out
     content = torch.load(stopped.folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert content["global_step"] == 14, "the batch in hand was finished and saved"
+    assert "optimizer_states" in content
+    best = stopped.folder / "checkpoints" / "best.ckpt"
+    assert "optimizer_states" not in torch.load(best, weights_only=True), "nobody trains on from it"
+    if number == signal.SIGINT:  # as version 0.1 left it, with the later ones damaged
+        best.with_name("last.ckpt").replace(best)
+        best.with_name("previous.ckpt").unlink()
     again = framework(*arguments)
     assert again.code == 0, again.out
     assert stopped.losses() == whole.losses()
+    assert [path.name for path in best.parent.iterdir()] == ["model.ckpt"], (
+        "a finished run keeps its model alone"
+    )
 
 
 def test_a_nan_label_stops_before_the_weights_are_touched(framework: Framework) -> None:
