@@ -225,7 +225,11 @@ def test_a_run_from_open_to_close(folder: Path, tmp_path: Path) -> None:
         "figures/curve.png",
         "pictures/curve.png",
     ]
-    assert client(folder).get_experiment(run.info.experiment_id).name == "some/experiment"
+    experiment = client(folder).get_experiment(run.info.experiment_id)
+    assert experiment.name == "some/experiment"
+    assert "viewStateShareKey=losses" in experiment.tags["mlflow.note.content"]
+    (chart,) = json.loads(experiment.tags["mlflow.sharedViewState.losses"])["compareRunCharts"]
+    assert chart["selectedMetricKeys"] == ["train/loss", "validation/loss"]
     info = read_run_info(folder)
     assert info is not None
     assert (info.status, info.owed, info.sent) == ("FINISHED", (), tracker.journal.last)
@@ -1305,7 +1309,7 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
         (used,), (made,) = run.inputs.dataset_inputs, run.outputs.model_outputs
         assert (used.dataset.name, used.dataset.digest, used.tags[0].value) == (
             "tabular",
-            "ab" * 18,
+            "ab" * 8,
             "training",
         )
         assert json.loads(used.dataset.profile) == facts

@@ -39,7 +39,7 @@ logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)
 
 _KEY, _FOLDER = "framework.key", "framework.folder"  # tags
 _LONGEST_NAME = 250  # characters
-_LONGEST_DIGEST = 36
+_DIGEST = 16  # letters that are shown
 _LOADER = "framework.deployment.served"
 """The module by which MLflow loads a model: written here, since what a run folder says may be a stranger's."""
 
@@ -218,7 +218,7 @@ def _dataset(record: Record) -> DatasetInput:
     digest = facts.get("sha256") or hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     dataset = Dataset(
         record["dataset"],
-        digest[:_LONGEST_DIGEST],
+        digest[:_DIGEST],
         source_type="local",
         source=json.dumps({"root": facts.get("root", "")}),
         profile=json.dumps(facts),
@@ -295,7 +295,10 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
     found = client.get_experiment_by_name(info.experiment)
     if found is None:
         try:
-            return client.create_experiment(info.experiment, artifact_location=info.artifacts)
+            made = client.create_experiment(info.experiment, artifact_location=info.artifacts)
+            for key, value in _view(made).items():
+                client.set_experiment_tag(made, key, value)
+            return made
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
@@ -305,6 +308,23 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
             f"experiment {info.experiment!r} was deleted there; restore it, or choose another name"
         )
     return found.experiment_id
+
+
+def _view(experiment_id: str) -> dict[str, str]:
+    """Tags of an experiment: a view with both losses in one chart, and its link as the description.
+
+    MLflow itself draws each metric apart; a view is what its button `Share` makes.
+    """
+    losses = ["train/loss", "validation/loss"]
+    chart = {"uuid": "losses", "metricSectionId": "losses", "type": "LINE", "metricKey": losses[0]}
+    chart |= {"selectedMetricKeys": losses, "deleted": False, "isGenerated": False, "lineSmoothness": 0}
+    section = {"uuid": "losses", "name": "Losses", "display": True, "isReordered": False}
+    view = {"compareRunCharts": [chart], "compareRunSections": [section], "isAccordionReordered": True}
+    link = f"#/experiments/{experiment_id}/runs?viewStateShareKey=losses&compareRunsMode=CHART"
+    return {
+        "mlflow.sharedViewState.losses": json.dumps(view),
+        "mlflow.note.content": f"[Training and validation loss in one chart]({link})",
+    }
 
 
 def _user() -> str:
