@@ -1322,8 +1322,7 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
     stored = [path.name for path in (folder.parents[1] / "artifacts").rglob("*") if path.is_file()]
     assert sorted(stored) == ["MLmodel", "model.ckpt"], "the weights lie in the store once"
 
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", default_uri(folder))
-    served = load_model(f"models:/{made.model_id}")
+    served = load_model(model.artifact_location)
     answer = served.predict(rows)
     density = load(checkpoint)(rows)
     assert list(answer) == ["mass", "entropy_nats", "mass_mode"]
