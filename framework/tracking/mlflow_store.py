@@ -259,9 +259,9 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         copy = cache_folder("runs") / run_id
         copy.mkdir(exist_ok=True)
         if models:
-            artifacts.download_artifacts(f"models:/{models[0]}", dst_path=str(copy), tracking_uri=uri)
-        else:  # a run of version 0.1
-            client.download_artifacts(run_id, "checkpoints", str(copy))
+            place = client.get_logged_model(models[0]).artifact_location  # "models:/" asks another store
+            return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=uri))
+        client.download_artifacts(run_id, "checkpoints", str(copy))  # a run of version 0.1
     except MlflowException as error:
         raise CheckpointError(f"Run {run_id} cannot be had from {shown}: {reason(error)}.") from error
     return copy
