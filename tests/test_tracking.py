@@ -1296,6 +1296,7 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
     folder: Path, trained: tuple[Path, DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)  # MLflow makes a store where it loads a model
     checkpoint, rows = trained
     tracker = build(folder, run_name="mine, seed=3")
     tracker.open()
