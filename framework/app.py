@@ -22,11 +22,13 @@ def main() -> None:
         _fail("interrupted.", 130)
     except Exception as error:
         from framework.configuration.composition import sentence
+        from framework.storage.files import unwritable
 
-        message = None if full_error == "1" else sentence(error)
+        refused = unwritable(error)
+        message = None if full_error == "1" else refused or sentence(error)
         if message is None:
             raise
-        _fail(message, 2)
+        _fail(message, 1 if refused else 2)
 
 
 def _run() -> None:

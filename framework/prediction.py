@@ -1,5 +1,6 @@
 """What a model predicted for one batch; whatever is derived from it is computed on first use, once."""
 
+import math
 from contextlib import nullcontext
 from functools import cached_property
 from typing import Literal
@@ -7,10 +8,13 @@ from typing import Literal
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.data import Batch
+from framework.data import Batch, Frame
+from framework.distributions.circular import wrap
 from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.moved import Moved
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import Estimate, estimate, marginal, median
+from framework.target import Target
 
 Split = Literal["test", "outliers"]
 """Where inputs come from: the test split, or data that belongs to nothing the model was trained on."""
@@ -39,7 +43,15 @@ class Prediction:
         self.batch = batch
         self.samples = samples
         self.split: Split = split
+        self._given = draw
         self._draw = draw or (lambda purpose: nullcontext())
+
+    def in_frame(self, frame: Frame | None) -> "Prediction":
+        """The same prediction in the user's own unit, where `Data.frame` says in which the target lies."""
+        if frame is None:
+            return self
+        density = Moved(self.density, *(part.to(self.batch["input"]) for part in frame))
+        return Prediction(density, self.batch, self.samples, self.split, self._given)
 
     @property
     def target(self) -> Tensor:
@@ -81,3 +93,21 @@ class Prediction:
     @cached_property
     def _marginals(self) -> dict[int, Distribution]:
         return {}
+
+
+def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:
+    """What a table of predictions says, (batch,) each, in the user's names and units; angles in degrees."""
+    if target.kind == "class":
+        shares = prediction.class_probabilities
+        found = {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
+    else:
+        found = named(target, prediction.point)
+    return {**found, "entropy_nats": prediction.entropy}
+
+
+def named(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:
+    """Angles or reals, (batch, number), by their names; `of` says what they are, where it is not the prediction."""
+    if target.kind == "angle":
+        degrees = wrap(values) * (180 / math.pi)
+        return {f"{name}{of}_deg": degrees[:, i] for i, name in enumerate(target.names)}
+    return {f"{name}{of}": values[:, i] for i, name in enumerate(target.names)}

@@ -1,11 +1,13 @@
 """A trained model after its run: it takes what its user has, of each kind of data, when the training data are gone."""
 
+import base64
 import shutil
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -13,6 +15,7 @@ import framework as package
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
 from framework.deployment.frozen import Frozen
+from framework.deployment.served import _load_pyfunc
 from framework.errors import DataError
 from framework.geometry.meshes import read
 from framework.model import Predictor, fitted_models
@@ -69,7 +72,7 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
     done = framework(f"data={kind}", *options, *arguments, *quick)
     assert done.code == 0, done.out
     shutil.rmtree(home)
-    files = [Path(file) for file in row.files(own)]
+    files = sorted(Path(file) for file in row.files(own))
     predicted = framework(
         "mode=predict", f"checkpoint={done.folder}", f"mode.files={own}", "logger=none", folder="predicted"
     )
@@ -88,6 +91,22 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
         assert bool(torch.isfinite(one.log_prob(here)).all())
     if kind == "registration":
         follows_the_scan(model, frozen, files[0], lines)
+
+    served = _load_pyfunc(str(done.folder / "checkpoints" / "model.ckpt"))
+    told = pd.read_csv(predicted.folder / "predictions.csv").drop(columns="sample")
+    contents = [base64.b64encode(file.read_bytes()).decode() for file in files]
+    named = pd.DataFrame({"base64": contents, "name": [file.name for file in files]})
+    for given in (files, named, *([contents] if kind == "images_with_angles" else [])):
+        answer = served.answer(given)
+        assert set(answer) - set(told) == {
+            f"{name.removesuffix('_deg')}_mode{'_deg' * name.endswith('_deg')}"
+            for name in told
+            if kind != "point_cloud_folder" and name != "entropy_nats"
+        }
+        pd.testing.assert_frame_equal(answer[list(told)], told, rtol=1e-6, check_dtype=False)
+    for wrong in ([str(file) for file in files], ["etc"], named.assign(base64="/etc/hostname"), object()):
+        with pytest.raises(DataError):
+            served.answer(wrong)
     for wrong in (object(), tmp_path / "gone.csv", np.zeros((2, 77, 5, 3))):
         for form in (model, frozen):
             with pytest.raises(DataError):

@@ -9,8 +9,11 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -137,9 +140,18 @@ def test_a_signal_saves_and_says_so(
     assert "resume=" in stopped.out
     content = torch.load(stopped.folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert content["global_step"] == 14, "the batch in hand was finished and saved"
+    assert "optimizer_states" in content
+    best = stopped.folder / "checkpoints" / "best.ckpt"
+    assert "optimizer_states" not in torch.load(best, weights_only=True), "nobody trains on from it"
+    if number == signal.SIGINT:  # as version 0.1 left it, with the later ones damaged
+        best.with_name("last.ckpt").replace(best)
+        best.with_name("previous.ckpt").unlink()
     again = framework(*arguments)
     assert again.code == 0, again.out
     assert stopped.losses() == whole.losses()
+    assert [path.name for path in best.parent.iterdir()] == ["model.ckpt"], (
+        "a finished run keeps its model alone"
+    )
 
 
 def test_a_nan_label_stops_before_the_weights_are_touched(framework: Framework) -> None:
@@ -261,8 +273,9 @@ print(tuple(density.batch_shape), model.training, "hydra" in sys.modules, "mlflo
 
 def test_a_run_imports_only_what_it_names(stranger_site: Path, tmp_path: Path) -> None:
     run = f"hydra.run.dir={tmp_path / 'run'}"
-    done = listed(*QUIET, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
+    done = listed(*TINY, "trainer.max_epochs=1", run, folder=tmp_path, site=stranger_site)
     assert done.code == 0, done.out
+    assert stored_statuses(Done(0, "", tmp_path / "run")) == ["FINISHED"], "another process has sent it"
     plugins = {".".join(name.split(".")[1:3]) for name in done.modules if name.startswith("plugins.")}
     assert plugins - {"encoder", "metric"} == {"encoder.mlp", "metric.log_likelihood", "metric.angular"}
     assert not {"mlflow", "numba", "trimesh", "sklearn", "kornia"} & {
@@ -407,6 +420,44 @@ def test_a_run_killed_while_it_was_closed_is_sent_by_resume(framework: Framework
     again = framework(f"resume={done.folder}")
     assert again.code == 2
     assert "that run has finished" in again.out
+
+
+def test_a_sweep_that_was_killed_closes_its_parent_when_it_is_repeated(
+    stranger_site: Path, tmp_path: Path
+) -> None:
+    sweep = tmp_path / "outputs" / "sweep"
+    arguments = ["-m", *TINY, "trainer.max_epochs=1", "seed=0", "pictures=false", f"hydra.sweep.dir={sweep}"]
+    command = [sys.executable, "-m", "framework", *arguments]
+    options: dict[str, Any] = {
+        "cwd": tmp_path,
+        "env": {**os.environ, "PYTHONPATH": str(stranger_site), "FRAMEWORK_CACHE": str(tmp_path / "cache")},
+        "stdout": subprocess.DEVNULL,
+    }
+    first = subprocess.Popen(command, **options)
+    wait_for(lambda: (sweep / "0" / "journal.jsonl").exists())
+    first.kill()
+    first.wait()
+    parent = Done(0, "", sweep)
+    assert (status(parent), stored_statuses(parent)[0]) == ("RUNNING", "RUNNING")
+    (sweep / "parent.json").unlink()  # as if killed before that was written
+    subprocess.run(command, check=True, timeout=300, **options)
+    assert (status(parent), stored_statuses(parent)) == ("FINISHED", ["FINISHED", "FINISHED"])
+    with closing(sqlite3.connect(store_of(parent))) as store:
+        of_parent = "run_uuid not in (select run_uuid from tags where key = 'mlflow.parentRunId')"
+        numbers = store.execute(f"select count(*) from metrics where {of_parent}").fetchone()
+        (said,) = store.execute(
+            f"select value from tags where key = 'mlflow.note.content' and {of_parent}"
+        ).fetchone()
+    assert numbers == (0,), "they would be charts of the parent alone"
+    assert said.startswith(f"A sweep in `{sweep}`: 1 runs over")
+    assert "| method | data |" in said
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.02)
 
 
 def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: Framework) -> None:

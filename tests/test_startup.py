@@ -34,8 +34,18 @@ def test_asking_imports_nothing_heavy_and_no_plugin(arguments: tuple[str, ...], 
     assert list(tmp_path.iterdir()) == [], "asking leaves nothing behind"
 
 
-@pytest.mark.parametrize("mistake", ["density_head=scvae", "trainer.strategy=dpp", "encoder.mlp.widths=[0]"])
-def test_a_mistake_is_found_before_what_trains_is_imported(mistake: str, tmp_path: Path) -> None:
-    done = listed("experiment=moons/vanilla_128", mistake, folder=tmp_path)
+@pytest.mark.parametrize(
+    ("experiment", "mistake"),
+    [
+        ("moons/vanilla_128", "density_head=scvae"),
+        ("moons/vanilla_128", "trainer.strategy=dpp"),
+        ("moons/vanilla_128", "encoder.mlp.widths=[0]"),
+        ("pascal3d/scvae", "density_head=categorical"),
+    ],
+)
+def test_a_mistake_is_found_before_what_trains_is_imported(
+    experiment: str, mistake: str, tmp_path: Path
+) -> None:
+    done = listed(f"experiment={experiment}", mistake, folder=tmp_path)
     assert done.code == 2, done.out
-    assert not {"pytorch_lightning", "mlflow"} & done.modules
+    assert not {"pytorch_lightning", "torchmetrics", "matplotlib", "mlflow"} & done.modules

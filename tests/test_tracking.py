@@ -11,23 +11,32 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib.machinery import PathFinder
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy
+from pandas import DataFrame
 from werkzeug.serving import make_server
 
+from framework.configuration.assembly import build_data, build_predictor, resolve_all
+from framework.configuration.settings import Settings
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
-from framework.tracking import sender
+from framework.runs.description import Description
+from framework.runs.loading import PREFIX, load
+from framework.tracking import sender, store_process
 from framework.tracking import tracker as tracking
 from framework.tracking.ended import mark_dead, sync
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
+    MODEL,
+    Destination,
     RunInfo,
     Sidecar,
     default_uri,
@@ -38,6 +47,7 @@ from framework.tracking.run_info import (
 )
 from framework.tracking.sender import Record, Sender, Store, batches
 from framework.tracking.tracker import MlflowTracker, NoTracker
+from framework.training.checkpoint import WholeCheckpoints
 
 
 @contextmanager
@@ -52,8 +62,11 @@ def metadata_read_as_before() -> Iterator[None]:
     PathFinder.find_distributions = reader
 
 
-with metadata_read_as_before():
+with metadata_read_as_before(), warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # MLflow's, about itself
     from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
+    from mlflow.pyfunc import load_model
 
     from framework.tracking import mlflow_store
     from framework.tracking.mlflow_store import run_folder
@@ -84,8 +97,11 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def build(folder: Path, run_id: str | None = None, **changes: object) -> MlflowTracker:
-    arguments = {"uri": None, "experiment": "some/experiment", "run_name": "some run", "parent": None}
-    return MlflowTracker(folder, run_id=run_id, **{**arguments, **changes})
+    """A tracker that sends from this process, where a test can meddle with MLflow."""
+    named = {"uri": None, "experiment": "some/experiment", "run_name": "some run", "parent": None}
+    destination = Destination(run_id=run_id, **{key: changes.pop(key, value) for key, value in named.items()})  # type: ignore[arg-type]
+    options: dict[str, Any] = {"opening_patience": 30.0, "open_store": mlflow_store.MlflowStore, **changes}
+    return MlflowTracker(folder, destination, **options)
 
 
 def client(folder: Path) -> MlflowClient:
@@ -112,6 +128,13 @@ def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < end, "it never happened"
         time.sleep(0.01)
+
+
+def ended(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
 
 
 def losses(steps: Sequence[int]) -> list[tuple[int, float]]:
@@ -202,7 +225,11 @@ def test_a_run_from_open_to_close(folder: Path, tmp_path: Path) -> None:
         "figures/curve.png",
         "pictures/curve.png",
     ]
-    assert client(folder).get_experiment(run.info.experiment_id).name == "some/experiment"
+    experiment = client(folder).get_experiment(run.info.experiment_id)
+    assert experiment.name == "some/experiment"
+    assert "viewStateShareKey=losses" in experiment.tags["mlflow.note.content"]
+    (chart,) = json.loads(experiment.tags["mlflow.sharedViewState.losses"])["compareRunCharts"]
+    assert chart["selectedMetricKeys"] == ["train/loss", "validation/loss"]
     info = read_run_info(folder)
     assert info is not None
     assert (info.status, info.owed, info.sent) == ("FINISHED", (), tracker.journal.last)
@@ -675,13 +702,59 @@ def test_a_store_that_does_not_answer_does_not_hold_up_the_start(
         return opened(info)
 
     monkeypatch.setattr(mlflow_store, "_opened", hangs)
-    tracker = build(folder, opening_patience=0.0)
+    tracker = build(folder, opening_patience=0.01)
     tracker.open()
     assert "no answer yet" in caplog.text
     log(tracker, range(5))
     answer.set()
     tracker.close("FINISHED")
     assert history(folder) == losses(range(5))
+
+
+# The process that sends
+
+
+def sending_process(tracker: MlflowTracker) -> subprocess.Popen[bytes]:
+    assert tracker._process is not None
+    while (process := tracker._process._process) is None:  # between two of them
+        time.sleep(0.01)
+    return process
+
+
+def test_what_sends_dies_and_another_goes_on(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tracker = build(folder, open_store=None, opening_patience=0.0)
+    tracker.open()
+    assert tracker.run_id is None, "nobody waits for the store"
+    first = sending_process(tracker)
+    tracker.log_metrics({"a name [°]": 1.0}, 0, 0)
+    until(lambda: "MLflow takes no name like 'a name [°]'" in caplog.text)
+    log(tracker, range(10))
+    first.kill()
+    log(tracker, range(10, 20))
+    until(lambda: "the sending process has ended" in caplog.text)
+    until(lambda: sending_process(tracker) is not first)
+    second = sending_process(tracker)
+    tracker.close("FINISHED")
+    assert history(folder) == losses(range(20))
+    assert status(folder) == "FINISHED"
+    assert second.returncode == 0
+
+
+def test_what_sends_and_hangs_is_ended_with_the_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(store_process, "_COMMAND", ("sleep", "100"))
+    tracker = build(folder, open_store=None, opening_patience=0.01, patience=0.1)
+    tracker.open()
+    assert "no answer yet" in caplog.text
+    log(tracker, range(5))
+    process = sending_process(tracker)
+    tracker.close("FAILED")
+    assert process.returncode == -9
+    assert "mode=sync" in caplog.text
+    sync(folder)
+    assert history(folder) == losses(range(5))
+    assert status(folder) == "FAILED"
 
 
 # A process that dies, and one that goes on
@@ -693,9 +766,7 @@ from pathlib import Path
 from framework.tracking import run_info
 from framework.tracking.tracker import MlflowTracker
 
-tracker = MlflowTracker(
-    Path(sys.argv[1]), uri=None, experiment="some/experiment", run_name="r", parent=None, run_id=None
-)
+tracker = MlflowTracker(Path(sys.argv[1]), run_info.Destination(None, "some/experiment", "r"))
 tracker.open()
 for step in range(100):
     tracker.log_metrics({"loss": step / 7}, step, 0)
@@ -710,6 +781,7 @@ def die(self, **changes):
     os.kill(os.getpid(), signal.SIGKILL)
 
 run_info.Sidecar.update = die
+print(tracker._process._process.pid, flush=True)
 for step in range(100, 150):
     tracker.log_metrics({"loss": step / 7}, step, 0)
 time.sleep(60)
@@ -722,8 +794,11 @@ def died(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> Path:
     folder = tmp_path_factory.mktemp("died") / "outputs" / "some experiment" / "run"
     folder.mkdir(parents=True)
     shutil.copy(empty_store, folder.parents[1] / "mlflow.db")
-    done = subprocess.run([sys.executable, "-c", DYING, folder], timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", DYING, folder], timeout=120, check=False, stdout=subprocess.PIPE
+    )
     assert done.returncode == -9
+    until(lambda: ended(int(done.stdout)))  # the sending process does not outlive it
     return folder
 
 
@@ -954,7 +1029,7 @@ def test_four_processes_begin_at_once_where_there_is_no_store(tmp_path: Path) ->
 import os, sys
 from pathlib import Path
 import framework.tracking.mlflow_store
-from framework.tracking.run_info import read_run_info
+from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.tracker import MlflowTracker
 
 children = []
@@ -963,8 +1038,7 @@ for number in range(4):
     if child == 0:
         folder = Path(sys.argv[1]) / str(number)
         tracker = MlflowTracker(
-            folder, uri=None, experiment="new/experiment", run_name=str(number), parent=None, run_id=None,
-            opening_patience=300.0, patience=300.0,
+            folder, Destination(None, "new/experiment", str(number)), opening_patience=300.0, patience=300.0,
         )
         tracker.open()
         reached = tracker.run_id is not None and not tracker._sender._away_since
@@ -1192,6 +1266,75 @@ def test_the_folder_of_a_run_or_a_copy_of_its_checkpoints(
     with pytest.raises(CheckpointError, match="There is no tracking store"):
         run_folder(run_id, "sqlite:///missing.db")
     assert not (tmp_path / "missing.db").exists()
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DataFrame]:
+    """A checkpoint of a model that reads a table, and rows for it."""
+    folder = tmp_path_factory.mktemp("trained")
+    lines = [f"{row},{row % 7},{1e6 * row}" for row in range(40)]
+    (folder / "table.csv").write_text("width,height,mass\n" + "\n".join(lines))
+    parts = resolve_all(
+        {
+            "data": {"name": "tabular", "path": str(folder / "table.csv"), "target": "mass", "kind": "real"},
+            "encoder": {"mlp": {"name": "mlp", "widths": [4]}},
+            "density_head": {"name": "gaussian"},
+        }
+    )
+    data = build_data(parts)
+    data.prepare()
+    predictor = build_predictor(parts, data.target, data.input_shape, 0, data.columns)
+    content = {
+        "framework": Description.of(parts, data, "mine", Settings(seed=3, samples=10)).stored(),
+        "state_dict": {f"{PREFIX}{name}": value for name, value in predictor.state_dict().items()},
+    }
+    WholeCheckpoints().save_checkpoint(content, folder / "model.ckpt")
+    return folder / "model.ckpt", DataFrame({"height": [1.0, 5.0], "width": [3, 40]})
+
+
+def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
+    folder: Path, trained: tuple[Path, DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)  # MLflow makes a store where it loads a model
+    checkpoint, rows = trained
+    tracker = build(folder, run_name="mine, seed=3")
+    tracker.open()
+    facts = {"root": "table.csv", "sha256": "ab" * 32, "train": "28", "synthetic": "false"}
+    tracker.log_dataset("tabular", "training", facts)
+    (folder / "model.ckpt").write_bytes(checkpoint.read_bytes())
+    tracker.log_artifact(folder / "model.ckpt", MODEL)
+    tracker.close("FINISHED")
+    for _ in range(2):  # a sending that was cut short begins again
+        run = client(folder).get_run(identity(folder))
+        (used,), (made,) = run.inputs.dataset_inputs, run.outputs.model_outputs
+        assert (used.dataset.name, used.dataset.digest, used.tags[0].value) == (
+            "tabular",
+            "ab" * 8,
+            "training",
+        )
+        assert json.loads(used.dataset.profile) == facts
+        model = client(folder).get_logged_model(made.model_id)
+        assert (model.name, str(model.status), model.source_run_id) == ("mine", "READY", run.info.run_id)
+        info = read_run_info(folder)
+        assert info is not None
+        Sidecar(folder, info).update(sent=0)
+        sync(folder)
+    stored = [path.name for path in (folder.parents[1] / "artifacts").rglob("*") if path.is_file()]
+    assert sorted(stored) == ["MLmodel", "model.ckpt"], "the weights lie in the store once"
+
+    served = load_model(model.artifact_location)
+    answer = served.predict(rows)
+    density = load(checkpoint)(rows)
+    assert list(answer) == ["mass", "entropy_nats", "mass_mode"]
+    assert answer["mass_mode"].tolist() == density.mode.flatten().tolist()
+    assert answer["entropy_nats"].tolist() == density.entropy().tolist()
+    with pytest.raises(MlflowException, match=r"reads a column 'height', which is not given\."):
+        served.predict(rows[["width"]])
+
+    shutil.move(folder, tmp_path / "moved")
+    copy = run_folder(run.info.run_id, default_uri(folder))
+    assert load(copy)(rows).mode.equal(density.mode)
 
 
 def test_a_run_without_checkpoints_is_said(folder: Path) -> None:

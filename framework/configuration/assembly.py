@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -12,10 +12,12 @@ from framework.data import Data
 from framework.density_head import DensityHead
 from framework.encoder import Encoder
 from framework.errors import ConfigError, quoted
-from framework.metric import Metric
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.objective import Objective
 from framework.target import Target
+
+if TYPE_CHECKING:
+    from framework.metric import Metric
 
 Resolved = dict[str, Any]
 """Every plugin of a run with every parameter written out: plain values, by group; lists for plural groups."""
@@ -37,6 +39,9 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
         "data": resolve("data", config["data"]),
         "density_head": resolve("density_head", config["density_head"]),
     }
+    target = getattr(build_data(resolved), "target", None)
+    if target is not None:  # known without reading: what cannot describe it says so now
+        build("density_head", resolved["density_head"], target=target)
     for group in ("encoder", "uncertainty", "objective", "metric"):
         chosen = config.get(group) or {}
         if not isinstance(chosen, Mapping):
@@ -47,9 +52,7 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     outliers = config.get("outliers")
     resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
     require_outliers(resolved)
-    target = getattr(build_data(resolved), "target", None)
-    if target is not None:  # known without reading: what cannot describe it says so now
-        build("density_head", resolved["density_head"], target=target)
+    if target is not None:
         build_metrics(resolved, target)
     return resolved
 
@@ -149,7 +152,7 @@ def build_objectives(resolved: Resolved) -> Sequence[Objective]:
     return [build("objective", part) for part in resolved["objective"]]
 
 
-def build_metrics(resolved: Resolved, target: Target) -> list[Metric]:
+def build_metrics(resolved: Resolved, target: Target) -> "list[Metric]":
     """Fresh metrics, in the order asked for."""
     return [build("metric", part, target=target) for part in resolved["metric"]]
 

@@ -1,7 +1,6 @@
 """mode=predict: a CSV of point predictions and uncertainties for a user's own files, or for the test split."""
 
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,13 +12,11 @@ from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
-from framework.distributions.circular import wrap
-from framework.distributions.moved import Moved
 from framework.distributions.noise import Draw
 from framework.errors import DataError
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
-from framework.prediction import Prediction
+from framework.prediction import answers
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, to_read
@@ -75,12 +72,8 @@ def predictions(
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
     for number, batch in enumerate(told(loader, "predicting")):
-        draw, frame = Draw(settings.seed, number), data.frame(batch)
-        prediction = predicted(predictor, batch, settings.samples, draw)
-        if frame is not None:
-            moved = Moved(prediction.density, *frame)
-            prediction = Prediction(moved, batch, settings.samples, draw=draw)
-        columns = _columns(target, prediction) | {"entropy_nats": prediction.entropy}
+        prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
+        columns = answers(target, prediction.in_frame(data.frame(batch)))
         for row in range(len(batch["index"])):
             values = {key: _text(column[row]) for key, column in columns.items()}
             if target.kind == "class":
@@ -97,17 +90,6 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
         return [str(file) for file in files]
     counts = [len(data.read([file])) for file in files]  # type: ignore[arg-type]
     return [f"{file} row {row}" for file, count in zip(files, counts, strict=True) for row in range(count)]
-
-
-def _columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
-    if target.kind == "class":
-        shares = prediction.class_probabilities
-        return {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
-    point = prediction.point
-    if target.kind == "angle":
-        degrees = wrap(point) * (180 / math.pi)
-        return {f"{name}_deg": degrees[:, i] for i, name in enumerate(target.names)}
-    return {name: point[:, i] for i, name in enumerate(target.names)}
 
 
 def _text(value: Tensor) -> str:

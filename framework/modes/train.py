@@ -2,7 +2,7 @@
 
 from framework.configuration.config import Config
 from framework.reports.report import report_test, report_training
-from framework.runs.fit import fit
+from framework.runs.fit import fit, keep_model_alone
 from framework.runs.job import leave_value
 from framework.runs.run import opened
 from framework.runs.session import calibrate, for_training
@@ -23,5 +23,6 @@ def run(config: Config) -> float:
         calibrate(session)
         session.save_model(run)
         report_test(run, session)
+        keep_model_alone(run)
     leave_value(config.folder, loss)
     return loss

@@ -14,6 +14,7 @@ from framework.metric import Pictured
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.run import Run
 from framework.runs.session import Session
+from framework.storage.files import write_whole
 from framework.training.batches import told
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def report_test(run: Run, session: Session) -> None:
     results = _results(run, session, found, spent, columns, better)
     results["synthetic"] = synthetic
     path = run.folder / "results.json"
-    path.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    write_whole(path, json.dumps(results, indent=1).encode())
     numbers = {key: float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)}
     groups = {f"test/{name}": some for name, some in found.groups.items()}
     for part, values in {"test": found.total, **groups, "cost": numbers}.items():

@@ -21,8 +21,9 @@ from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
 from framework.training.progress import Progress
 
-TRAINED = {"last.ckpt", "previous.ckpt", "best.ckpt"}
-"""Checkpoints that training can go on from; model.ckpt holds weights alone."""
+TRAINED = {"last.ckpt", "previous.ckpt"}
+"""Checkpoints that training can go on from; the others hold weights alone."""
+BEST = "best.ckpt"
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
@@ -84,7 +85,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
 
 def _resumed_from(session: Session, run: Run) -> Path | None:
     """The checkpoint that training goes on from: every rank looks before the first writes another."""
-    resume = latest_good(run.checkpoints, names=TRAINED) if run.resumed else None
+    resume = _trained(run.checkpoints) if run.resumed else None
     if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
         run.tracker.drop_after(step)
@@ -94,6 +95,22 @@ def _resumed_from(session: Session, run: Run) -> Path | None:
             else f"resuming from {resume} (step {step})."
         )
     return resume
+
+
+def _trained(folder: Path) -> Path | None:
+    found = latest_good(folder, names=TRAINED)
+    if found is None:
+        best = latest_good(folder, names={BEST})
+        found = (
+            best if best is not None and "optimizer_states" in read(best) else None
+        )  # version 0.1 wrote it whole
+    return found
+
+
+def keep_model_alone(run: Run) -> None:
+    """Delete what only going on would need: the run is about to finish, and its model.ckpt is written."""
+    for name in (*TRAINED, BEST):
+        (run.checkpoints / name).unlink(missing_ok=True)
 
 
 def _part() -> None:

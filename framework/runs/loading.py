@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
 from framework.configuration.schema import resolve
-from framework.data import Data, Frame
+from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
 from framework.distributions.moved import Moved
 from framework.errors import CheckpointError
@@ -46,13 +46,9 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     frames: dict[int, Frame | None] = {}  # of the inputs that are being predicted for, by their identity
 
     def ready(model: nn.Module, given: tuple[Any]) -> Tensor:
-        batch = data.asked(*given)
-        inputs = batch["input"]
-        own = next(model.parameters(), inputs)
-        # bytes are pixels, which encoders scale; any other number is one of the model's own type
-        inputs = inputs.to(own.device, inputs.dtype if inputs.dtype == torch.uint8 else own.dtype)
-        frames[id(inputs)] = data.frame(batch)
-        return inputs
+        batch = asked_of(predictor, data, *given)
+        frames[id(batch["input"])] = data.frame(batch)
+        return batch["input"]
 
     def answered(model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
         frame = frames.pop(id(inputs[0]))
@@ -61,6 +57,16 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     predictor.register_forward_pre_hook(ready)
     predictor.register_forward_hook(answered)
     return predictor
+
+
+def asked_of(predictor: Predictor, data: Data, given: Any) -> Batch:
+    """What a predictor reads, of what a user gives; errors as `Data.asked`."""
+    batch = data.asked(given)
+    inputs = batch["input"]
+    own = next(predictor.parameters(), inputs)
+    # bytes are pixels, which encoders scale; any other number is one of the model's own type
+    kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
+    return {**batch, "input": inputs.to(own.device, kind)}
 
 
 def reader(description: Description) -> Data:

@@ -5,7 +5,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ import yaml
 
 from framework.configuration.config import Config
 from framework.configuration.settings import Settings, store_experiment
-from framework.errors import UserError
+from framework.errors import DataError, UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
-from framework.storage.files import write_whole
+from framework.storage.files import unwritable, write_whole
 from framework.storage.plain_values import read_yaml
 from framework.storage.progress import first_rank
-from framework.tracking.run_info import read_run_info
+from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
@@ -106,6 +106,10 @@ def opened(config: Config) -> Iterator[Run]:
             tracker.close("KILLED" if killed else "FAILED")
             if killed:
                 sys.stderr.write(f"stopped; go on with: python -m framework resume={run.folder}\n")
+            if refused := unwritable(error):
+                raise DataError(
+                    f"{refused} What was written is whole: resume={run.folder} goes on."
+                ) from error
             raise
         tracker.close("FINISHED")
 
@@ -138,15 +142,13 @@ def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
     if config.settings.logger.name == "none":
         return NoTracker(config.folder, resumed=resumed)
+    parent = os.environ.get(PARENT)
+    named = run_name(config.settings, config.mode, config.overrides)
     return MlflowTracker(
         config.folder,
-        uri=config.settings.logger.uri,
-        experiment=store_experiment(config.values),
-        run_name=run_name(config.settings, config.mode, config.overrides),
-        parent=os.environ.get(PARENT),
-        wait=SYNCED_WITHIN if PARENT in os.environ else 0.0,
-        run_id=run_id,
+        Destination(config.settings.logger.uri, store_experiment(config.values), named, parent, run_id),
         resumed=resumed,
+        wait=0.0 if parent is None else SYNCED_WITHIN,
     )
 
 
@@ -182,8 +184,9 @@ def _describe(run: Run) -> None:
 def _record(run: Run, error: BaseException) -> None:
     """Leave the traceback and the sentence with the run."""
     path = run.folder / "traceback.txt"
-    path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
-    run.tracker.log_artifact(path)
+    with suppress(OSError):  # of a full disk there is no more to be said than the error itself
+        write_whole(path, "".join(traceback.format_exception(error)).encode())
+        run.tracker.log_artifact(path)
     sentence = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     if isinstance(error, Stopped):
         sentence = f"stopped by {error.signal}"

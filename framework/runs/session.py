@@ -39,6 +39,7 @@ from framework.runs.loading import PREFIX, load_with_description, reader
 from framework.runs.run import Run
 from framework.storage.progress import first_rank, output
 from framework.target import Target
+from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, told
 from framework.training.checkpoint import WholeCheckpoints
 
@@ -109,20 +110,20 @@ class Session:
         """Tell the run what it is fed, and leave what to cite with it."""
         for role, data in (("data", self.data), ("outliers", self.outliers)):
             if data is not None:
-                tags = {f"{role}.{key}": value for key, value in data.fingerprint().items()}
-                tags |= {
-                    f"{role}.synthetic": str(data.synthetic).lower(),
-                    f"{role}.skipped": str(data.skipped),
-                }
-                run.tracker.set_tags(tags)
+                about = {"synthetic": str(data.synthetic).lower(), "skipped": str(data.skipped)}
+                facts = {**data.fingerprint(), **about}
+                run.tracker.set_tags({f"{role}.{key}": value for key, value in facts.items()})
+                mode = "training" if run.config.mode == "train" else run.config.mode
+                context = mode if role == "data" else role
+                run.tracker.log_dataset(self.parts[role]["name"], context, facts)
         record_citations(run, self.parts)
 
     def save_model(self, run: Run) -> None:
-        """Leave weights and description with the run, for `framework.load`."""
+        """Leave weights and description with the run, for `framework.load`; in the store they are its model."""
         path = run.checkpoints / "model.ckpt"
         state = {f"{PREFIX}{key}": value.cpu() for key, value in self.predictor.state_dict().items()}
         WholeCheckpoints().save_checkpoint({"framework": self.description(), "state_dict": state}, path)
-        run.tracker.log_artifact(path, "checkpoints")
+        run.tracker.log_artifact(path, MODEL)
 
 
 def record_citations(run: Run, parts: Resolved) -> None:

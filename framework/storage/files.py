@@ -1,5 +1,6 @@
 """Files that are whole or absent, and locks between processes."""
 
+import errno
 import os
 import socket
 import threading
@@ -8,6 +9,31 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from filelock import FileLock
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_CLOSED = (
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOTDIR,
+    errno.EEXIST,
+    errno.EISDIR,
+    errno.ENAMETOOLONG,
+)
+
+
+def full(error: OSError) -> bool:
+    """Whether a disk has no more room, or its user may use no more."""
+    return error.errno in _FULL
+
+
+def unwritable(error: BaseException) -> str | None:
+    """What is wrong with a place that takes nothing, and what to do, as a sentence; None for any other error."""
+    if not isinstance(error, OSError) or error.errno not in (*_FULL, *_CLOSED):
+        return None
+    where = f"{error.filename} cannot be written" if error.filename else "A file cannot be written"
+    remedy = "Free some space" if full(error) else "Choose a place that can"
+    return f"{where} ({error.strerror}). {remedy}."
 
 
 @contextmanager

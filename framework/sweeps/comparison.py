@@ -9,16 +9,28 @@ from typing import Any, Literal
 
 from framework.configuration.settings import store_experiment
 from framework.errors import ConfigError, did_you_mean
-from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, aggregate, csv, machine, results_table
+from framework.reports.table import (
+    COST_BETTER,
+    COST_COLUMNS,
+    Better,
+    aggregate,
+    csv,
+    machine,
+    markdown,
+    results_table,
+)
 from framework.runs.job import RECORD
 from framework.runs.run import stored_config
 from framework.storage.plain_values import read_json
 from framework.storage.progress import output
 from framework.tracking.ended import mark_dead
-from framework.tracking.tracker import MlflowTracker
+from framework.tracking.run_info import Destination, read_run_info
+from framework.tracking.tracker import MlflowTracker, mlflow_store
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
 PARENT_OF = "what a sweep keeps of its parent run"
+DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
+"""The tag that MLflow shows as a run's description, and the letters that fit into it."""
 RETURNED = "best validation loss (nats)"
 """What a training returns to its sweep."""
 
@@ -46,12 +58,12 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
     logger = config.get("logger") or {}
     if logger.get("name") != "mlflow":
         return None
-    earlier = folder / "parent.json"  # of the sweep that is being resumed
-    known = read_json(earlier, PARENT_OF).get("run_id") if earlier.is_file() else None
+    earlier = read_run_info(folder)  # of the sweep that is being repeated, which may have been killed
+    known = earlier.run_id if earlier else None
     logger = {**logger, "experiment": store_experiment(config)}
     tracker = _parent(folder, logger, known)
     tracker.open()
-    tracker.set_tags({"mode": "sweep", "folder": str(folder)})
+    tracker.set_tags({"mode": "sweep", "folder": str(folder), DESCRIPTION: f"A sweep in `{folder}`."})
     run_id = tracker.run_id
     (folder / "parent.json").write_text(json.dumps({"run_id": run_id, "logger": logger}), encoding="utf-8")
     tracker.leave_open()
@@ -66,7 +78,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
             mark_dead(path.parent)  # a killed process could not close its run
     rows = [row for row in (_row(path) for path in _in_order(folder.glob("*/results.json"))) if row]
     files: list[Path] = []
-    compared: list[dict[str, object]] = []
+    said = ""
     if rows:
         # also those of another command's jobs in this folder: what tells rows apart must be told
         keys = _varied([*overrides, *(row["overrides"] for row in rows)])
@@ -85,7 +97,8 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         files.append(folder / "comparison.csv")
         files.extend(_picture(compared, rows, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
-    _close_parent(folder, files, compared)
+        said = f"{len(rows)} runs over {', '.join(keys) or 'nothing'}.\n\n{markdown(compared, columns, better=better)}"
+    _close_parent(folder, files, said)
 
 
 def rank(
@@ -151,10 +164,10 @@ def rank(
     return Ranking(trials[order[0]], said)
 
 
-def close_ranking(folder: Path) -> None:
-    """Log to the parent run what a search found."""
+def close_ranking(folder: Path, said: str) -> None:
+    """Log to the parent run what a search found; `said` describes it."""
     paths = (folder / name for name in ("ranking.csv", "best.yaml"))
-    _close_parent(folder, [path for path in paths if path.is_file()], [])
+    _close_parent(folder, [path for path in paths if path.is_file()], said)
 
 
 def _results(trial: Trial) -> dict[str, Any]:
@@ -273,25 +286,21 @@ def _picture(
 def _parent(folder: Path, logger: Mapping[str, Any], run_id: str | None) -> MlflowTracker:
     return MlflowTracker(
         folder,
-        uri=logger.get("uri"),
-        experiment=logger["experiment"],
-        run_name=f"sweep {folder.name}",
-        parent=None,
-        run_id=run_id,
+        Destination(logger.get("uri"), logger["experiment"], f"sweep {folder.name}", run_id=run_id),
+        opening_patience=30.0,  # its jobs are told its id
+        open_store=mlflow_store(),  # which sends what they leave, too
     )
 
 
-def _close_parent(folder: Path, files: Sequence[Path], rows: Sequence[Mapping[str, Any]]) -> None:
+def _close_parent(folder: Path, files: Sequence[Path], said: str) -> None:
     path = folder / "parent.json"
     if not path.is_file():
         return
     stored = read_json(path, PARENT_OF)
     tracker = _parent(folder, stored["logger"], stored["run_id"])
     tracker.open()
-    for row in rows:
-        numbers = {key: float(value) for key, value in row.items() if isinstance(value, int | float)}
-        name = f"{str(row['method']).replace(' + ', ' ')}/{row['data']}"  # MLflow's names hold no plus
-        tracker.log_metrics({f"{name}/{key}": value for key, value in numbers.items()}, 0, 0)
+    if said:  # numbers of the parent's own would be charts that none of its jobs has a point in
+        tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {said}"[:LONGEST_DESCRIPTION]})
     for file in files:
         tracker.log_artifact(file)
     failed = [record for record in folder.glob(f"*/{RECORD}") if _status(record.parent) != "completed"]

@@ -1,18 +1,22 @@
 """A run in an MLflow store. Imports MLflow, so it is imported only when a store is opened."""
 
 import getpass
+import hashlib
+import json
 import logging
 import os
+import platform
 import re
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import final
 
 from framework.errors import CheckpointError
 from framework.storage.cache import folder as cache_folder
 from framework.storage.files import alone, remove_leftovers, replacing
-from framework.tracking.run_info import RunInfo, default_uri, sqlite_path, store_uri, without_password
+from framework.tracking.run_info import MODEL, RunInfo, default_uri, sqlite_path, store_uri, without_password
 from framework.tracking.sender import Record, Store, reason
 
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
@@ -20,9 +24,10 @@ os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # MLflow's, about its own dependencies
-    from mlflow import MlflowClient
-    from mlflow.entities import Metric, Param, Run, RunTag
+    from mlflow import MlflowClient, artifacts
+    from mlflow.entities import Dataset, DatasetInput, InputTag, LoggedModelOutput, Metric, Param, Run, RunTag
     from mlflow.exceptions import MlflowException
+    from mlflow.models import Model
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
 _log = logging.getLogger(__name__)
@@ -34,6 +39,9 @@ logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)
 
 _KEY, _FOLDER = "framework.key", "framework.folder"  # tags
 _LONGEST_NAME = 250  # characters
+_DIGEST = 16  # letters that are shown
+_LOADER = "framework.deployment.served"
+"""The module by which MLflow loads a model: written here, since what a run folder says may be a stranger's."""
 
 
 @final
@@ -70,6 +78,8 @@ class MlflowStore(Store):
             **self.replay,
         }
         self._run_id: str = run.info.run_id
+        self._experiment_id: str = run.info.experiment_id
+        self._model_name = re.sub(r"[^\w-]", "_", info.run_name.partition(",")[0])[:_LONGEST_NAME] or "model"
         self._params: dict[str, str] = dict(run.data.params)
         # The last step of each metric; RunData itself gives the values alone.
         self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
@@ -85,6 +95,8 @@ class MlflowStore(Store):
                 self._client.set_terminated(self._run_id, status, end)
         elif "resumed_after" in batch[0]:
             self.replay = {"replay_after": batch[0]["resumed_after"], "replay_until": dict(self._stored)}
+        elif "dataset" in batch[0]:
+            self._client.log_inputs(self._run_id, [_dataset(batch[0])])
         else:
             metrics = [metric for record in batch for metric in self._metrics(record)]
             params, tags = self._params_and_tags(batch)
@@ -100,6 +112,8 @@ class MlflowStore(Store):
         held = [file, *file.rglob("*")] if file.is_dir() else [file]
         if not all(item.resolve().is_relative_to(home) for item in held):
             _log.warning("%s leads out of the run folder %s: it is not sent.", file, home)
+        elif place == MODEL and file.is_file():
+            self._send_model(file)
         elif file.is_dir():
             self._client.log_artifacts(
                 self._run_id, str(file), f"{place}/{file.name}" if place else file.name
@@ -108,6 +122,26 @@ class MlflowStore(Store):
             self._client.log_artifact(self._run_id, str(file), place or None)
         else:
             _log.warning("%s is gone before it could be stored.", file)
+
+    def _send_model(self, file: Path) -> None:
+        """Make the checkpoint a model of MLflow, which serves it; what was sent before is replaced."""
+        found = self._client.search_logged_models(
+            [self._experiment_id], f"source_run_id = '{self._run_id}'", max_results=1
+        )
+        model = found[0] if found else None
+        if model is None:
+            model = self._client.create_logged_model(self._experiment_id, self._model_name, self._run_id)
+        described = Model(run_id=self._run_id, model_id=model.model_id)
+        described.add_flavor(
+            "python_function", loader_module=_LOADER, data=file.name, python_version=platform.python_version()
+        )
+        with TemporaryDirectory() as folder:
+            described.save(str(Path(folder) / "MLmodel"))
+            self._client.log_model_artifact(model.model_id, str(Path(folder) / "MLmodel"))
+        self._client.log_model_artifact(model.model_id, str(file))
+        self._client.finalize_logged_model(model.model_id, "READY")
+        if model.model_id not in _models(self._client.get_run(self._run_id)):
+            self._client.log_outputs(self._run_id, [LoggedModelOutput(model.model_id, 0)])
 
     def _found(self, info: RunInfo, experiment_id: str) -> Run | None:
         if info.run_id is not None:
@@ -178,6 +212,24 @@ class MlflowStore(Store):
         return key
 
 
+def _dataset(record: Record) -> DatasetInput:
+    """What the column `Dataset` of MLflow shows: name and digest, and on a click all that is known of the data."""
+    facts: dict[str, str] = record["facts"]
+    digest = facts.get("sha256") or hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    dataset = Dataset(
+        record["dataset"],
+        digest[:_DIGEST],
+        source_type="local",
+        source=json.dumps({"root": facts.get("root", "")}),
+        profile=json.dumps(facts),
+    )
+    return DatasetInput(dataset, [InputTag("mlflow.data.context", record["context"])])
+
+
+def _models(run: Run) -> list[str]:
+    return [output.model_id for output in run.outputs.model_outputs] if run.outputs else []
+
+
 def run_folder(run_id: str, uri: str | None = None) -> Path:
     """The folder a run was made in, or else a copy, in the cache, of the checkpoints in its store.
 
@@ -199,13 +251,17 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         made = Path(run.data.tags.get(_FOLDER, ""))
         if _FOLDER in run.data.tags and made.is_dir():
             return made
-        if not client.list_artifacts(run_id, "checkpoints"):
+        models = _models(run)
+        if not models and not client.list_artifacts(run_id, "checkpoints"):
             raise CheckpointError(
                 f"Run {run_id} of {shown} has no checkpoints, and its folder {made} is gone."
             )
         copy = cache_folder("runs") / run_id
         copy.mkdir(exist_ok=True)
-        client.download_artifacts(run_id, "checkpoints", str(copy))
+        if models:
+            place = client.get_logged_model(models[0]).artifact_location  # "models:/" asks another store
+            return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=uri))
+        client.download_artifacts(run_id, "checkpoints", str(copy))  # a run of version 0.1
     except MlflowException as error:
         raise CheckpointError(f"Run {run_id} cannot be had from {shown}: {reason(error)}.") from error
     return copy
@@ -239,7 +295,10 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
     found = client.get_experiment_by_name(info.experiment)
     if found is None:
         try:
-            return client.create_experiment(info.experiment, artifact_location=info.artifacts)
+            made = client.create_experiment(info.experiment, artifact_location=info.artifacts)
+            for key, value in _view(made).items():
+                client.set_experiment_tag(made, key, value)
+            return made
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
@@ -249,6 +308,23 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
             f"experiment {info.experiment!r} was deleted there; restore it, or choose another name"
         )
     return found.experiment_id
+
+
+def _view(experiment_id: str) -> dict[str, str]:
+    """Tags of an experiment: a view with both losses in one chart, and its link as the description.
+
+    MLflow itself draws each metric apart; a view is what its button `Share` makes.
+    """
+    losses = ["train/loss", "validation/loss"]
+    chart = {"uuid": "losses", "metricSectionId": "losses", "type": "LINE", "metricKey": losses[0]}
+    chart |= {"selectedMetricKeys": losses, "deleted": False, "isGenerated": False, "lineSmoothness": 0}
+    section = {"uuid": "losses", "name": "Losses", "display": True, "isReordered": False}
+    view = {"compareRunCharts": [chart], "compareRunSections": [section], "isAccordionReordered": True}
+    link = f"#/experiments/{experiment_id}/runs?viewStateShareKey=losses&compareRunsMode=CHART"
+    return {
+        "mlflow.sharedViewState.losses": json.dumps(view),
+        "mlflow.note.content": f"[Training and validation loss in one chart]({link})",
+    }
 
 
 def _user() -> str:

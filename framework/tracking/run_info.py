@@ -5,6 +5,8 @@ import logging
 import os
 import re
 import threading
+import time
+import uuid
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,28 @@ from framework.storage.reading import guarded, read_bytes
 _log = logging.getLogger(__name__)
 
 SIDECAR = "run.json"
+MODEL = "model:"
+"""The place of a checkpoint that the store keeps as the run's model, and not in a folder of its files."""
 _SQLITE = "sqlite:///"
+
+
+@dataclass(frozen=True)
+class Destination:
+    """A run in a store.
+
+    Attributes:
+        uri: an MLflow tracking URI; None: `default_uri` of the run's folder.
+        experiment: its name in MLflow; made if new.
+        run_name: shown in MLflow.
+        parent: run id under which MLflow shows this one.
+        run_id: of the run to go on with; None: a new run, or the one in the folder if that has no id yet.
+    """
+
+    uri: str | None
+    experiment: str
+    run_name: str
+    parent: str | None = None
+    run_id: str | None = None
 
 
 @dataclass(frozen=True)
@@ -51,6 +74,27 @@ class RunInfo:
     """Up to which step each metric was in the store by then, and need not be sent again."""
     owed: tuple[tuple[str, str], ...] = ()
     """Files (path, folder in the store) that the store has still to take."""
+
+    @classmethod
+    def at(cls, place: Destination, folder: Path) -> "RunInfo":
+        """Of a run in `folder` that begins now.
+
+        Raises:
+            ConfigError: MLflow cannot keep runs in that store.
+        """
+        uri = store_uri(place.uri) if place.uri else default_uri(folder)
+        files, key = artifact_folder(uri, folder), uuid.uuid4().hex
+        return cls(
+            place.run_id,
+            uri,
+            place.experiment,
+            place.run_name,
+            place.parent,
+            files,
+            key,
+            time.time(),
+            "RUNNING",
+        )
 
 
 def read_run_info(folder: Path) -> RunInfo | None:

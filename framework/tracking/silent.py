@@ -27,6 +27,9 @@ class SilentTracker(Tracker):
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         pass
 
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        pass
+
     def log_artifact(self, path: Path, folder: str = "") -> None:
         pass
 

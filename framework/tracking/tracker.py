@@ -17,15 +17,14 @@ from framework.storage.files import write_whole
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
     SIDECAR,
+    Destination,
     RunInfo,
     Sidecar,
-    artifact_folder,
-    default_uri,
     read_run_info,
-    store_uri,
     without_password,
 )
 from framework.tracking.sender import OpenStore, Sender
+from framework.tracking.store_process import StoreProcess
 
 _log = logging.getLogger(__name__)
 
@@ -67,8 +66,15 @@ class Tracker(ABC):
         """Record numbers, NaN and infinities among them."""
 
     @abstractmethod
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        """Record what the run reads; `context` says for what, "training" say, `facts` are of `Data.fingerprint`."""
+
+    @abstractmethod
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Record a file or a directory, under `folder` in the store. Leave it there: it is read later."""
+        """Record a file or a directory, under `folder` in the store. Leave it there: it is read later.
+
+        A checkpoint under `MODEL` (`run_info`) becomes the model of the run, which the store can serve.
+        """
 
     @abstractmethod
     def drop_after(self, step: int) -> None:
@@ -121,6 +127,9 @@ class NoTracker(Tracker):
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
 
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        """Nothing: nobody could search them."""
+
     def log_artifact(self, path: Path, folder: str = "") -> None:
         """Nothing: the file is where it is."""
 
@@ -146,65 +155,49 @@ class NoTracker(Tracker):
 
 @final
 class MlflowTracker(Tracker):
-    """Sends a run to an MLflow store from a thread of its own, in batches, however long that takes.
+    """Sends a run to an MLflow store in batches, from a process of its own, however long that takes.
 
-    Everything logged is a line of the journal, and the store is a copy of it. The thread sends what is new
-    when 50 lines wait or two seconds have passed; when the store is locked, full or away it tries again, for
-    ever and ever less often. What the process could not send before it ended, `sync` sends. What the store
-    has is not sent again: a resumed run repeats the steps after its checkpoint, and of these the store keeps
-    what it got first.
+    Everything logged is a line of the journal, and the store is a copy of it. A thread sends what is new when 50
+    lines wait or two seconds have passed; when the store is locked, full or away it tries again, for ever and ever
+    less often. What the process could not send before it ended, `sync` sends. What the store has is not sent again:
+    a resumed run repeats the steps after its checkpoint, and of these the store keeps what it got first.
 
     A short run that somebody else will `sync` when it has ended (a sweep, which has MLflow at hand already) need not
     pay for MLflow's import, several seconds: with `wait` nothing is sent before that time is over.
 
     Args:
         folder: of the run.
-        uri: an MLflow tracking URI; None: `default_uri(folder)`.
-        experiment: its name in MLflow; made if new.
-        run_name: shown in MLflow.
-        parent: run id under which MLflow shows this one.
-        run_id: of the run to go on with; None: a new run, or the one in the folder if that has no id yet.
-        resumed: whether to go on with the run in the folder, or to set that aside; None: as `run_id` tells.
-        patience: seconds `close` waits for the store.
-        opening_patience: seconds `open` waits for the store.
+        destination: which run of which store.
+        resumed: whether to go on with the run in the folder, or to set that aside; None: as the destination tells.
         wait: seconds after opening before the first line is sent; a run that ends sooner sends nothing.
+        opening_patience: seconds `open` waits for the store, for those who need the run's id at once.
+        patience: seconds `close` waits for the store.
+        open_store: what opens the run in the store; None: a process of its own.
 
     Raises:
-        ConfigError: `uri` names a store that MLflow cannot keep runs in.
+        ConfigError: the destination is a store that MLflow cannot keep runs in.
     """
 
     def __init__(
         self,
         folder: Path,
+        destination: Destination,
         *,
-        uri: str | None,
-        experiment: str,
-        run_name: str,
-        parent: str | None,
-        run_id: str | None,
         resumed: bool | None = None,
-        patience: float = 60.0,
-        opening_patience: float = 30.0,
         wait: float = 0.0,
+        opening_patience: float = 0.0,
+        patience: float = 60.0,
+        open_store: OpenStore | None = None,
     ) -> None:
         self.folder = folder.absolute()
         self.journal = Journal(self.folder / JOURNAL)
-        uri = store_uri(uri) if uri else default_uri(self.folder)
-        self._wanted = RunInfo(
-            run_id=run_id,
-            uri=uri,
-            experiment=experiment,
-            run_name=run_name,
-            parent=parent,
-            artifacts=artifact_folder(uri, self.folder),
-            key=uuid.uuid4().hex,
-            started=time.time(),
-            status="RUNNING",
-        )
+        self._wanted = RunInfo.at(destination, self.folder)
         self._resumed = resumed
         self._patience = patience
         self._opening_patience = opening_patience
         self._sends_from = time.monotonic() + wait if wait else 0.0
+        self._process = StoreProcess() if open_store is None else None
+        self._open_store = open_store or self._process
         self._sidecar: Sidecar | None = None
         self._sender: Sender | None = None
         self._closed = False
@@ -216,12 +209,11 @@ class MlflowTracker(Tracker):
         self._notice()
 
     def _start_sending(self, sidecar: Sidecar) -> None:
-        # Imported here and not in the sender's thread: imports of two threads can get into each other's way.
-        sender = Sender(self.folder, self.journal, sidecar, mlflow_store())
-        sender.start()
-        if not sender.tried.wait(self._opening_patience):
-            sender.warn("no answer yet")
-        self._sender = sender
+        assert self._open_store is not None
+        self._sender = Sender(self.folder, self.journal, sidecar, self._open_store)
+        self._sender.start()
+        if self._opening_patience and not self._sender.tried.wait(self._opening_patience):
+            self._sender.warn("no answer yet")
 
     def log_params(self, flat: Mapping[str, object]) -> None:
         shown = {key: str(value) for key, value in flat.items()}
@@ -237,6 +229,9 @@ class MlflowTracker(Tracker):
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
         self._notice()
+
+    def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
+        self._log(dataset=name, context=context, facts=dict(facts))
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
         path = path.absolute()
@@ -270,6 +265,8 @@ class MlflowTracker(Tracker):
                 self.journal.path,
                 shlex.quote(str(self.folder)),
             )
+        if self._process is not None:
+            self._process.end(at_once=self._sender is not None and self._sender.is_alive())
         self._sender = None
         self.journal.close()
 

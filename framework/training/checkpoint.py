@@ -1,6 +1,5 @@
 """Checkpoints that are whole or absent: written aside, synced, renamed; verified before they are read."""
 
-import errno
 import hashlib
 import os
 import shutil
@@ -16,7 +15,7 @@ from torch import Tensor
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError, shown
-from framework.storage.files import remove_leftovers, replacing
+from framework.storage.files import full, remove_leftovers, replacing
 from framework.storage.plain_values import require_flat
 
 # A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
@@ -55,9 +54,11 @@ class WholeCheckpoints(CheckpointIO):
                     torch.save(checkpoint, cast(BinaryIO, hashed))
                     file.write(_MARK + hashed.digest.digest())
                 _require_plain(partial, path)
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise _no_room(path, needed) from error
+        except (OSError, RuntimeError) as error:
+            # torch fails once more when it closes a file that took no more
+            fault = error if isinstance(error, OSError) else error.__context__
+            if isinstance(fault, OSError) and full(fault):
+                raise _no_room(path, needed) from fault
             raise
 
     def load_checkpoint(
@@ -180,7 +181,7 @@ def _require_plain(partial: Path, path: Path) -> None:
 def _no_room(path: Path, needed: int) -> CheckpointError:
     free = shutil.disk_usage(path.parent).free
     return CheckpointError(
-        f"The checkpoint {path} needs {needed / 1e6:.1f} MB and its disk has {free / 1e6:.1f} MB free. "
+        f"The checkpoint {path} needs {needed / 1e6:.3g} MB and its disk has {free / 1e6:.3g} MB free. "
         "It was not written; earlier ones are untouched. Free some space and resume the run."
     )
 

@@ -155,8 +155,9 @@ class Training(pl.LightningModule):
 class KeepCheckpoints(pl.Callback):
     """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, where it is to be kept, best.ckpt.
 
-    `last` is saved at the end of every epoch that was validated, of the last one, and every `every_steps` steps; `best`
-    whenever the validation loss is lower than ever. Each write is whole or absent (framework.training.checkpoint).
+    Training goes on from the first two; `best` holds weights alone, with Adam a third of the size. `last` is saved at
+    the end of every epoch that was validated, of the last one, and every `every_steps` steps; `best` whenever the
+    validation loss is lower than ever. Each write is whole or absent (framework.training.checkpoint).
 
     Attributes:
         kept_loss: validation loss of the weights that will be tested, nats.
@@ -196,7 +197,7 @@ class KeepCheckpoints(pl.Callback):
         if self.keep == "last" or loss < self.kept_loss:
             self.kept_loss, self.kept_epoch = loss, trainer.current_epoch
             if self.keep == "best":
-                trainer.save_checkpoint(self.kept)
+                trainer.save_checkpoint(self.kept, weights_only=True)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         done, every = trainer.current_epoch + 1, trainer.check_val_every_n_epoch or 1

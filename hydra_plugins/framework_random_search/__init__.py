@@ -109,10 +109,11 @@ class RandomSearch(Sweeper):
         ]
         varied = [key for key, domain in space.items() if domain.size > 1]
         ranking = comparison.rank(folder, trials, varied, self.metric, self.direction)
+        found = "no trial has a finite value"
         if ranking.best is not None:
             found = f"{ranking.said}; trial {ranking.best.folder.name} of {len(trials)} (seed {self.seed})"
             _best.write(folder, ranking.best.overrides, loader, found)
-        comparison.close_ranking(folder)
+        comparison.close_ranking(folder, f"a random search of {len(trials)} trials; {found}")
 
 
 def _folder(one: JobReturn) -> Path:

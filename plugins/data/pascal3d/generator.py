@@ -11,7 +11,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-import scipy.io
 from PIL import Image
 
 from framework.errors import ConfigError
@@ -98,8 +97,10 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
         "database": "synthetic",
         "objects": _objects(shot),
     }
+    from scipy.io import savemat  # a quarter of a second, for those alone who generate
+
     content = io.BytesIO()
-    scipy.io.savemat(content, {"record": record}, do_compression=True)
+    savemat(content, {"record": record}, do_compression=True)
     (part / "Annotations" / folder / f"{name}.mat").write_bytes(HEADER + content.getvalue()[len(HEADER) :])
 
 

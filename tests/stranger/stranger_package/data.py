@@ -1,6 +1,7 @@
 """A data set that the framework does not ship."""
 
 import os
+import resource
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -30,6 +31,7 @@ class Dial(Data):
         signal_at: int | None = None,
         signal_number: int = 9,
         signal_marker: str = "",
+        longest_file: int | None = None,
     ) -> None:
         self.samples = samples
         self.noise = noise
@@ -37,6 +39,7 @@ class Dial(Data):
         self.signal_at = signal_at
         self.signal_number = signal_number
         self.signal_marker = Path(signal_marker)
+        self.longest_file = longest_file
         self.batches = 0
         self.target = Target("angle", ("needle",))
         self.input_shape = (2,)
@@ -45,6 +48,8 @@ class Dial(Data):
         self.skipped = 0
 
     def prepare(self) -> None:
+        if self.longest_file is not None:  # stands for a disk that is full from then on
+            resource.setrlimit(resource.RLIMIT_FSIZE, (self.longest_file, resource.RLIM_INFINITY))
         generator = torch.Generator().manual_seed(0)
         angle = (torch.rand(self.samples, generator=generator) * 2 - 1) * torch.pi
         tip = torch.stack([angle.cos(), angle.sin()], -1)

@@ -1,0 +1,151 @@
+"""A store in a process of its own, so that the process that trains never imports MLflow.
+
+Questions and answers are lines of JSON. The process ends with its input: when it is closed, or when whoever asks died.
+"""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, BinaryIO, final
+
+from pydantic import TypeAdapter
+
+from framework.tracking.run_info import RunInfo
+from framework.tracking.sender import Record, Store, reason
+
+_log = logging.getLogger(__name__)
+_COMMAND = (sys.executable, "-P", "-m", __name__)
+_ENDING = 5.0  # seconds that the process has to end by itself
+
+
+class StoreAway(Exception):
+    """What the process says of a store that is locked, full or away, or that the process has ended."""
+
+
+@final
+class StoreProcess:
+    """Opens runs in MLflow (`sender.OpenStore`), in a process that starts with the first; it is kept for the next."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __call__(self, folder: Path, info: RunInfo) -> Store:
+        if self._process is not None and self._process.poll() is not None:
+            self.end()
+        if self._process is None:
+            # in a session of its own: a Ctrl-C is for those who train, and they say when it is to end
+            self._process = subprocess.Popen(
+                _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+            )
+        return _DistantStore(self, folder, info)
+
+    def ask(self, **question: Any) -> Mapping[str, Any]:
+        """What the process answers; what it has to say on the way is said here.
+
+        Raises:
+            StoreAway: the store failed, or the process has ended.
+        """
+        process = self._process
+        assert process is not None and process.stdin is not None and process.stdout is not None
+        line = b""
+        with suppress(BrokenPipeError):
+            process.stdin.write(json.dumps(question).encode() + b"\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        answer: dict[str, Any] = json.loads(line) if line else {"error": "the sending process has ended"}
+        for level, text in answer.get("said", ()):
+            _log.log(level, "%s", text)
+        if "error" in answer:
+            raise StoreAway(answer["error"])
+        return answer
+
+    def end(self, *, at_once: bool = False) -> None:
+        """End the process; `at_once`, also in the middle of a question."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        assert process.stdin is not None and process.stdout is not None
+        if at_once:
+            process.kill()
+        with suppress(OSError):  # it has ended already, with part of a question
+            process.stdin.close()
+        try:
+            process.wait(_ENDING)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+
+@final
+class _DistantStore(Store):
+    def __init__(self, process: StoreProcess, folder: Path, info: RunInfo) -> None:
+        self._process = process
+        answer = process.ask(open=str(folder), info=asdict(info))
+        owed = tuple((path, place) for path, place in answer["identity"]["owed"])  # JSON has lists alone
+        self.identity, self.replay = {**answer["identity"], "owed": owed}, answer["replay"]
+
+    def send(self, batch: Sequence[Record]) -> None:
+        self.replay = self._process.ask(send=batch)["replay"]
+
+    def send_file(self, path: str, place: str) -> None:
+        self._process.ask(send_file=path, place=place)
+
+
+class _Said(logging.Handler):
+    """Keeps what is logged for the next answer."""
+
+    def __init__(self) -> None:
+        logging.Handler.__init__(self, logging.WARNING)
+        self.lines: list[tuple[int, str]] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append((record.levelno, record.getMessage()))
+
+
+def serve(questions: BinaryIO, answers: BinaryIO) -> None:
+    """Answer until the questions end."""
+    said = _Said()
+    logging.getLogger().addHandler(said)
+    store: Store | None = None
+    for line in questions:
+        question = json.loads(line)
+        try:
+            if "open" in question:
+                from framework.tracking.mlflow_store import (
+                    MlflowStore,
+                )  # seconds: whoever asks waits for them
+
+                info = TypeAdapter(RunInfo).validate_python(question["info"])
+                store = MlflowStore(Path(question["open"]), info)
+            assert store is not None, "a run is opened first"
+            if "send" in question:
+                store.send(question["send"])
+            elif "send_file" in question:
+                store.send_file(question["send_file"], question["place"])
+            answer: dict[str, Any] = {"identity": dict(store.identity), "replay": dict(store.replay)}
+        except Exception as error:
+            answer = {"error": reason(error)}
+        answer["said"], said.lines = said.lines, []
+        try:
+            answers.write(json.dumps(answer).encode() + b"\n")
+            answers.flush()
+        except BrokenPipeError:  # whoever asked has died
+            return
+
+
+def main() -> None:
+    """Serve standard input; what MLflow prints goes to the standard error, and not among the answers."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    serve(sys.stdin.buffer, answers)
+
+
+if __name__ == "__main__":
+    main()

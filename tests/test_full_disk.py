@@ -1,0 +1,57 @@
+"""Places that take nothing: a sentence, exit 1, and every checkpoint that is there is whole."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from framework.training.checkpoint import read
+from tests.conftest import TINY, Done, Framework, listed
+
+STEPS = ("trainer.checkpoint_every_steps=2", "trainer.max_epochs=2", "optimizer=adam")
+
+
+def one_sentence(done: Done) -> str:
+    """What a command that failed says of it."""
+    errors = [line for line in done.out.splitlines() if line.startswith("error: ")]
+    assert done.code == 1, done.out
+    assert len(errors) == 1, done.out
+    assert "Traceback" not in done.out, done.out
+    return errors[0]
+
+
+@pytest.mark.parametrize(("size", "at"), [(4_000, "checkpoint"), (12_000, "last.ckpt"), (20_000, "")])
+def test_a_disk_that_is_full_ends_a_run_with_a_sentence(size: int, at: str, framework: Framework) -> None:
+    """While it trains, after it and when it draws: nothing longer than `size` bytes can be written."""
+    done = framework(*TINY, f"+data.longest_file={size}", "logger=none", *STEPS)
+    said = one_sentence(done)
+    assert at in said, said
+    assert "ree some space" in said, said
+    for path in done.folder.rglob("*.ckpt"):
+        read(path)
+    for path in done.folder.rglob("*.json"):
+        json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_a_disk_that_is_full_from_the_start(stranger_site: Path, tmp_path: Path) -> None:
+    run = f"hydra.run.dir={tmp_path / 'run'}"
+    arguments = (*TINY, "+data.longest_file=100", "logger=none", run)
+    done = listed(*arguments, folder=tmp_path, site=stranger_site)
+    assert "ree some space" in one_sentence(Done(done.code, done.out, tmp_path / "run"))
+
+
+def test_a_full_store_stops_nobody(framework: Framework) -> None:
+    done = framework(*TINY, "+data.longest_file=100000", "pictures=false", *STEPS)
+    assert done.code == 0, done.out
+    assert "mode=sync" in done.out
+    assert "Traceback" not in done.out
+    sent = framework("mode=sync", f"mode.run={done.folder}", folder="sync")
+    assert sent.code == 0, sent.out
+
+
+@pytest.mark.parametrize("place", ["file", "file/run"])
+def test_a_file_where_a_folder_is_wanted(place: str, framework: Framework, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    said = one_sentence(framework(*TINY, "logger=none", folder=place))
+    assert "file" in said
+    assert (tmp_path / "file").read_text() == "mine"
