@@ -118,9 +118,8 @@ def serve(questions: BinaryIO, answers: BinaryIO) -> None:
         question = json.loads(line)
         try:
             if "open" in question:
-                from framework.tracking.mlflow_store import (
-                    MlflowStore,
-                )  # seconds: whoever asks waits for them
+                # takes seconds, for which whoever asks waits
+                from framework.tracking.mlflow_store import MlflowStore
 
                 info = TypeAdapter(RunInfo).validate_python(question["info"])
                 store = MlflowStore(Path(question["open"]), info)
