@@ -176,22 +176,24 @@ def pull(first, last, number, painted, crossing, share, least, place, owner, val
     """What the kept pixels from `first` to before `last` (of the face `number`; -1: of any) gain a pixel of the way of
     an edge's two ends."""
     count = last - first
-    for each in range(count):
-        gains[each] = value[first + each]
+    gains = gains[:count]
+    gains[:] = value[first:last]
     for channel in range(slopes.shape[0]):
         paint = np.float64(painted[channel])
+        slope = slopes[channel, first:last]
         for each in range(count):
-            gains[each] -= paint * slopes[channel, first + each]  # -δ_j^I δ_j^P
+            gains[each] -= paint * slope[each]  # -δ_j^I δ_j^P
     if number >= 0:
+        owners = owner[first:last]
         for each in range(count):
-            if owner[first + each] != number:
-                gains[each] = 0.0
+            gains[each] = gains[each] if owners[each] == number else 0.0
     other_share = 1 - share
     add = share * least if share > 0 else 1.0
     other_add = other_share * least if other_share > 0 else 1.0
     pulled = pulled_other = 0.0
+    places = place[first:last]
     for each in range(count):
-        distance = abs(place[first + each] - crossing)
+        distance = abs(places[each] - crossing)
         gain = max(gains[each], 0.0)  # 0 where δ_j^P δ_j^I >= 0; over δ_i^x = distance / share + least
         pulled += gain / (distance + add)
         pulled_other += gain / (distance + other_add)

@@ -38,9 +38,9 @@ class Blend:
         place: (vertices, 2) float64, column and row, pixels.
         bounds: (faces, 4) int64, first and past-the-last row and column that a face may reach.
         nearest: the vertex that depths are measured by; -1: nothing is in view.
-        scales: 1 / σ in 1/pixel², and γ.
-        most, total, cover: (height, width) float64: the largest z_j or ε, Σ D exp((z - most) / γ) with the background's
-            part, and -Σ log(1 - D).
+        scales: 1 / σ in 1/pixel², γ, and how far outside of a face it is seen, pixels.
+        most, total, clear: (height, width) float64: the largest z_j or ε, Σ D exp((z - most) / γ) with the background's
+            part, and Π (1 - D).
         mean: (height, width, channels) float64, A_S.
         color: (height, width, channels) float64, A_O A_S.
     """
@@ -48,10 +48,10 @@ class Blend:
     place: np.ndarray
     bounds: np.ndarray
     nearest: int
-    scales: tuple[float, float]
+    scales: tuple[float, float, float]
     most: np.ndarray
     total: np.ndarray
-    cover: np.ndarray
+    clear: np.ndarray
     mean: np.ndarray
     color: np.ndarray
 
@@ -74,14 +74,15 @@ def blend(
 ) -> Blend:
     """The soft picture of what `raster.project` found."""
     place, bounds = np.zeros((len(seen), 2)), np.zeros((len(faces), 4), np.int64)
-    nearest = prepare(seen, screen, faces, lens, cull, *size, reach(sigma, size), place, bounds)
-    scales = (4 / (sigma * min(size) ** 2), gamma)
-    most, total, cover = np.full(size, BACKGROUND), np.ones(size), np.zeros(size)
+    margin = reach(sigma, size)
+    nearest = prepare(seen, screen, faces, lens, cull, *size, margin, place, bounds)
+    scales = (4 / (sigma * min(size) ** 2), gamma, margin)
+    most, total, clear = np.full(size, BACKGROUND), np.ones(size), np.ones(size)
     mean = np.zeros((*size, colors.shape[1]))
     color = np.zeros(mean.shape)
     if nearest >= 0:
-        forward(seen, faces, colors, place, bounds, nearest, *scales, most, total, cover, mean, color)
-    return Blend(place, bounds, nearest, scales, most, total, cover, mean, color)
+        forward(seen, faces, colors, place, bounds, nearest, *scales, most, total, clear, mean, color)
+    return Blend(place, bounds, nearest, scales, most, total, clear, mean, color)
 
 
 def slopes(
@@ -98,8 +99,8 @@ def slopes(
     """Add to `of_*` the slopes of a loss whose slopes in the picture are `along_color`."""
     if drawn.nearest >= 0:
         arrays = (drawn.place, drawn.bounds, drawn.nearest, *drawn.scales)
-        sums = (drawn.most, drawn.total, drawn.cover, drawn.mean)
-        backward(seen, faces, colors, lens, *arrays, *sums, along_color, of_seen, of_colors, of_lens)
+        arrays += (drawn.most, drawn.total, drawn.clear, drawn.mean)
+        backward((seen, faces, colors, lens), arrays, along_color, (of_seen, of_colors, of_lens))
 
 
 @compiled
@@ -169,14 +170,41 @@ def to_edge(ax, ay, bx, by, x, y):
 
 @compiled
 @no_type_check
-def squared_distance(ax, ay, bx, by, cx, cy, x, y):
-    """To the border of a triangle: its square, and which edge it is to, by the corner opposite."""
-    d0, _ = to_edge(bx, by, cx, cy, x, y)
-    d1, _ = to_edge(cx, cy, ax, ay, x, y)
-    d2, _ = to_edge(ax, ay, bx, by, x, y)
-    if d0 <= d1 and d0 <= d2:
-        return d0, 0
-    return (d1, 1) if d1 <= d2 else (d2, 2)
+def heights_of(ax, ay, bx, by, cx, cy):
+    """Of a triangle over its edges, each opposite its corner, pixels."""
+    area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    return (
+        area / np.hypot(cx - bx, cy - by),
+        area / np.hypot(ax - cx, ay - cy),
+        area / np.hypot(bx - ax, by - ay),
+    )
+
+
+@compiled
+@no_type_check
+def to_border(corners, heights, w0, w1, w2, x, y):
+    """Squared distance to the border of a triangle, 1 inside of it or -1, and the nearest edge, by the corner opposite.
+
+    From inside, that to the nearest of the edges' lines; from outside, to one of the edges that face the pixel.
+    """
+    ax, ay, bx, by, cx, cy = corners
+    least, edge = np.inf, 0
+    if w0 >= 0 and w1 >= 0 and w2 >= 0:
+        d0, d1, d2 = w0 * heights[0], w1 * heights[1], w2 * heights[2]
+        if d0 <= d1 and d0 <= d2:
+            return d0 * d0, 1.0, 0
+        return (d1 * d1, 1.0, 1) if d1 <= d2 else (d2 * d2, 1.0, 2)
+    if w0 < 0:
+        least, _ = to_edge(bx, by, cx, cy, x, y)
+    if w1 < 0:
+        squared, _ = to_edge(cx, cy, ax, ay, x, y)
+        if squared < least:
+            least, edge = squared, 1
+    if w2 < 0:
+        squared, _ = to_edge(ax, ay, bx, by, x, y)
+        if squared < least:
+            least, edge = squared, 2
+    return least, -1.0, edge
 
 
 @compiled
@@ -190,14 +218,9 @@ def cut(w0, w1, w2):
 
 @compiled
 @no_type_check
-def softplus(x):
-    """log(1 + e^x) = -log(1 - sigmoid(x))."""
-    return max(x, 0.0) + np.log1p(np.exp(-abs(x)))
-
-
-@compiled
-@no_type_check
-def forward(seen, faces, colors, place, bounds, nearest, sharpness, gamma, most, total, cover, mean, color):
+def forward(
+    seen, faces, colors, place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean, color
+):
     """Fill the arrays of `Blend`, face by face; sums are rescaled where a nearer face comes (w_j)."""
     channels = colors.shape[1]
     height, width = most.shape
@@ -208,17 +231,21 @@ def forward(seen, faces, colors, place, bounds, nearest, sharpness, gamma, most,
             continue
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         corners = corners_of(place, a, b, c)
+        heights = heights_of(*corners)
+        # barycentric weights beyond which a pixel is out of reach
+        low0, low1, low2 = -margin / heights[0], -margin / heights[1], -margin / heights[2]
         near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
         for row in range(top, bottom):
             for column in range(left, right):
                 w0, w1, w2 = parts(*corners, column, row)
-                squared, _ = squared_distance(*corners, column, row)
-                odds = squared * sharpness
-                if w0 < 0 or w1 < 0 or w2 < 0:
-                    odds = -odds
-                    if odds < -REACH:
-                        continue
-                cover[row, column] += softplus(odds)
+                if w0 < low0 or w1 < low1 or w2 < low2:
+                    continue
+                squared, turn, _ = to_border(corners, heights, w0, w1, w2, column, row)
+                if turn < 0 and squared * sharpness > REACH:
+                    continue
+                doubt = np.exp(-squared * sharpness)
+                covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
+                clear[row, column] *= (doubt if turn > 0 else 1.0) / (1 + doubt)
                 q0, q1, q2, _ = cut(w0, w1, w2)
                 a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
                 inverse = a0 + a1 + a2
@@ -233,7 +260,7 @@ def forward(seen, faces, colors, place, bounds, nearest, sharpness, gamma, most,
                     for channel in range(channels):
                         mean[row, column, channel] *= scale
                     above = 0.0
-                weight = np.exp(above) / (1 + np.exp(-odds))
+                weight = np.exp(above) * covered
                 total[row, column] += weight
                 weight /= inverse
                 for channel in range(channels):
@@ -242,8 +269,8 @@ def forward(seen, faces, colors, place, bounds, nearest, sharpness, gamma, most,
                     )
     for row in range(height):
         for column in range(width):
-            if cover[row, column] > 0:
-                opacity = -np.expm1(-cover[row, column])  # A_O
+            if clear[row, column] < 1:
+                opacity = 1 - clear[row, column]  # A_O
                 for channel in range(channels):
                     mean[row, column, channel] /= total[row, column]  # A_S
                     color[row, column, channel] = opacity * mean[row, column, channel]
@@ -251,26 +278,11 @@ def forward(seen, faces, colors, place, bounds, nearest, sharpness, gamma, most,
 
 @compiled
 @no_type_check
-def backward(
-    seen,
-    faces,
-    colors,
-    lens,
-    place,
-    bounds,
-    nearest,
-    sharpness,
-    gamma,
-    most,
-    total,
-    cover,
-    mean,
-    along_color,
-    of_seen,
-    of_colors,
-    of_lens,
-):
+def backward(scene, drawn, along_color, sums):
     """Add to `of_*` the slopes of the loss, face by face; everything of a face at a pixel is computed anew."""
+    seen, faces, colors, lens = scene
+    place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean = drawn
+    of_seen, of_colors, of_lens = sums
     channels = colors.shape[1]
     unit = seen[nearest, 2]
     height, width = most.shape
@@ -278,7 +290,7 @@ def backward(
     live = np.zeros((height, width), np.bool_)
     for row in range(height):
         for column in range(width):
-            if cover[row, column] > 0:
+            if clear[row, column] < 1:
                 for channel in range(channels):
                     slope = np.float64(along_color[row, column, channel])
                     of_mean[row, column] += slope * mean[row, column, channel]
@@ -290,6 +302,9 @@ def backward(
             continue
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         corners = corners_of(place, a, b, c)
+        heights = heights_of(*corners)
+        # barycentric weights beyond which a pixel is out of reach
+        low0, low1, low2 = -margin / heights[0], -margin / heights[1], -margin / heights[2]
         ax, ay, bx, by, cx, cy = corners
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
@@ -300,20 +315,21 @@ def backward(
                 if not live[row, column]:
                     continue
                 w0, w1, w2 = parts(*corners, column, row)
-                squared, edge = squared_distance(*corners, column, row)
-                turn = -1.0 if w0 < 0 or w1 < 0 or w2 < 0 else 1.0
-                odds = turn * squared * sharpness
-                if turn < 0 and odds < -REACH:
+                if w0 < low0 or w1 < low1 or w2 < low2:
                     continue
-                covered = 1 / (1 + np.exp(-odds))
-                clear = np.exp(-cover[row, column])
-                of_odds = of_mean[row, column] * clear * covered  # of A_O: ∂/∂x Π (1 - D) = -Π D
+                squared, turn, edge = to_border(corners, heights, w0, w1, w2, column, row)
+                if turn < 0 and squared * sharpness > REACH:
+                    continue
+                doubt = np.exp(-squared * sharpness)
+                covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
+                left_clear = (doubt if turn > 0 else 1.0) / (1 + doubt)
+                of_odds = of_mean[row, column] * clear[row, column] * covered  # of A_O: ∂ log(1 - D) = -D
                 q0, q1, q2, scale = cut(w0, w1, w2)
                 a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
                 inverse = a0 + a1 + a2
                 above = (unit * inverse - most[row, column]) / gamma
                 if above >= -HIDDEN:
-                    weight = (1 - clear) * covered * np.exp(above) / total[row, column]
+                    weight = (1 - clear[row, column]) * covered * np.exp(above) / total[row, column]
                     d0 = d1 = d2 = 0.0
                     for channel in range(channels):
                         slope = weight * along_color[row, column, channel]
@@ -325,17 +341,15 @@ def backward(
                         d2 += slope * colors[c, channel]
                     own = (a0 * d0 + a1 * d1 + a2 * d2) / inverse
                     gained = own - weight * of_mean[row, column]  # ∂L / ∂ log(D exp(z / γ))
-                    of_odds += gained / (1 + np.exp(odds))
+                    of_odds += gained * left_clear  # ∂ log D = 1 - D
                     of_unit += gained / gamma * inverse
                     # through C_j = Σ a c / Σ a and z_j = unit Σ a, with a = q / depth
                     d0 = (d0 - own) / inverse + unit * gained / gamma
                     d1 = (d1 - own) / inverse + unit * gained / gamma
                     d2 = (d2 - own) / inverse + unit * gained / gamma
-                    of_near0, of_near1, of_near2 = (
-                        of_near0 + q0 * d0,
-                        of_near1 + q1 * d1,
-                        of_near2 + q2 * d2,
-                    )
+                    of_near0 += q0 * d0
+                    of_near1 += q1 * d1
+                    of_near2 += q2 * d2
                     d0, d1, d2 = d0 * near0, d1 * near1, d2 * near2
                     # through q = max(w, 0) / Σ max(w, 0), and w = edge function / area
                     flat = q0 * d0 + q1 * d1 + q2 * d2
