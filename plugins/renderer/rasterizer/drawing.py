@@ -1,7 +1,7 @@
 """One picture of one scene as a differentiable operation on tensors: compiled kernels forwards and backwards."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from plugins.renderer.rasterizer import gradient, raster
+from plugins.renderer.rasterizer import gradient, nmr, raster, soft
 
-Gradient = Literal["boundary", "interior"]
+Gradient = Literal["boundary", "interior", "nmr", "soft"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class View:
         size: (height, width), pixels.
         cull: leave out faces seen from behind.
         channels: to draw.
-        gradient: of what edges hand over, too, or of the inside of faces alone.
+        gradient: see `Rasterizer`; "soft" draws another picture.
+        softness: σ and γ of "soft".
     """
 
     faces: np.ndarray
@@ -35,11 +36,16 @@ class View:
     cull: bool
     channels: frozenset[str]
     gradient: Gradient
+    softness: tuple[float, float]
 
 
 @dataclass
 class Drawn:
-    """A picture and what its gradient reads; channels that nobody reads are of size 0."""
+    """A picture and what its gradient reads; channels that nobody reads are of size 0.
+
+    Attributes:
+        blend: what `color` was rounded from where the gradient is "soft" and something is in view.
+    """
 
     seen: np.ndarray
     screen: np.ndarray
@@ -48,6 +54,7 @@ class Drawn:
     depth: np.ndarray
     face: np.ndarray
     mask: np.ndarray
+    blend: soft.Blend | None
 
 
 def draw(
@@ -61,7 +68,8 @@ def draw(
     """The channels of a view; `lens` holds fx, fy, cx, cy, pixels."""
     height, width = view.size
     focal, principal = lens[:2], lens[2:]
-    want_face = not {"color", "face"}.isdisjoint(view.channels)
+    blended = colors is not None and view.gradient == "soft"
+    want_face = "face" in view.channels or ("color" in view.channels and not blended)
     want_depth = want_face or "depth" in view.channels
     depth = np.full(view.size if want_depth else (0, 0), np.inf, np.float32)
     face = np.full(view.size if want_face else (0, 0), -1, np.int32)
@@ -69,13 +77,20 @@ def draw(
     mask = np.zeros(view.size if "mask" in view.channels else (0, 0), np.bool_)
     color = np.zeros((*view.size, colors.shape[1]) if colors is not None else (0, 0, 0), np.float32)
     faces = view.faces
-    if raster.out_of_view(vertices, rotation, translation, focal, principal, view.near, height, width):
+    margin = soft.reach(view.softness[0], view.size) if blended else 0.0
+    bounds = (principal + margin, view.near, height + 2 * margin, width + 2 * margin)
+    if raster.out_of_view(vertices, rotation, translation, focal, *bounds):
         faces = faces[:0]
     count = len(vertices) if len(faces) else 0
     seen, screen = np.empty((count, 3)), np.empty((count, 3))
     box = (height, 0, width, 0)
+    blend = None
     if len(faces):
         hidden = raster.project(vertices, rotation, translation, focal, principal, view.near, seen, screen)
+        if blended and colors is not None:
+            blend = soft.blend(seen, screen, faces, colors, lens, view.cull, view.size, *view.softness)
+            color = blend.color.astype(np.float32)
+    if len(faces) and (want_depth or mask.size):
         nothing = np.empty(0, np.int64)
         box = raster.rasterise(screen, faces, nothing, view.cull, height, width, depth, face, mask)
         if hidden:
@@ -83,9 +98,9 @@ def draw(
             if len(parts):
                 cut = raster.rasterise(corners, parts, numbers, view.cull, height, width, depth, face, mask)
                 box = tuple(least(*pair) for least, *pair in zip((min, max, min, max), box, cut, strict=True))
-        if colors is not None:
+        if colors is not None and not blended:
             raster.shade(seen, screen, faces, colors, focal, principal, face, box, color)
-    return Drawn(seen, screen, box, color, depth, face, mask)
+    return Drawn(seen, screen, box, color, depth, face, mask, blend)
 
 
 class Picture(torch.autograd.Function):
@@ -106,6 +121,8 @@ class Picture(torch.autograd.Function):
         turn, shift, focus = (
             part.detach().double().contiguous().numpy() for part in (rotation, translation, lens)
         )
+        if any(ctx.needs_input_grad) and "depth" in view.channels:
+            view = replace(view, channels=view.channels | {"face"})  # which a depth's slope is led through
         drawn = draw(place, shown, turn, shift, focus, view)
         ctx.arrays, ctx.drawn, ctx.view = (place, shown, turn, shift, focus), drawn, view
         ctx.types = [
@@ -142,14 +159,48 @@ def backward(
     of_vertices = np.zeros((len(vertices), 3))
     of_colors = np.zeros((0, 0) if colors is None else colors.shape)
     of_rotation, of_translation, of_lens = np.zeros((3, 3)), np.zeros(3), np.zeros(4)
-    if drawn.box[0] < drawn.box[1] and drawn.face.size:
+    if len(drawn.seen):
         of_seen = np.zeros((len(vertices), 3))
-        shown = np.zeros((0, 0), np.float32) if colors is None else colors
-        along_color = along_color if colors is not None else np.zeros((0, 0, 0), np.float32)
         deep = along_depth if "depth" in view.channels else np.zeros((0, 0), np.float32)
-        picture = (drawn.seen, view.faces, shown, lens, drawn.face, drawn.box)
-        gradient.interior(*picture, along_color, deep, of_seen, of_colors, of_lens)
-        if view.gradient == "boundary" and colors is not None:
+        to_camera(colors, lens, drawn, view, along_color, deep, of_seen, of_colors, of_lens)
+        gradient.of_the_world(vertices, rotation, of_seen, of_vertices, of_rotation, of_translation)
+    return of_vertices, None if colors is None else of_colors, of_rotation, of_translation, of_lens
+
+
+def to_camera(
+    colors: np.ndarray | None,
+    lens: np.ndarray,
+    drawn: Drawn,
+    view: View,
+    along_color: np.ndarray,
+    along_depth: np.ndarray,
+    of_seen: np.ndarray,
+    of_colors: np.ndarray,
+    of_lens: np.ndarray,
+) -> None:
+    """Add the slopes in camera coordinates, colours and lens, by the kind of gradient."""
+    no_color, no_depth = np.zeros((0, 0, 0), np.float32), np.zeros((0, 0), np.float32)
+    shown = np.zeros((0, 0), np.float32) if colors is None else colors
+    visible = drawn.face.size > 0 and drawn.box[0] < drawn.box[1]
+    faces = (drawn.seen, view.faces, shown, lens, drawn.face, drawn.box)
+    if drawn.blend is not None:
+        soft.slopes(
+            drawn.seen, view.faces, shown, lens, drawn.blend, along_color, of_seen, of_colors, of_lens
+        )
+    if colors is None or view.gradient == "soft":
+        if visible:
+            gradient.interior(*faces, no_color, along_depth, of_seen, of_colors, of_lens)
+    elif visible and view.gradient == "nmr":
+        # of what faces do within, colours and depths alone
+        gradient.interior(
+            *faces, along_color, no_depth, np.zeros_like(of_seen), of_colors, np.zeros_like(of_lens)
+        )
+        gradient.interior(*faces, no_color, along_depth, of_seen, of_colors, of_lens)
+        picture = (drawn.face, drawn.color, along_color)
+        nmr.sweeps(drawn.seen, drawn.screen, view.faces, lens, *picture, of_seen, of_lens)
+    elif visible:
+        gradient.interior(*faces, along_color, along_depth, of_seen, of_colors, of_lens)
+        if view.gradient == "boundary":
             gradient.boundary(
                 drawn.seen,
                 drawn.screen,
@@ -164,5 +215,3 @@ def backward(
                 of_seen,
                 of_lens,
             )
-        gradient.of_the_world(vertices, rotation, of_seen, of_vertices, of_rotation, of_translation)
-    return of_vertices, None if colors is None else of_colors, of_rotation, of_translation, of_lens

@@ -2,8 +2,7 @@
 
 Corners are rounded to 1/256 pixel, and edge functions that are exact on those whole numbers (Pineda 1988)
 decide with the top-left rule which pixels a triangle covers: a pixel centre on the edge between two triangles
-belongs to exactly one of them. A visible face and its pixel give back the barycentric weights (`weights`),
-which is what a backward pass needs beside `screen`.
+belongs to exactly one of them. A visible face and its pixel give back the barycentric weights (`weights`).
 
 Arrays:
     seen: (vertices, 3) float64: x right, y down, z forward from the camera, metres.
@@ -46,8 +45,8 @@ def largest_index(indices):
 def out_of_view(vertices, rotation, translation, focal, principal, near, height, width):
     """Whether the box around all vertices lies wholly outside one plane of the view.
 
-    The planes stand one pixel outside the image, so that no rounding can hide a visible pixel. NaN enters no
-    comparison; an infinite coordinate makes the box infinite and the answer no.
+    The planes stand one pixel outside the image: no rounding hides a visible pixel. NaN enters no comparison; an
+    infinite coordinate makes the box infinite and the answer no.
     """
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -86,8 +85,7 @@ def out_of_view(vertices, rotation, translation, focal, principal, near, height,
 @compiled
 @no_type_check
 def project(vertices, rotation, translation, focal, principal, near, seen, screen):
-    """Fill `seen` and `screen` from world coordinates, in float64. Returns how many vertices are finite and cut off by
-    the near plane."""
+    """Fill `seen` and `screen` from world coordinates. Returns how many finite vertices the near plane cuts off."""
     hidden = 0
     for vertex in range(vertices.shape[0]):
         a = np.float64(vertices[vertex, 0])
@@ -357,8 +355,7 @@ def weights(screen, a, b, c, row, column):
 @compiled
 @no_type_check
 def weights_in_space(seen, a, b, c, ray_x, ray_y):
-    """The same of a face of which corners may be behind the camera, by its planes through the eye (Olano & Greer
-    1997): r·(b × c) and so on, each of the share it has of their sum."""
+    """Those of a face with corners behind the camera too: r·(b × c) and so on over their sum (Olano & Greer 1997)."""
     part0 = volume(seen, b, c, ray_x, ray_y)
     part1 = volume(seen, c, a, ray_x, ray_y)
     part2 = volume(seen, a, b, ray_x, ray_y)

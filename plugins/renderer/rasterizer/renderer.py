@@ -34,7 +34,10 @@ class Rasterizer(Renderer):
     Args:
         cull: leave out faces seen from behind; right for closed meshes only, and faster.
         gradient: "boundary": what the inside of faces does and what moving edges hand from one surface to another;
-            "interior": the former alone.
+            "interior": the former alone; "nmr": the approximation of Kato et al., for comparison; "soft": the picture
+            itself is that of Liu et al., blurred and blended, for comparison, in "color" alone.
+        sigma: how far coverage blurs ("soft" alone): squared distance, where the image's shorter side is 2.
+        gamma: how far depths blend ("soft" alone): of the nearest depth over a face's.
         supersampling: samples a pixel along each axis, of "color" alone, whose mean it then is.
     """
 
@@ -56,6 +59,18 @@ class Rasterizer(Renderer):
   volume = {37},
   number = {6},
   year = {2018}
+}
+@inproceedings{kato2018neural,
+  author = {Kato, Hiroharu and Ushiku, Yoshitaka and Harada, Tatsuya},
+  title = {Neural {3D} mesh renderer},
+  booktitle = {Conference on Computer Vision and Pattern Recognition},
+  year = {2018}
+}
+@inproceedings{liu2019soft,
+  author = {Liu, Shichen and Li, Tianye and Chen, Weikai and Li, Hao},
+  title = {Soft rasterizer: A differentiable renderer for image-based {3D} reasoning},
+  booktitle = {International Conference on Computer Vision},
+  year = {2019}
 }"""
 
     def __init__(
@@ -63,10 +78,13 @@ class Rasterizer(Renderer):
         *,
         cull: bool = False,
         gradient: Gradient = "boundary",
+        sigma: Annotated[float, Field(ge=1e-8, le=1)] = 1e-5,
+        gamma: Annotated[float, Field(ge=1e-6, le=1)] = 1e-4,
         supersampling: Annotated[int, Field(ge=1, le=16)] = 1,
     ) -> None:
         self.cull = cull
         self.gradient: Gradient = gradient
+        self.softness = (sigma, gamma)
         self.supersampling = supersampling
         self._known: tuple[weakref.ref[Tensor], int, np.ndarray] | None = None
 
@@ -116,7 +134,7 @@ class Rasterizer(Renderer):
         size = (camera.height * times, camera.width * times)
         near = max(float(camera.near), raster.NEAREST)
         beside = partial(self._neighbours, scene.faces, faces)
-        view = View(faces, beside, near, size, self.cull, channels, self.gradient)
+        view = View(faces, beside, near, size, self.cull, channels, self.gradient, self.softness)
         if times > 1:  # the middle of pixel 0 is that of its samples
             lens = torch.cat([lens[:2] * times, (lens[2:] + 0.5) * times - 0.5])
         shown = colors if "color" in channels else None

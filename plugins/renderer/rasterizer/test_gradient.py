@@ -9,6 +9,7 @@ import torch
 
 from framework.geometry.camera import Camera, look_from
 from framework.renderer import Scene
+from plugins.renderer.rasterizer.drawing import Gradient
 from plugins.renderer.rasterizer.renderer import Rasterizer
 
 torch_float = torch.float64
@@ -181,7 +182,8 @@ def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
         torch.testing.assert_close(one.grad, other.grad, rtol=2e-3, atol=2e-3 * float(other.grad.abs().max()))
 
 
-def test_gradients_of_extreme_scenes_are_finite() -> None:
+@pytest.mark.parametrize("gradient", ["boundary", "interior", "nmr", "soft"])
+def test_gradients_of_extreme_scenes_are_finite(gradient: Gradient) -> None:
     edge_on = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0.5, 2.5]])
     sliver = torch.tensor([[-1.0, 0, 2], [1, 1e-7, 2], [0, 2e-7, 2]])
     everywhere = torch.tensor([[-1e6, -1e6, 1.0], [1e6, -1e6, 1.0], [0, 1e6, 1.0]])
@@ -195,10 +197,29 @@ def test_gradients_of_extreme_scenes_are_finite() -> None:
             lens = torch.tensor([focal, focal]).double().requires_grad_()
             seen = Camera(torch.eye(3), torch.zeros(3), lens, (8.0, 8.0), 17, 17)
             faces = torch.tensor([[0, 1, 2], [0, 2, 1], [3, 4, 5]])
-            drawn = Rasterizer()(Scene(given, faces, torch.rand(6, 3), seen), ("color", "depth"))
-            (drawn["color"].sum() + drawn["depth"].where(drawn["depth"] < math.inf, 0).sum()).backward()
-            assert given.grad.isfinite().all()
-            assert lens.grad.isfinite().all()
+            colors = torch.rand(6, 3).requires_grad_()
+            drawn = Rasterizer(gradient=gradient)(Scene(given, faces, colors, seen), ("color", "depth"))
+            # of both signs: nmr drops what a loss does not gain by
+            (drawn["color"].square().sum() - drawn["color"].sum()).backward(retain_graph=True)
+            drawn["depth"].where(drawn["depth"] < math.inf, 0).sum().backward()
+            assert drawn["color"].isfinite().all()
+            assert all(part.grad.isfinite().all() for part in (given, colors, lens))
+
+
+@pytest.mark.parametrize("gradient", ["boundary", "nmr", "soft"])
+def test_a_depths_gradient_does_not_depend_on_what_else_is_asked(gradient: Gradient) -> None:
+    vertices, faces, colors = blob(12)
+    found = []
+    for channels in (("depth",), ("depth", "mask"), ("color", "depth"), ("face", "depth")):
+        for supersampling in (1, 2):
+            given = vertices.clone().requires_grad_()
+            renderer = Rasterizer(gradient=gradient, supersampling=supersampling)
+            depth = renderer(Scene(given, faces, colors, camera()), channels)["depth"]
+            depth.where(depth < math.inf, 0).sum().backward()
+            found.append(given.grad)
+    assert found[0].abs().max() > 0
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=1e-9, atol=1e-9)
 
 
 def test_what_nobody_differentiates_costs_nothing() -> None:

@@ -1,0 +1,386 @@
+"""Aggregation of Liu, Li, Chen & Li, "Soft Rasterizer" (ICCV 2019, section 3), forwards and backwards; compiled.
+
+A pixel's colour is A_O A_S: the colours of the faces near it, blended by nearness and coverage, over black by the soft
+silhouette (which the paper gives beside the colours):
+
+    D_j = sigmoid(± d² / σ), + inside of the face
+    w_j = D_j exp(z_j / γ) / (Σ_k D_k exp(z_k / γ) + exp(ε / γ))
+    A_S = Σ_j w_j C_j + w_b 0
+    A_O = 1 - Π_j (1 - D_j)
+
+d is the distance from the pixel to the face's border, in units in which the image's shorter side is 2; z_j,
+"normalised inverse depth", is the depth of the nearest vertex in view over the face's. Outside of a face its colour
+and depth are those of its barycentric weights cut at 0 and scaled to the sum 1, as in the published kernel, which also
+leaves a face out where D < 1e-4; here they are perspective-correct. No corner is rounded. A face that the near plane
+cuts is left out.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+
+from plugins.renderer.rasterizer.gradient import along
+from plugins.renderer.rasterizer.raster import compiled
+
+BACKGROUND = 1e-3  # ε, as published
+REACH = math.log(1e4 - 1)  # -log(odds) of D = 1e-4
+HIDDEN = 40.0  # nats; e^-40 vanishes beside 1 in float64
+FLATTEST = 1e-12  # area over the square of the longest side
+
+
+@dataclass
+class Blend:
+    """A soft picture and what its gradient reads.
+
+    Attributes:
+        place: (vertices, 2) float64, column and row, pixels.
+        bounds: (faces, 4) int64, first and past-the-last row and column that a face may reach.
+        nearest: the vertex that depths are measured by; -1: nothing is in view.
+        scales: 1 / σ in 1/pixel², γ, and how far outside of a face it is seen, pixels.
+        most, total, clear: (height, width) float64: the largest z_j or ε, Σ D exp((z - most) / γ) with the background's
+            part, and Π (1 - D).
+        mean: (height, width, channels) float64, A_S.
+        color: (height, width, channels) float64, A_O A_S.
+    """
+
+    place: np.ndarray
+    bounds: np.ndarray
+    nearest: int
+    scales: tuple[float, float, float]
+    most: np.ndarray
+    total: np.ndarray
+    clear: np.ndarray
+    mean: np.ndarray
+    color: np.ndarray
+
+
+def reach(sigma: float, size: tuple[int, int]) -> float:
+    """How far outside of a face it is seen, pixels."""
+    return math.sqrt(REACH * sigma) * min(size) / 2
+
+
+def blend(
+    seen: np.ndarray,
+    screen: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    lens: np.ndarray,
+    cull: bool,
+    size: tuple[int, int],
+    sigma: float,
+    gamma: float,
+) -> Blend:
+    """The soft picture of what `raster.project` found."""
+    place, bounds = np.zeros((len(seen), 2)), np.zeros((len(faces), 4), np.int64)
+    margin = reach(sigma, size)
+    nearest = prepare(seen, screen, faces, lens, cull, *size, margin, place, bounds)
+    scales = (4 / (sigma * min(size) ** 2), gamma, margin)
+    most, total, clear = np.full(size, BACKGROUND), np.ones(size), np.ones(size)
+    mean = np.zeros((*size, colors.shape[1]))
+    color = np.zeros(mean.shape)
+    if nearest >= 0:
+        forward(seen, faces, colors, place, bounds, nearest, *scales, most, total, clear, mean, color)
+    return Blend(place, bounds, nearest, scales, most, total, clear, mean, color)
+
+
+def slopes(
+    seen: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    lens: np.ndarray,
+    drawn: Blend,
+    along_color: np.ndarray,
+    of_seen: np.ndarray,
+    of_colors: np.ndarray,
+    of_lens: np.ndarray,
+) -> None:
+    """Add to `of_*` the slopes of a loss whose slopes in the picture are `along_color`."""
+    if drawn.nearest >= 0:
+        arrays = (drawn.place, drawn.bounds, drawn.nearest, *drawn.scales)
+        arrays += (drawn.most, drawn.total, drawn.clear, drawn.mean)
+        backward((seen, faces, colors, lens), arrays, along_color, (of_seen, of_colors, of_lens))
+
+
+@compiled
+@no_type_check
+def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bounds):
+    """Fill `place` and `bounds`; returns the nearest vertex of a face in view, or -1."""
+    for vertex in range(seen.shape[0]):
+        if screen[vertex, 2] != 0:
+            for axis in range(2):
+                place[vertex, axis] = lens[axis] * seen[vertex, axis] / seen[vertex, 2] + lens[2 + axis]
+    nearest = -1
+    for index in range(faces.shape[0]):
+        a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+        if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
+            continue
+        ux, uy = place[b, 0] - place[a, 0], place[b, 1] - place[a, 1]
+        vx, vy = place[c, 0] - place[a, 0], place[c, 1] - place[a, 1]
+        area = ux * vy - vx * uy
+        longest = max(ux * ux + uy * uy, vx * vx + vy * vy)
+        if not abs(area) > FLATTEST * longest or (cull and area > 0):
+            continue
+        for axis in range(2):
+            last = (width if axis == 0 else height) - 1.0
+            low = min(place[a, axis], place[b, axis], place[c, axis]) - margin
+            high = max(place[a, axis], place[b, axis], place[c, axis]) + margin
+            if high >= 0 and low <= last:
+                bounds[index, 2 - 2 * axis] = np.int64(np.ceil(max(low, 0.0)))
+                bounds[index, 3 - 2 * axis] = np.int64(np.floor(min(high, last))) + 1
+        if bounds[index, 0] >= bounds[index, 1] or bounds[index, 2] >= bounds[index, 3]:
+            bounds[index] = 0
+            continue
+        for corner in range(3):
+            vertex = faces[index, corner]
+            if nearest < 0 or seen[vertex, 2] < seen[nearest, 2]:
+                nearest = vertex
+    return nearest
+
+
+@compiled
+@no_type_check
+def corners_of(place, a, b, c):
+    return place[a, 0], place[a, 1], place[b, 0], place[b, 1], place[c, 0], place[c, 1]
+
+
+@compiled
+@no_type_check
+def parts(ax, ay, bx, by, cx, cy, x, y):
+    """Barycentric weights on the screen; their sum is 1."""
+    inverse = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    return (
+        ((bx - x) * (cy - y) - (cx - x) * (by - y)) * inverse,
+        ((cx - x) * (ay - y) - (ax - x) * (cy - y)) * inverse,
+        ((ax - x) * (by - y) - (bx - x) * (ay - y)) * inverse,
+    )
+
+
+@compiled
+@no_type_check
+def to_edge(ax, ay, bx, by, x, y):
+    """Squared distance from a pixel to an edge, and where on it the closest point is, 0 to 1."""
+    ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
+    length = ux * ux + uy * uy
+    part = min(max((ux * vx + uy * vy) / length, 0.0), 1.0) if length > 0 else 0.0
+    ox, oy = vx - part * ux, vy - part * uy
+    return ox * ox + oy * oy, part
+
+
+@compiled
+@no_type_check
+def heights_of(ax, ay, bx, by, cx, cy):
+    """Of a triangle over its edges, each opposite its corner, pixels."""
+    area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    return (
+        area / np.hypot(cx - bx, cy - by),
+        area / np.hypot(ax - cx, ay - cy),
+        area / np.hypot(bx - ax, by - ay),
+    )
+
+
+@compiled
+@no_type_check
+def to_border(corners, heights, w0, w1, w2, x, y):
+    """Squared distance to the border of a triangle, 1 inside of it or -1, and the nearest edge, by the corner opposite.
+
+    From inside, that to the nearest of the edges' lines; from outside, to one of the edges that face the pixel.
+    """
+    ax, ay, bx, by, cx, cy = corners
+    least, edge = np.inf, 0
+    if w0 >= 0 and w1 >= 0 and w2 >= 0:
+        d0, d1, d2 = w0 * heights[0], w1 * heights[1], w2 * heights[2]
+        if d0 <= d1 and d0 <= d2:
+            return d0 * d0, 1.0, 0
+        return (d1 * d1, 1.0, 1) if d1 <= d2 else (d2 * d2, 1.0, 2)
+    if w0 < 0:
+        least, _ = to_edge(bx, by, cx, cy, x, y)
+    if w1 < 0:
+        squared, _ = to_edge(cx, cy, ax, ay, x, y)
+        if squared < least:
+            least, edge = squared, 1
+    if w2 < 0:
+        squared, _ = to_edge(ax, ay, bx, by, x, y)
+        if squared < least:
+            least, edge = squared, 2
+    return least, -1.0, edge
+
+
+@compiled
+@no_type_check
+def cut(w0, w1, w2):
+    """Weights cut at 0 and scaled to the sum 1, and that sum before."""
+    w0, w1, w2 = max(w0, 0.0), max(w1, 0.0), max(w2, 0.0)
+    scale = w0 + w1 + w2
+    return w0 / scale, w1 / scale, w2 / scale, scale
+
+
+@compiled
+@no_type_check
+def forward(
+    seen, faces, colors, place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean, color
+):
+    """Fill the arrays of `Blend`, face by face; sums are rescaled where a nearer face comes (w_j)."""
+    channels = colors.shape[1]
+    height, width = most.shape
+    unit = seen[nearest, 2]
+    for index in range(faces.shape[0]):
+        top, bottom, left, right = bounds[index]
+        if top >= bottom:
+            continue
+        a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+        corners = corners_of(place, a, b, c)
+        heights = heights_of(*corners)
+        # barycentric weights beyond which a pixel is out of reach
+        low0, low1, low2 = -margin / heights[0], -margin / heights[1], -margin / heights[2]
+        near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
+        for row in range(top, bottom):
+            for column in range(left, right):
+                w0, w1, w2 = parts(*corners, column, row)
+                if w0 < low0 or w1 < low1 or w2 < low2:
+                    continue
+                squared, turn, _ = to_border(corners, heights, w0, w1, w2, column, row)
+                if turn < 0 and squared * sharpness > REACH:
+                    continue
+                doubt = np.exp(-squared * sharpness)
+                covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
+                clear[row, column] *= (doubt if turn > 0 else 1.0) / (1 + doubt)
+                q0, q1, q2, _ = cut(w0, w1, w2)
+                a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
+                inverse = a0 + a1 + a2
+                nearness = unit * inverse
+                above = (nearness - most[row, column]) / gamma
+                if above < -HIDDEN:
+                    continue
+                if above > 0:
+                    scale = np.exp(-above)
+                    most[row, column] = nearness
+                    total[row, column] *= scale
+                    for channel in range(channels):
+                        mean[row, column, channel] *= scale
+                    above = 0.0
+                weight = np.exp(above) * covered
+                total[row, column] += weight
+                weight /= inverse
+                for channel in range(channels):
+                    mean[row, column, channel] += weight * (
+                        a0 * colors[a, channel] + a1 * colors[b, channel] + a2 * colors[c, channel]
+                    )
+    for row in range(height):
+        for column in range(width):
+            if clear[row, column] < 1:
+                opacity = 1 - clear[row, column]  # A_O
+                for channel in range(channels):
+                    mean[row, column, channel] /= total[row, column]  # A_S
+                    color[row, column, channel] = opacity * mean[row, column, channel]
+
+
+@compiled
+@no_type_check
+def backward(scene, drawn, along_color, sums):
+    """Add to `of_*` the slopes of the loss, face by face; everything of a face at a pixel is computed anew."""
+    seen, faces, colors, lens = scene
+    place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean = drawn
+    of_seen, of_colors, of_lens = sums
+    channels = colors.shape[1]
+    unit = seen[nearest, 2]
+    height, width = most.shape
+    of_mean = np.zeros((height, width))  # g · A_S
+    live = np.zeros((height, width), np.bool_)
+    for row in range(height):
+        for column in range(width):
+            if clear[row, column] < 1:
+                for channel in range(channels):
+                    slope = np.float64(along_color[row, column, channel])
+                    of_mean[row, column] += slope * mean[row, column, channel]
+                    live[row, column] |= slope != 0
+    of_corners = np.empty(6)
+    for index in range(faces.shape[0]):
+        top, bottom, left, right = bounds[index]
+        if top >= bottom:
+            continue
+        a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+        corners = corners_of(place, a, b, c)
+        heights = heights_of(*corners)
+        # barycentric weights beyond which a pixel is out of reach
+        low0, low1, low2 = -margin / heights[0], -margin / heights[1], -margin / heights[2]
+        ax, ay, bx, by, cx, cy = corners
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
+        of_corners[:] = 0.0
+        of_near0 = of_near1 = of_near2 = of_unit = 0.0
+        for row in range(top, bottom):
+            for column in range(left, right):
+                if not live[row, column]:
+                    continue
+                w0, w1, w2 = parts(*corners, column, row)
+                if w0 < low0 or w1 < low1 or w2 < low2:
+                    continue
+                squared, turn, edge = to_border(corners, heights, w0, w1, w2, column, row)
+                if turn < 0 and squared * sharpness > REACH:
+                    continue
+                doubt = np.exp(-squared * sharpness)
+                covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
+                left_clear = (doubt if turn > 0 else 1.0) / (1 + doubt)
+                of_odds = of_mean[row, column] * clear[row, column] * covered  # of A_O: ∂ log(1 - D) = -D
+                q0, q1, q2, scale = cut(w0, w1, w2)
+                a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
+                inverse = a0 + a1 + a2
+                above = (unit * inverse - most[row, column]) / gamma
+                if above >= -HIDDEN:
+                    weight = (1 - clear[row, column]) * covered * np.exp(above) / total[row, column]
+                    d0 = d1 = d2 = 0.0
+                    for channel in range(channels):
+                        slope = weight * along_color[row, column, channel]
+                        of_colors[a, channel] += slope * a0 / inverse
+                        of_colors[b, channel] += slope * a1 / inverse
+                        of_colors[c, channel] += slope * a2 / inverse
+                        d0 += slope * colors[a, channel]
+                        d1 += slope * colors[b, channel]
+                        d2 += slope * colors[c, channel]
+                    own = (a0 * d0 + a1 * d1 + a2 * d2) / inverse
+                    gained = own - weight * of_mean[row, column]  # ∂L / ∂ log(D exp(z / γ))
+                    of_odds += gained * left_clear  # ∂ log D = 1 - D
+                    of_unit += gained / gamma * inverse
+                    # through C_j = Σ a c / Σ a and z_j = unit Σ a, with a = q / depth
+                    d0 = (d0 - own) / inverse + unit * gained / gamma
+                    d1 = (d1 - own) / inverse + unit * gained / gamma
+                    d2 = (d2 - own) / inverse + unit * gained / gamma
+                    of_near0 += q0 * d0
+                    of_near1 += q1 * d1
+                    of_near2 += q2 * d2
+                    d0, d1, d2 = d0 * near0, d1 * near1, d2 * near2
+                    # through q = max(w, 0) / Σ max(w, 0), and w = edge function / area
+                    flat = q0 * d0 + q1 * d1 + q2 * d2
+                    d0 = (d0 - flat) / scale if w0 > 0 else 0.0
+                    d1 = (d1 - flat) / scale if w1 > 0 else 0.0
+                    d2 = (d2 - flat) / scale if w2 > 0 else 0.0
+                    flat = w0 * d0 + w1 * d1 + w2 * d2
+                    d0, d1, d2 = (d0 - flat) / area, (d1 - flat) / area, (d2 - flat) / area
+                    of_corners[0] += d2 * (by - row) - d1 * (cy - row)
+                    of_corners[1] += d1 * (cx - column) - d2 * (bx - column)
+                    of_corners[2] += d0 * (cy - row) - d2 * (ay - row)
+                    of_corners[3] += d2 * (ax - column) - d0 * (cx - column)
+                    of_corners[4] += d1 * (ay - row) - d0 * (by - row)
+                    of_corners[5] += d0 * (bx - column) - d1 * (ax - column)
+                # through d² = |p - (1 - t) A - t B|², at the t that makes it least
+                first, second = 2 * ((edge + 1) % 3), 2 * ((edge + 2) % 3)
+                sx, sy = corners[first], corners[first + 1]
+                ex, ey = corners[second], corners[second + 1]
+                _, part = to_edge(sx, sy, ex, ey, column, row)
+                down = -2 * of_odds * turn * sharpness
+                down_x = down * (column - sx - part * (ex - sx))
+                down_y = down * (row - sy - part * (ey - sy))
+                of_corners[first] += (1 - part) * down_x
+                of_corners[first + 1] += (1 - part) * down_y
+                of_corners[second] += part * down_x
+                of_corners[second + 1] += part * down_y
+        for axis in range(2):
+            along(seen, a, axis, of_corners[axis], lens, of_seen, of_lens)
+            along(seen, b, axis, of_corners[2 + axis], lens, of_seen, of_lens)
+            along(seen, c, axis, of_corners[4 + axis], lens, of_seen, of_lens)
+        of_seen[a, 2] -= of_near0 * near0 * near0
+        of_seen[b, 2] -= of_near1 * near1 * near1
+        of_seen[c, 2] -= of_near2 * near2 * near2
+        of_seen[nearest, 2] += of_unit

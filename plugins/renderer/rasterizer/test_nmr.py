@@ -1,0 +1,147 @@
+"""The gradient of Kato et al. against the paper's definition, taken literally pixel by pixel, and where it leads."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from framework.geometry.camera import Camera
+from framework.renderer import Scene
+from plugins.renderer.rasterizer.renderer import Rasterizer
+from plugins.renderer.rasterizer.test_gradient import blob, camera
+
+HEIGHT, WIDTH = 9, 12
+DISTANCE_ADDED = 1e-4  # as published, where the image is 2 wide
+
+
+def at(places: np.ndarray, depths: np.ndarray, lens: torch.Tensor) -> torch.Tensor:
+    """Vertices that are seen at those places."""
+    rays = (torch.as_tensor(places) - lens[2:]) / lens[:2]
+    z = torch.as_tensor(depths)[:, None]
+    return torch.cat([rays * z, z], 1)
+
+
+def literal(places, faces, face, color, slopes) -> np.ndarray:
+    """∂L/∂(column, row) of every vertex: for each pixel, face, edge and end i of that edge, how far i alone must move
+    along the axis until the edge meets the pixel, and what the pixel would then show."""
+    found = np.zeros_like(places)
+    for axis, number, corner in np.ndindex(2, len(faces), 3):
+        corners = places[faces[number]]
+        (ax, ay), (bx, by), (cx, cy) = corners
+        if (bx - ax) * (cy - ay) - (cx - ax) * (by - ay) >= 0:
+            continue
+        ends = [faces[number][corner], faces[number][(corner + 1) % 3]]
+        third = places[faces[number][(corner + 2) % 3]]
+        for row, column in np.ndindex(HEIGHT, WIDTH):
+            pixel = np.array([column, row])
+            line, place = pixel[1 - axis], pixel[axis]
+            one, other = places[ends[0]], places[ends[1]]
+            low, high = sorted([one[1 - axis], other[1 - axis]])
+            if low == high or not low <= line <= high:
+                continue
+            crossing = np.interp(
+                line,
+                [low, high],
+                [e[axis] for e in sorted([one, other], key=lambda end, axis=axis: end[1 - axis])],
+            )
+            # on which side of the edge the face is
+            normal = np.array([other[1] - one[1], one[0] - other[0]])
+            outwards = -int(np.sign(normal @ (third - one)) * np.sign(normal[axis]))
+            inner = math.floor(crossing) if outwards > 0 else math.ceil(crossing)
+            outer = inner + outwards
+            size = (WIDTH, HEIGHT)[axis]
+            if not (0 <= inner < size and 0 <= outer < size):
+                continue
+
+            def there(position, line=line, axis=axis):
+                return (line, position) if axis == 0 else (position, line)
+
+            if (place - crossing) * outwards > 0:
+                if face[there(inner)] != number:
+                    continue
+                change = color[there(inner)] - color[row, column]
+            else:
+                if face[row, column] != number:
+                    continue
+                change = color[there(outer)] - color[row, column]
+            falls = float(slopes[row, column] @ change)
+            if falls >= 0:
+                continue
+            beyond = (place - crossing) * outwards > 0
+            for end, fixed in (ends, ends[::-1]):
+                here, pivot = places[end], places[fixed]
+                if line == pivot[1 - axis]:
+                    continue  # however far it moves, the edge stays where it is on this line
+                needed = pivot[axis] + (place - pivot[axis]) * (here[1 - axis] - pivot[1 - axis]) / (
+                    line - pivot[1 - axis]
+                )
+                distance = abs(needed - here[axis]) + DISTANCE_ADDED * size / 2
+                found[end, axis] += falls / distance * (outwards if beyond else -outwards)
+    return found
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> None:
+    """Overlapping faces, also from behind and past the image; `whole`: corners on pixels, edges along lines of them."""
+    random = np.random.default_rng(seed)
+    places = random.uniform([-3, -3], [WIDTH + 2, HEIGHT + 2], (9, 2))
+    places = np.round(places) if whole else np.round(places * 256) / 256
+    if whole:
+        places[1, 1], places[4, 0] = places[0, 1], places[3, 0]
+    faces = np.concatenate([np.arange(9).reshape(3, 3), random.integers(0, 9, (2, 3))])
+    for number in range(2):  # these from the front
+        ways = places[faces[number, 1:]] - places[faces[number, 0]]
+        if np.linalg.det(ways) > 0:
+            faces[number] = faces[number, ::-1]
+    depths = random.uniform(1, 3, 9)
+    lens = torch.tensor([10.0, 11, 5.5, 4], dtype=torch.float64).requires_grad_()
+    vertices = at(places, depths, lens.detach()).requires_grad_()
+    colors = torch.tensor(random.uniform(0, 1, (9, 2))).requires_grad_()
+    eye = torch.eye(3, dtype=torch.float64)
+    seen = Camera(eye, torch.zeros(3).double(), lens[:2], lens[2:], HEIGHT, WIDTH)
+    scene = Scene(vertices, torch.tensor(faces), colors, seen)
+    drawn = Rasterizer(gradient="nmr")(scene, ("color", "face"))
+    slopes = torch.tensor(random.normal(0, 1, (HEIGHT, WIDTH, 2)) * random.integers(0, 2, (HEIGHT, WIDTH, 1)))
+    (drawn["color"] * slopes).sum().backward()
+    picture = drawn["color"].detach().double().numpy()
+    wanted = literal(places, faces, drawn["face"].numpy(), picture, slopes.float().double().numpy())
+    assert np.abs(wanted).max() > 0.1
+
+    again, lens_again = vertices.detach().requires_grad_(), lens.detach().clone().requires_grad_()
+    projected = again[:, :2] / again[:, 2:] * lens_again[:2] + lens_again[2:]
+    (projected * torch.tensor(wanted)).sum().backward()
+    torch.testing.assert_close(vertices.grad, again.grad, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(lens.grad, lens_again.grad, rtol=1e-6, atol=1e-6)
+
+
+def test_colors_and_depths_are_led_back_as_within_faces() -> None:
+    vertices, faces, colors = blob(12)
+    slopes, down = torch.rand(72, 88, 3), torch.rand(72, 88)
+    found = {}
+    for gradient in ("interior", "nmr"):
+        tinted, moved = colors.clone().requires_grad_(), vertices.clone().requires_grad_()
+        drawn = Rasterizer(gradient=gradient)(Scene(moved, faces, tinted, camera()), ("color", "depth"))
+        (drawn["depth"].where(drawn["depth"] < math.inf, 0) * down).sum().backward(retain_graph=True)
+        of_depth, moved.grad = moved.grad, None
+        (drawn["color"] * slopes).sum().backward()
+        found[gradient] = (tinted.grad, of_depth)
+    assert all(torch.equal(*pair) for pair in zip(found["interior"], found["nmr"], strict=True))
+
+
+def test_it_reaches_a_target_that_the_face_does_not_touch() -> None:
+    """What long sweeps are for: descending leads to the right, where a gradient of the edges alone says nothing."""
+    eye = torch.eye(3)
+    seen = Camera(eye, torch.zeros(3), (20.0, 20.0), (19.5, 9.5), 20, 40)
+    corners = torch.tensor([[-0.8, -0.2, 1.0], [-0.5, 0.2, 1], [-0.3, -0.2, 1]])
+    faces, colors = torch.tensor([[0, 1, 2]]), torch.ones(3, 1)
+    target = Rasterizer()(Scene(corners + torch.tensor([1.0, 0, 0]), faces, colors, seen))["color"]
+    way = {}
+    for gradient in ("boundary", "nmr"):
+        shift = torch.zeros(3, requires_grad=True)
+        picture = Rasterizer(gradient=gradient)(Scene(corners + shift, faces, colors, seen))["color"]
+        assert 10 < picture.sum() < 200 and (picture * target).sum() == 0
+        (picture - target).square().sum().backward()
+        way[gradient] = -float(shift.grad[0])
+    assert way["nmr"] > 1 > abs(way["boundary"])
