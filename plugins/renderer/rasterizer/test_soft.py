@@ -72,7 +72,16 @@ def given(seed: int) -> tuple[list[Tensor], Tensor]:
 
 
 def view(faces: Tensor, cull: bool, sigma: float, gamma: float) -> View:
-    return View(faces.numpy(), 1e-3, SIZE, cull, frozenset({"color"}), "soft", (sigma, gamma))
+    return View(
+        faces.numpy(),
+        lambda: np.empty((0, 3), np.int64),
+        1e-3,
+        SIZE,
+        cull,
+        frozenset({"color"}),
+        "soft",
+        (sigma, gamma),
+    )
 
 
 def picture(parts: list[np.ndarray], seen: View) -> np.ndarray:
