@@ -27,6 +27,7 @@ class View:
         channels: to draw.
         gradient: see `Rasterizer`; "soft" draws another picture.
         softness: σ and γ of "soft".
+        once: whether a pixel is one sample, and not the mean of several.
     """
 
     faces: np.ndarray
@@ -37,6 +38,7 @@ class View:
     channels: frozenset[str]
     gradient: Gradient
     softness: tuple[float, float]
+    once: bool = True
 
 
 @dataclass
@@ -211,6 +213,7 @@ def to_camera(
                 drawn.face,
                 drawn.depth,
                 drawn.box,
+                view.once,
                 along_color,
                 of_seen,
                 of_lens,

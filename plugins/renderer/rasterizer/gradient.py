@@ -133,8 +133,15 @@ def interior(seen, faces, colors, lens, face, box, along_color, along_depth, of_
 
 @compiled
 @no_type_check
-def boundary(seen, screen, faces, beside, colors, lens, face, depth, box, along_color, of_seen, of_lens):
-    """Add to `of_seen` and `of_lens` what edges hand over where they move; `beside` as `neighbours` says."""
+def boundary(
+    seen, screen, faces, beside, colors, lens, face, depth, box, once, along_color, of_seen, of_lens
+):
+    """Add to `of_seen` and `of_lens` what edges hand over where they move.
+
+    Args:
+        beside: as `neighbours` says.
+        once: whether a pixel is one sample, and not the mean of several.
+    """
     height, width = face.shape
     top, bottom = max(box[0] - 1, 0), min(box[1] + 1, height)
     left, right = max(box[2] - 1, 0), min(box[3] + 1, width)
@@ -158,6 +165,7 @@ def boundary(seen, screen, faces, beside, colors, lens, face, depth, box, along_
                         lens,
                         face,
                         depth,
+                        once,
                         along_color,
                         of_seen,
                         of_lens,
@@ -173,7 +181,7 @@ def parted(depth, other, footprint):
 
 @compiled
 @no_type_check
-def pair(pixels, seen, screen, faces, beside, colors, lens, face, depth, along_color, of_seen, of_lens):
+def pair(pixels, seen, screen, faces, beside, colors, lens, face, depth, once, along_color, of_seen, of_lens):
     """What one pair of neighbouring pixels sees of the edge between them, if there is one."""
     row, column, other_row, other_column = pixels
     if depth[other_row, other_column] < depth[row, column]:  # the nearer one first
@@ -212,19 +220,19 @@ def pair(pixels, seen, screen, faces, beside, colors, lens, face, depth, along_c
             return
         a, b, c = faces[behind, 0], faces[behind, 1], faces[behind, 2]
         w0, w1, w2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
+    # The area that changes hands is part of the pixel in which the edge lies. Of one sample a pixel the slope there is
+    # that of all or nothing, while the pixel has a part of each surface.
+    inside = 1.0 if share < 0.5 else 0.0
+    if once:
+        inside = share + 0.5 if share < 0.5 else share - 0.5
     handed = 0.0
     for channel in range(colors.shape[1]):
         # colours where the edge is: towards it that of a surface that turns away changes fast
         step = near * (of_first * colors[first, channel] + of_second * colors[second, channel])
         if behind >= 0:
             step -= w0 * colors[a, channel] + w1 * colors[b, channel] + w2 * colors[c, channel]
-        # the area that changes hands is part of the pixel in which the edge lies
-        slope = (
-            along_color[row, column, channel]
-            if share < 0.5
-            else along_color[other_row, other_column, channel]
-        )
-        handed += np.float64(slope) * step
+        here, there = along_color[row, column, channel], along_color[other_row, other_column, channel]
+        handed += (inside * here + (1 - inside) * there) * step
     outwards = handed * ((other_column - column) + (other_row - row))
     along(seen, first, axis, outwards * (1 - part), lens, of_seen, of_lens)
     along(seen, second, axis, outwards * part, lens, of_seen, of_lens)

@@ -134,7 +134,7 @@ class Rasterizer(Renderer):
         size = (camera.height * times, camera.width * times)
         near = max(float(camera.near), raster.NEAREST)
         beside = partial(self._neighbours, scene.faces, faces)
-        view = View(faces, beside, near, size, self.cull, channels, self.gradient, self.softness)
+        view = View(faces, beside, near, size, self.cull, channels, self.gradient, self.softness, times == 1)
         if times > 1:  # the middle of pixel 0 is that of its samples
             lens = torch.cat([lens[:2] * times, (lens[2:] + 0.5) * times - 0.5])
         shown = colors if "color" in channels else None
