@@ -221,10 +221,10 @@ def pair(pixels, seen, screen, faces, beside, colors, lens, face, depth, once, a
         a, b, c = faces[behind, 0], faces[behind, 1], faces[behind, 2]
         w0, w1, w2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
     # The area that changes hands is part of the pixel in which the edge lies. Of one sample a pixel the slope there is
-    # that of all or nothing, while the pixel has a part of each surface.
+    # that of all or nothing, and jumps when the edge passes the border: the mean of both pixels' does not.
     inside = 1.0 if share < 0.5 else 0.0
-    if once:
-        inside = share + 0.5 if share < 0.5 else share - 0.5
+    if once or share == 0.5:
+        inside = 0.5
     handed = 0.0
     for channel in range(colors.shape[1]):
         # colours where the edge is: towards it that of a surface that turns away changes fast
