@@ -1,7 +1,11 @@
 """What a committed result says of where and when it was measured."""
 
 import datetime
+import os
 import platform
+import subprocess
+import sys
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,3 +21,21 @@ def machine(*packages: str) -> str:
     return (
         f"{processor}; {datetime.date.today().isoformat()}; Python {platform.python_version()}, {versions}."
     )
+
+
+def first_calls(script: str, **elsewhere: str) -> tuple[float, float]:
+    """What a script prints, seconds, in a fresh process: with nothing compiled, and with everything in the cache.
+
+    Args:
+        elsewhere: further environment; the cache of compiled code is in the folder {} of a value.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, **{name: value.format(folder) for name, value in elsewhere.items()}}
+        cold, warm = (
+            subprocess.run(
+                [sys.executable, "-c", script],
+                env=environment, cwd=Path(__file__).parent.parent, check=True, capture_output=True, text=True,
+            ).stdout
+            for _ in range(2)
+        )  # fmt: skip
+    return float(cold), float(warm)

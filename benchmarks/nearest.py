@@ -10,9 +10,7 @@ import argparse
 import math
 import os
 import resource
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +27,7 @@ from scipy.spatial import cKDTree  # type: ignore[reportAttributeAccessIssue]
 from sklearn.neighbors import NearestNeighbors
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.machine import machine
+from benchmarks.machine import first_calls, machine
 from framework.geometry.nearest import Queries, nearest, prepare
 from framework.geometry.nearest.streamed import Middle, Reach, Stream, normal
 
@@ -228,20 +226,6 @@ def two_cores(points: int, basis_points: int, count: int, seconds: float = 12.0)
     return wall[1] / wall[2], 2 * processor[1] / processor[2]
 
 
-def first_calls() -> tuple[float, float]:
-    """Seconds of processor time of the first call of a process: cache empty, cache filled."""
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "FRAMEWORK_CACHE": folder, "NUMBA_CACHE_DIR": ""}
-        cold, warm = (
-            subprocess.run(
-                [sys.executable, "-c", FIRST_CALL],
-                env=environment, cwd=Path(__file__).parent.parent, check=True, capture_output=True, text=True,
-            ).stdout
-            for _ in range(2)
-        )  # fmt: skip
-    return float(cold), float(warm)
-
-
 def report() -> str:
     torch.set_num_threads(1)
     names = ["ours", "ours, a call a cloud", *(rival.__name__ for rival in RIVALS)]
@@ -267,7 +251,7 @@ def report() -> str:
         "one cloud, 10,000 and 32,768": two_cores(10_000, 32_768, 1),
     }
     load = os.getloadavg()[0]
-    cold, warm = first_calls()
+    cold, warm = first_calls(FIRST_CALL, FRAMEWORK_CACHE="{}", NUMBA_CACHE_DIR="")
     return "\n".join(
         [
             "# Nearest neighbours of a basis: milliseconds a cloud on one core",

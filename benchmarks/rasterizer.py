@@ -1,23 +1,19 @@
 """Milliseconds a frame of the renderer rasterizer, written beside this file: `python benchmarks/rasterizer.py`."""
 
 import math
-import os
-import platform
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import date
 from functools import partial
 from pathlib import Path
 from statistics import median
 
-import numba
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.machine import first_calls, machine
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene
@@ -113,30 +109,6 @@ def both_ways(renderer: Renderer, drawn: Scene, learned: str) -> None:
     renderer(replace(drawn, **{learned: part}), ("color",))["color"].sum().backward()
 
 
-def first_calls() -> tuple[float, float]:
-    """Seconds of the first call in a fresh process: with an empty compilation cache, and with a filled one.
-
-    The import of torch and numba is not in it.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        cold, warm = (
-            subprocess.run(
-                [sys.executable, "-c", FIRST_CALL],
-                env=environment, cwd=Path(__file__).parent.parent, check=True, capture_output=True, text=True,
-            ).stdout
-            for _ in range(2)
-        )  # fmt: skip
-    return float(cold), float(warm)
-
-
-def processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor()
-
-
 def report() -> str:
     torch.set_num_threads(1)
     plain, culling, inside = (
@@ -154,7 +126,7 @@ def report() -> str:
             row(f"{size}, in view, culled, interior", inside, scene(vertices, faces, distance=DISTANCE))
         )
         rows.append(row(f"{size}, out of view", plain, scene(vertices, faces, distance=-DISTANCE)))
-    cold, warm = first_calls()
+    cold, warm = first_calls(FIRST_CALL, NUMBA_CACHE_DIR="{}")
     return "\n".join(
         [
             "# rasterizer: milliseconds a frame",
@@ -171,9 +143,7 @@ def report() -> str:
             f"First call in a process, all channels: {cold:.1f} s where everything is compiled, "
             f"{warm:.2f} s where the compiled code is read from the cache.",
             "",
-            f"{processor()}, {os.cpu_count()} cores; {date.today()}; Python {platform.python_version()}, "
-            f"torch {torch.__version__}, numba {numba.__version__}, numpy {np.__version__}. "
-            "Command: `python benchmarks/rasterizer.py`.",
+            f"{machine('torch', 'numba', 'numpy')} Command: `python benchmarks/rasterizer.py`.",
             "",
         ]
     )

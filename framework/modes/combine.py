@@ -91,7 +91,8 @@ def common(members: Sequence[Description]) -> Description:
     for other in members[1:]:
         here, there = other.config["data"], first.config["data"]
         if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
-            fixed = " ".join(f"data.{key}={there.get(key)}" for key in differing)
+            wanted = {key: "null" if there.get(key) is None else there[key] for key in differing}
+            fixed = " ".join(f"data.{key}={value}" for key, value in wanted.items())
             raise CheckpointError(
                 f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}: what is "
                 f"test data of one may have trained the other. Train the members on the same data, with {fixed} in all."

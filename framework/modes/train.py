@@ -6,7 +6,7 @@ from framework.runs.fit import fit, keep_model_alone
 from framework.runs.job import leave_value
 from framework.runs.run import opened
 from framework.runs.session import calibrate, for_training
-from framework.storage.progress import first_rank
+from framework.storage.first_rank import first_rank
 
 
 def run(config: Config) -> float:

@@ -14,7 +14,7 @@ from framework.model import FrozenFrontEnd, fitted_models
 from framework.runs.loading import fill, weights
 from framework.runs.run import Run
 from framework.runs.session import Session
-from framework.storage.progress import first_rank
+from framework.storage.first_rank import first_rank
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import WholeCheckpoints, latest_good, read
 from framework.training.fitting import fit_at_once, mean_loss
@@ -99,12 +99,11 @@ def _resumed_from(session: Session, run: Run) -> Path | None:
 
 def _trained(folder: Path) -> Path | None:
     found = latest_good(folder, names=TRAINED)
-    if found is None:
-        best = latest_good(folder, names={BEST})
-        found = (
-            best if best is not None and "optimizer_states" in read(best) else None
-        )  # version 0.1 wrote it whole
-    return found
+    if found is not None:
+        return found
+    best = latest_good(folder, names={BEST})
+    # version 0.1 wrote it whole
+    return best if best is not None and "optimizer_states" in read(best) else None
 
 
 def keep_model_alone(run: Run) -> None:

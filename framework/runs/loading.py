@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
@@ -43,15 +44,15 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     predictor.description = description
     data = reader(description)
 
-    frames: dict[int, Frame | None] = {}  # of the inputs that are being predicted for, by their identity
+    frames = WeakTensorKeyDictionary()  # of the inputs that are being predicted for
 
     def ready(model: nn.Module, given: tuple[Any]) -> Tensor:
         batch = asked_of(predictor, data, *given)
-        frames[id(batch["input"])] = data.frame(batch)
+        frames[batch["input"]] = data.frame(batch)
         return batch["input"]
 
     def answered(model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
-        frame = frames.pop(id(inputs[0]))
+        frame: Frame | None = frames.pop(inputs[0])
         return density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
 
     predictor.register_forward_pre_hook(ready)

@@ -18,8 +18,8 @@ from framework.errors import DataError, UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
 from framework.storage.files import unwritable, write_whole
+from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_yaml
-from framework.storage.progress import first_rank
 from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker

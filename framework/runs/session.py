@@ -37,7 +37,8 @@ from framework.prediction import Prediction
 from framework.runs.description import Description
 from framework.runs.loading import PREFIX, load_with_description, reader
 from framework.runs.run import Run
-from framework.storage.progress import first_rank, output
+from framework.storage.first_rank import first_rank
+from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, told

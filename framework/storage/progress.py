@@ -1,6 +1,5 @@
 """What long work says of itself while it goes on: a bar on a terminal, in a log a line every half minute."""
 
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
@@ -9,23 +8,13 @@ from typing import TypeVar, final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from framework.storage.first_rank import first_rank
+
 Item = TypeVar("Item")
 SHORT, APART = 2.0, 30.0
 """Seconds: shorter work says nothing, and lines of a log are so far apart."""
 WIDE = 160
 """Characters of a line of a log."""
-
-
-def first_rank() -> bool:
-    """Whether this process keeps the run's record: the only one, or the first of several that train together.
-
-    A launcher (Lightning, torchrun, srun) says which rank this is and of how many. A rank without a number of ranks is
-    somebody else's variable.
-    """
-    for rank, ranks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS")):
-        if rank in os.environ and os.environ.get(ranks, "1") != "1":
-            return os.environ[rank] == "0"
-    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
 
 
 def output() -> Console:

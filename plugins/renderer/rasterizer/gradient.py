@@ -189,14 +189,18 @@ def pair(pixels, seen, screen, faces, beside, colors, lens, face, depth, once, a
     # on the way from one pixel to the other, from face to face, to where the nearer surface ends or turns away
     index = face[row, column]
     facing = turn(screen, faces, index)
+    corner, share, ended = -1, 0.0, False
     for _ in range(MOST_FACES):
         corner, share = leaves(screen, faces, index, facing, row, column, other_row, other_column)
         if corner < 0 or share >= 1:
             return
         following = beside[index, corner]
-        if following < 0 or turn(screen, faces, following) * facing <= 0:
+        ended = following < 0 or turn(screen, faces, following) * facing <= 0
+        if ended:
             break
         index = following
+    if not ended:
+        return
     first, second = faces[index, corner], faces[index, (corner + 1) % 3]
     in_row = other_row == row
     axis = 0 if in_row else 1

@@ -209,6 +209,20 @@ def to_border(corners, heights, w0, w1, w2, x, y):
 
 @compiled
 @no_type_check
+def reached(corners, heights, low, sharpness, x, y):
+    """Barycentric weights of a pixel; 1 inside of the triangle, -1 outside, 0 out of reach (as it is below the weights
+    `low`); the nearest edge; and exp(-d²/σ) of the distance d to it."""
+    w0, w1, w2 = parts(*corners, x, y)
+    if w0 < low[0] or w1 < low[1] or w2 < low[2]:
+        return w0, w1, w2, 0.0, 0, 0.0
+    squared, turn, edge = to_border(corners, heights, w0, w1, w2, x, y)
+    if turn < 0 and squared * sharpness > REACH:
+        turn = 0.0
+    return w0, w1, w2, turn, edge, np.exp(-squared * sharpness)
+
+
+@compiled
+@no_type_check
 def cut(w0, w1, w2):
     """Weights cut at 0 and scaled to the sum 1, and that sum before."""
     w0, w1, w2 = max(w0, 0.0), max(w1, 0.0), max(w2, 0.0)
@@ -232,18 +246,13 @@ def forward(
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         corners = corners_of(place, a, b, c)
         heights = heights_of(*corners)
-        # barycentric weights beyond which a pixel is out of reach
-        low0, low1, low2 = -margin / heights[0], -margin / heights[1], -margin / heights[2]
+        low = -margin / heights[0], -margin / heights[1], -margin / heights[2]
         near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
         for row in range(top, bottom):
             for column in range(left, right):
-                w0, w1, w2 = parts(*corners, column, row)
-                if w0 < low0 or w1 < low1 or w2 < low2:
+                w0, w1, w2, turn, _, doubt = reached(corners, heights, low, sharpness, column, row)
+                if turn == 0:
                     continue
-                squared, turn, _ = to_border(corners, heights, w0, w1, w2, column, row)
-                if turn < 0 and squared * sharpness > REACH:
-                    continue
-                doubt = np.exp(-squared * sharpness)
                 covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
                 clear[row, column] *= (doubt if turn > 0 else 1.0) / (1 + doubt)
                 q0, q1, q2, _ = cut(w0, w1, w2)
@@ -303,8 +312,7 @@ def backward(scene, drawn, along_color, sums):
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         corners = corners_of(place, a, b, c)
         heights = heights_of(*corners)
-        # barycentric weights beyond which a pixel is out of reach
-        low0, low1, low2 = -margin / heights[0], -margin / heights[1], -margin / heights[2]
+        low = -margin / heights[0], -margin / heights[1], -margin / heights[2]
         ax, ay, bx, by, cx, cy = corners
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
@@ -314,13 +322,9 @@ def backward(scene, drawn, along_color, sums):
             for column in range(left, right):
                 if not live[row, column]:
                     continue
-                w0, w1, w2 = parts(*corners, column, row)
-                if w0 < low0 or w1 < low1 or w2 < low2:
+                w0, w1, w2, turn, edge, doubt = reached(corners, heights, low, sharpness, column, row)
+                if turn == 0:
                     continue
-                squared, turn, edge = to_border(corners, heights, w0, w1, w2, column, row)
-                if turn < 0 and squared * sharpness > REACH:
-                    continue
-                doubt = np.exp(-squared * sharpness)
                 covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
                 left_clear = (doubt if turn > 0 else 1.0) / (1 + doubt)
                 of_odds = of_mean[row, column] * clear[row, column] * covered  # of A_O: ∂ log(1 - D) = -D
