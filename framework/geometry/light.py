@@ -1,0 +1,18 @@
+"""Between the numbers of image files and light: sRGB (IEC 61966-2-1) to and from linear."""
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+
+def linear(stored: UInt8[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Light in [0, 1], float32, of 8-bit numbers."""
+    share = stored.float() / 255
+    return torch.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def eight_bit(light: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
+    """8-bit numbers of light; what lies outside of [0, 1] is cut off."""
+    light = light.clamp(0, 1)
+    share = torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+    return (share * 255).round().to(torch.uint8)
