@@ -150,10 +150,10 @@ class Renderer(ABC):
     channels: ClassVar[frozenset[str]]
     """What it can draw, each (height, width) or, with a number behind it here, (height, width, number): "color" of as
     many as the scene's, float32 in [0, 1], background 0; "depth", float32, metres along the optical axis, background
-    inf; "face", int32, index of the visible face, background -1; "mask", bool; "normal" 3, float32, of the visible face,
-    of length 1, in world axes, to the side from which its corners run counter-clockwise; "barycentric" 3, float32,
-    weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping; the background
-    of the last three is 0."""
+    inf; "face", int32, index of the visible face, background -1; "mask", bool; "normal" 3, float32, of the visible
+    face, of length 1, in world axes, to the side from which its corners run counter-clockwise; "barycentric" 3,
+    float32, weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping; the
+    background of the last three is 0."""
 
     differentiable: ClassVar[frozenset[str]] = frozenset()
     """In what "color" has a gradient, that of pictures of areas and not of single points, of: "vertices", "colors",
