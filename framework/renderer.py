@@ -155,7 +155,7 @@ class Renderer(ABC):
     float32, weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping; the
     background of the last three is 0."""
 
-    differentiable: ClassVar[frozenset[str]] = frozenset()
+    differentiable: frozenset[str] = frozenset()
     """In what "color" has a gradient, that of pictures of areas and not of single points, of: "vertices", "colors",
     "texture" (its images), "uv", "rotation", "translation", "focal", "principal"."""
 
