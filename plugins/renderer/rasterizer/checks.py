@@ -119,8 +119,6 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
             if len(colors) != len(vertices):
                 raise ValueError(f"{len(colors)} colors came for {len(vertices)} vertices; wanted one each.")
         learned.append(colors)
-    if "uv" in channels and scene.texture is None:
-        raise ValueError('"uv" was asked of a scene without a texture; give one, or ask other channels.')
     if scene.texture is not None and not set(PAINTED).isdisjoint(channels):
         if gradient == "soft" and "color" in channels:
             raise ValueError(

@@ -91,8 +91,8 @@ def interior(
                 if laid is not None and laid.shown[index] >= 0:
                     textured = True
                     pixel = (along_color, row, column)
-                    of_paint = (of_colors, of_texels, of_uv)
-                    d0, d1, d2 = into_texture(faces, colors, laid, index, w0, w1, w2, pixel, of_paint)
+                    where = (index, w0, w1, w2)
+                    d0, d1, d2 = into_texture(faces, colors, laid, where, pixel, of_colors, of_texels, of_uv)
                 if colors is not None and not textured:
                     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
                     for channel in range(along_color.shape[2]):
@@ -185,14 +185,14 @@ def settle(seen, faces, index, sums, place, lens, of_seen, of_lens):
 
 @compiled
 @no_type_check
-def into_texture(faces, colors, laid, index, w0, w1, w2, pixel, sums):
+def into_texture(faces, colors, laid, where, pixel, of_colors, of_texels, of_uv):
     """Add a pixel's slopes to those of colours, texels and uv; returns the slopes in its weights.
 
     Args:
+        where: the face and the weights.
         pixel: slopes of the loss, (height, width, channels), row and column.
-        sums: of colours, texels and uv, or None.
     """
-    of_colors, of_texels, of_uv = sums
+    index, w0, w1, w2 = where
     slopes, row, column = pixel
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     d0 = d1 = d2 = 0.0

@@ -142,7 +142,7 @@ def inform(seen, screen, vertices, faces, laid, lens, face, box, normal, barycen
                 barycentric[row, column, 0] = w0
                 barycentric[row, column, 1] = w1
                 barycentric[row, column, 2] = w2
-            if uv is not None and laid.shown[index] >= 0:
+            if uv is not None and laid is not None and laid.shown[index] >= 0:
                 uv[row, column, 0], uv[row, column, 1] = uv_at(laid, index, w0, w1, w2)
 
 
