@@ -1,28 +1,35 @@
-"""Milliseconds a frame of the renderer rasterizer, written beside this file: `python benchmarks/rasterizer.py`."""
+"""Milliseconds a frame of the renderer rasterizer, what is saved, threads, memory, growth, and other renderers; written
+beside this file: `python benchmarks/rasterizer.py`."""
 
 import math
 import sys
 import time
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import rasterizer_growth, rasterizer_peers
 from benchmarks.machine import first_calls, machine
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
-from framework.renderer import Renderer, Scene
+from framework.renderer import Renderer, Scene, joined
 
 HEIGHT, WIDTH = 410, 308
 FOCAL = 600  # pixels
 DISTANCE = 2.6  # metres
 ASKED = (("mask",), ("depth",), ("color",), ("color", "depth"))
 LEARNED = ("vertices", "colors")
+ALONE = ("view", "box")
+"""Savings of pictures that nothing came before."""
+SCENES = 32
 FIRST_CALL = """
 import time, torch
 from benchmarks.rasterizer import DISTANCE, figure, scene
@@ -109,30 +116,134 @@ def both_ways(renderer: Renderer, drawn: Scene, learned: str) -> None:
     renderer(replace(drawn, **{learned: part}), ("color",))["color"].sum().backward()
 
 
+def renderer(**config: Any) -> Renderer:
+    return build("renderer", resolve("renderer", {"name": "rasterizer", "savings": ALONE, **config}))
+
+
+def crowd(drawn: Scene) -> Scene:
+    """Five bodies behind one another, the farthest first."""
+    back = torch.tensor([0.0, 0.0, 1.0]) @ drawn.camera.rotation
+    return joined([replace(drawn, vertices=drawn.vertices + 0.5 * step * back) for step in (4, 3, 2, 1, 0)])
+
+
+def savings(drawn: Scene) -> list[str]:
+    """With everything left out that may be, and without one saving at a time."""
+    away = replace(drawn, vertices=drawn.vertices + 100)
+    many = crowd(drawn)
+    every = ("view", "box", "hidden", "unchanged")
+
+    def without(name: str) -> tuple[str, ...]:
+        return tuple(other for other in every if other not in (name, "unchanged"))
+
+    found = [
+        ("back", "one body, colour", drawn, ("color",), {"cull": True}, {"cull": False}),
+        ("view", "out of view, mask", away, ("mask",), {}, {"savings": without("view")}),
+        ("box", "one body, colour", drawn, ("color",), {"cull": True}, {"cull": True, "savings": ("view",)}),
+        (
+            "hidden",
+            "five bodies behind one another, depth",
+            many,
+            ("depth",),
+            {"cull": True, "savings": (*ALONE, "hidden")},
+            {"cull": True},
+        ),
+        (
+            "unchanged",
+            "one body whose colours alone change, colour",
+            drawn,
+            ("color",),
+            {"cull": True, "savings": (*ALONE, "unchanged")},
+            {"cull": True},
+        ),
+    ]
+    lines = []
+    for name, what, seen, asked, with_it, without_it in found:
+        with_one, other = renderer(**with_it), renderer(**without_it)
+        first, second = (milliseconds(partial(one, seen, asked)) for one in (with_one, other))
+        report = with_one.report
+        assert report is not None
+        left = ", ".join(f"{count:,} {reason}" for reason, count in report.left_out.items()) or "none"
+        again = f"; again used: {', '.join(sorted(report.reused))}" if report.reused else ""
+        lines.append(f"| {name} | {what} | {second:.2f} | {first:.2f} | {left}{again} |")
+    plain = renderer(cull=True)
+    every_channel = milliseconds(lambda: plain(replace(drawn), sorted(plain.channels - {"uv"})))
+    one = milliseconds(lambda: plain(drawn, ("mask",)))
+    lines.append(f"| channels | one body, mask alone for all but uv | {every_channel:.2f} | {one:.2f} | |")
+    return lines
+
+
+def side_by_side(drawn: Scene) -> list[str]:
+    """Pictures a second of wall clock: one by one, in batches on one thread, in batches on two; the best of five."""
+    scenes = [replace(drawn, vertices=drawn.vertices + 0.001 * number) for number in range(SCENES)]
+    plain = renderer(cull=True)
+
+    def rate(draw: Callable[[], object], threads: int) -> float:
+        torch.set_num_threads(threads)
+        draw()
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            draw()
+            times.append(time.perf_counter() - start)
+        torch.set_num_threads(1)
+        return SCENES / min(times)
+
+    single = rate(lambda: [plain(scene, ("color",)) for scene in scenes], 1)
+    one, two = (rate(lambda: plain.batch(scenes, ("color",)), threads) for threads in (1, 2))
+    return [
+        "| | pictures a second | ratio |",
+        "|---|---|---|",
+        f"| {SCENES} one by one | {single:.0f} | 1 |",
+        f"| batch of {SCENES}, 1 thread | {one:.0f} | {one / single:.2f} |",
+        f"| batch of {SCENES}, 2 threads | {two:.0f} | {two / single:.2f} |",
+    ]
+
+
+def memory(drawn: Scene) -> str:
+    """Beyond inputs and outputs, as NumPy allocates it."""
+    part = drawn.vertices.clone().requires_grad_()
+    plain = renderer(cull=True)
+    tracemalloc.start()
+    plain(replace(drawn, vertices=part), ("color",))["color"].sum().backward()
+    first = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    start = tracemalloc.get_traced_memory()[0]
+    for step in range(5):
+        plain(replace(drawn, vertices=drawn.vertices + step), ("color",))
+    later = tracemalloc.get_traced_memory()[1] - start
+    tracemalloc.stop()
+    return (
+        f"Memory at {len(drawn.vertices):,} vertices: {first / 2**20:.1f} MiB at most in the first picture with its "
+        f"gradient, picture included; {later / 2**20:.1f} MiB in later pictures, which take "
+        f"{HEIGHT * WIDTH * 12 / 2**20:.1f} MiB themselves."
+    )
+
+
 def report() -> str:
     torch.set_num_threads(1)
     plain, culling, inside = (
-        build("renderer", resolve("renderer", {"name": "rasterizer", **config}))
-        for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
+        renderer(**config) for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
     )
     bodies = [figure(), subdivided(*figure())]
-    cover = plain(scene(*bodies[0], distance=DISTANCE), ("mask",))["mask"].float().mean().item()
+    scenes = [scene(*body, distance=DISTANCE) for body in bodies]
+    cover = plain(scenes[0], ("mask",))["mask"].float().mean().item()
     rows = []
-    for vertices, faces in bodies:
+    for (vertices, faces), seen in zip(bodies, scenes, strict=True):
         size = f"{len(vertices):,} / {len(faces):,}"
-        rows.append(row(f"{size}, in view", plain, scene(vertices, faces, distance=DISTANCE)))
-        rows.append(row(f"{size}, in view, culled", culling, scene(vertices, faces, distance=DISTANCE)))
-        rows.append(
-            row(f"{size}, in view, culled, interior", inside, scene(vertices, faces, distance=DISTANCE))
-        )
+        rows.append(row(f"{size}, in view", plain, seen))
+        rows.append(row(f"{size}, in view, culled", culling, seen))
+        rows.append(row(f"{size}, in view, culled, interior", inside, seen))
         rows.append(row(f"{size}, out of view", plain, scene(vertices, faces, distance=-DISTANCE)))
     cold, warm = first_calls(FIRST_CALL, NUMBA_CACHE_DIR="{}")
+    ours = " / ".join(
+        f"{rasterizer_peers.milliseconds(lambda seen=seen: culling(seen, ('color',))):.2f}" for seen in scenes
+    )
     return "\n".join(
         [
             "# rasterizer: milliseconds a frame",
             "",
             f"A synthetic closed body in {HEIGHT} rows × {WIDTH} columns, of which it covers {cover:.0%}; "
-            "one thread; processor time, median of 300 calls.",
+            "one thread; processor time, median of 300 calls. Nothing is kept from one picture to the next.",
             "",
             f"| vertices / faces | {' | '.join(' + '.join(asked) for asked in ASKED)} | "
             + " | ".join(f"color, and back to {what}" for what in LEARNED)
@@ -142,6 +253,36 @@ def report() -> str:
             "",
             f"First call in a process, all channels: {cold:.1f} s where everything is compiled, "
             f"{warm:.2f} s where the compiled code is read from the cache.",
+            "",
+            "## What is left out",
+            "",
+            "| saving | scene | without it, ms | with it, ms | faces left out |",
+            "|---|---|---|---|---|",
+            *savings(scenes[0]),
+            "",
+            "## Side by side",
+            "",
+            *side_by_side(scenes[0]),
+            "",
+            memory(scenes[1]),
+            "",
+            "## Growth",
+            "",
+            *rasterizer_growth.report(Path(__file__).with_name("rasterizer_growth.png")),
+            "",
+            "## Others",
+            "",
+            f"The same two scenes, milliseconds of processor time of all threads, {len(bodies[0][0]):,} / "
+            f"{len(bodies[1][0]):,} vertices:",
+            "",
+            "| in this run | |",
+            "|---|---|",
+            f"| rasterizer (culled) | {ours} |",
+            *rasterizer_peers.rows(scenes),
+            "",
+            "| measured elsewhere, on two cores of a Sapphire Rapids Xeon | |",
+            "|---|---|",
+            *(f"| {name} | {told} |" for name, told in rasterizer_peers.ELSEWHERE.items()),
             "",
             f"{machine('torch', 'numba', 'numpy')} Command: `python benchmarks/rasterizer.py`.",
             "",
