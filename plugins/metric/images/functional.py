@@ -73,21 +73,23 @@ def ssim(predicted: Image, true: Image, mask: Mask | None) -> list[Float[Tensor,
 def ms_ssim(predicted: Image, true: Image, scales: int) -> Float[Tensor, ""]:
     """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003, eq. 7), each number apart and then their mean.
 
-    Of fewer than five scales the weights of the finest ones, made to sum to 1 again. A mean contrast below 0, of which
-    no power is known, counts as 0.
+    Of fewer than five scales the weights of the finest ones, made to sum to what all five do. A mean contrast below 0,
+    of which no power is known, counts as 0.
 
     Args:
         predicted, true: of at least `least_side(scales)` pixels a side.
     """
     one, other = predicted.double().movedim(-1, 0), true.double().movedim(-1, 0)
-    weights = torch.tensor(WEIGHTS[:scales], dtype=one.dtype, device=one.device)
+    weights = torch.tensor(WEIGHTS[:scales], dtype=one.dtype, device=one.device) * (
+        sum(WEIGHTS) / sum(WEIGHTS[:scales])
+    )
     factors: list[Tensor] = []
     for scale in range(scales):
         if scale:
             one, other = avg_pool2d(one, 2), avg_pool2d(other, 2)
         found = similarity(one, other)
         factors.append((found.whole if scale == scales - 1 else found.contrast).mean((-2, -1)).clamp(min=0))
-    return (torch.stack(factors) ** (weights / weights.sum())[:, None]).prod(0).mean()
+    return (torch.stack(factors) ** weights[:, None]).prod(0).mean()
 
 
 def least_side(scales: int) -> int:
