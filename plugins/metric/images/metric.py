@@ -183,10 +183,9 @@ class SilhouetteIoU(PerImage):
 
 
 class DepthError(PerImage):
-    """Mean absolute difference of depths over the pixels of each image that both see, metres, then the mean over
-    images; and `depth_unmatched`, of the pixels that either sees the share that only one does.
+    """Mean absolute error of depths over the pixels of each image that both see, metres, then the mean over images.
 
-    An image in which both see no pixel in common has no error, so that only the two together say how good depths are.
+    `depth_unmatched` is, of the pixels that either sees, the share that only one does. An image in which both see no pixel in common has no error, so that only the two together say how good depths are.
     """
 
     bibtex = """@inproceedings{eigen2014depth,
