@@ -185,7 +185,8 @@ class SilhouetteIoU(PerImage):
 class DepthError(PerImage):
     """Mean absolute error of depths over the pixels of each image that both see, metres, then the mean over images.
 
-    `depth_unmatched` is, of the pixels that either sees, the share that only one does. An image in which both see no pixel in common has no error, so that only the two together say how good depths are.
+    `depth_unmatched` is, of the pixels that either sees, the share that only one does. An image in which both see no
+    pixel in common has no error, so that only the two together say how good depths are.
     """
 
     bibtex = """@inproceedings{eigen2014depth,
