@@ -17,7 +17,7 @@ from framework.prediction import Prediction
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KEPT = 16
+KEPT = 8
 """Images that are kept beside the worst and the best: the one next to the median of all is shown."""
 
 
