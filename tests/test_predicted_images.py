@@ -115,5 +115,9 @@ def test_the_contract_finds_metrics_that_name_other_images_than_they_read() -> N
         metric = Reads("color", "mask", told=frozenset(told))
         failed = [finding.name for finding in examine_metric(row, metric.clone) if not finding.holds]  # type: ignore[arg-type]
         assert failed == ["only the images it names"], told
-    metric = Reads("color", "mask")
-    assert all(finding.holds for finding in examine_metric(row, metric.clone))  # type: ignore[arg-type]
+    for metric in (
+        Reads("color", "mask"),
+        Reads("color", splits=("test", "outliers")),
+        Reads("mask", splits=("outliers",)),
+    ):
+        assert all(finding.holds for finding in examine_metric(row, metric.clone))  # type: ignore[arg-type]

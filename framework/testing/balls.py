@@ -37,7 +37,7 @@ def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANN
         "mask": mask,
         "depth": torch.where(mask, 3 - bulge.clamp(min=0).sqrt(), torch.inf),
     }
-    return {channel: drawn[channel] for channel in channels}
+    return {channel: drawn[channel] for channel in sorted(channels)}
 
 
 class Ball(Mixture):

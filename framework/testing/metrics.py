@@ -154,8 +154,8 @@ def _predictions(row: MetricRow, count: int, reads: Collection[str]) -> Slices:
         else:
             about = logits[index] if row.target.kind == "class" else location[index]
             density = density_about(row.target, about)
-            if reads:
-                density = Ball(density, about, row.size)
+        if reads:
+            density = Ball(density, about, row.size)
         batch = {"target": target[index], "index": index, "group": torch.zeros_like(index)}
         batch |= {name: field[index] for name, field in fields.items()}
         return Prediction(density, batch, split=split)
@@ -290,7 +290,7 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
 
 def _images(build: Make, some: Slices, worst: Worst) -> None:
     """Each asked for alone, since the prediction was not told: those that `reads` names, each once."""
-    metric, prediction = build(), some(torch.arange(SAMPLES), "test")
+    metric, prediction = build(), some(torch.arange(SAMPLES), build().splits[0])
     metric.update(prediction)
     asked = prediction.density.asked  # type: ignore[attr-defined]  # a Ball
     worst.same("images drawn", sorted(map(sorted, asked)), sorted([name] for name in metric.reads))
