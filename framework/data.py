@@ -20,7 +20,10 @@ sample's number in its split; "group", int64 index into `Data.groups`; and what 
 Optional is "symmetry", int64, set by a data set that knows it (generated objects, say) and read by the pictures of
 densities: n where the object looks the same after 1/n of a turn about its vertical axis, so that n values of the
 first angle are equally right; 1 where none is, as where the field is missing; 0 where any turn looks the same, so that
-there is no direction."""
+there is no direction.
+
+Optional are "color", "mask" and "depth" too: the true image, laid out as `framework.renderer.Renderer.channels` says,
+read by metrics of images."""
 
 
 class Frame(NamedTuple):

@@ -33,6 +33,9 @@ class Metric(torchmetrics.Metric, ABC):
     splits: ClassVar[tuple[Split, ...]] = ("test",)
     """Whose predictions `update` is given. With "outliers" it also gets those on the test split of the config's
     `outliers`, told apart by `prediction.split`; nothing is predicted on outliers that no metric reads."""
+    reads: ClassVar[frozenset[str]] = frozenset()
+    """Channels of `Prediction.image` that `update` asks for: those that some metric reads are drawn together, and no
+    others. Their truth is `Prediction.true_image`."""
     columns: ClassVar[dict[str, str]]
     """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
     A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own."""

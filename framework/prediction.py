@@ -1,6 +1,7 @@
 """What a model predicted for one batch; whatever is derived from it is computed on first use, once."""
 
 import math
+from collections.abc import Collection
 from contextlib import nullcontext
 from functools import cached_property
 from typing import Literal
@@ -13,7 +14,8 @@ from framework.distributions.circular import wrap
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.moved import Moved
 from framework.distributions.noise import Draw
-from framework.distributions.protocol import Estimate, estimate, marginal, median
+from framework.distributions.protocol import Estimate, estimate, images, marginal, median
+from framework.errors import DataError
 from framework.target import Target
 
 Split = Literal["test", "outliers"]
@@ -29,6 +31,7 @@ class Prediction:
         samples: draws for a point prediction that has no closed form (S of eq. 3.24).
         split: where the batch comes from; the targets of outliers mean nothing.
         draw: where noise comes from; None: torch's generators as they stand.
+        reads: channels of images that will be asked for, to be drawn together.
     """
 
     def __init__(
@@ -38,11 +41,13 @@ class Prediction:
         samples: int = 1000,
         split: Split = "test",
         draw: Draw | None = None,
+        reads: Collection[str] = (),
     ) -> None:
         self.density = density
         self.batch = batch
         self.samples = samples
         self.split: Split = split
+        self.reads = frozenset(reads)
         self._given = draw
         self._draw = draw or (lambda purpose: nullcontext())
 
@@ -51,7 +56,7 @@ class Prediction:
         if frame is None:
             return self
         density = Moved(self.density, *(part.to(self.batch["input"]) for part in frame))
-        return Prediction(density, self.batch, self.samples, self.split, self._given)
+        return Prediction(density, self.batch, self.samples, self.split, self._given, self.reads)
 
     @property
     def target(self) -> Tensor:
@@ -93,6 +98,33 @@ class Prediction:
     @cached_property
     def _marginals(self) -> dict[int, Distribution]:
         return {}
+
+    def image(self, channel: str) -> Tensor:
+        """What the point prediction looks like (`protocol.images`), (batch, height, width[, number]).
+
+        The first channel that is asked for is drawn with all that `reads` names; any other with itself alone.
+        """
+        if channel not in self._images:
+            with self._draw("images"):
+                self._images.update(images(self.density, {channel, *self.reads} - self._images.keys()))
+        return self._images[channel]
+
+    @cached_property
+    def _images(self) -> dict[str, Tensor]:
+        return {}
+
+    def true_image(self, channel: str) -> Tensor:
+        """The truth, shaped like `image`: the batch's field of that name.
+
+        Raises:
+            DataError: there is no such field.
+        """
+        if channel not in self.batch:
+            raise DataError(
+                f"The true {channel!r} of every image was asked for, but batches have only {', '.join(self.batch)}. "
+                "Choose data that give it, or leave out the metric that reads it."
+            )
+        return self.batch[channel]
 
 
 def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:

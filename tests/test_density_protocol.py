@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torch.distributions import Dirichlet, Distribution, Independent, Normal
+from torch.distributions import Dirichlet, Distribution, Independent, Laplace, Normal
 
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
@@ -27,6 +27,7 @@ from framework.distributions.protocol import (
     arc,
     cdf,
     estimate,
+    images,
     mahalanobis,
     marginal,
     median,
@@ -42,6 +43,7 @@ from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
 from framework.model import Model
 from framework.target import Target
+from framework.testing.balls import CHANNELS, Ball, ball
 from framework.testing.contract import contract
 from framework.testing.heads import ready, values
 from framework.testing.metrics import Cardioid
@@ -225,6 +227,8 @@ def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow
             if "power" not in kind:  # which is of the density, not of what is inside
                 draws(kind, made, density)
             closed_forms(kind, made, density, value)
+            with pytest.raises(UserError, match=r"draws no color, mask.*protocol\.images\.register"):
+                images(density, {"mask", "color"})
             bounds(made, density, value)
             never_silently_exact(density, theirs[kind], value)
             if row.target.kind != "class":
@@ -616,6 +620,77 @@ def test_a_moved_normal_density_is_the_normal_density_there() -> None:
             close(drawn, pick(wanted, chosen).sample())
     with pytest.raises(ValueError, match="wanted three times the same shape"):
         Moved(wanted, location[:1], unit)
+
+
+DRAWN = {"gaussian": Target("real", ("x", "y")), "von_mises": Target("angle", ("a",))}
+DRAWN["categorical"] = Target("class", ("a", "b", "c"))
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_structures_show_what_is_drawn_inside_or_refuse(name: str) -> None:
+    """Where the point prediction is one of a part's, that part's images; of several parts none."""
+    made = Made(name, HeadRow("", DRAWN[name]))
+    places, size = torch.randn(3, BATCH, 2).double(), (5, 7)
+    made.parts = [Ball(part, place, size) for part, place in zip(made.parts, places, strict=True)]
+    drawn = [ball(place, size) for place in places]
+    seen = set()
+    for kind, density in made.structures().items():
+        for channels in ({"color"}, CHANNELS):
+            try:
+                found = images(density, channels)
+            except UserError as error:
+                assert "draws no color" in str(error)
+                continue
+            seen.add(kind)
+            assert found.keys() == channels
+            for channel, image in found.items():
+                parts = [one[channel] for one in drawn]
+                wanted = parts[0]
+                if kind == "stacked":
+                    wanted = torch.stack(parts, 1)
+                if kind == "reshaped":
+                    wanted = wanted.reshape(2, 2, *wanted.shape[1:])
+                assert torch.equal(image, wanted), (kind, channel)
+        if kind in seen:  # only what was asked for was drawn
+            assert made.parts[0].asked == [{"color"}, CHANNELS]
+            made.parts[0].asked.clear()
+    forwarded = {"itself", "stacked", "reshaped", "mixture of one", "with a set"}
+    extra = {"gaussian": {"moved there and back"}, "von_mises": {"floored", "power"}}
+    assert seen == forwarded | extra.get(name, {"floored"})
+
+
+@pytest.mark.parametrize("kind", [Normal, Laplace])
+def test_a_density_over_images_shows_its_mean(kind: type) -> None:
+    """Of mixtures the weighted sum over components, with the variance by the law of total variance."""
+    torch.manual_seed(0)
+    means, spreads = torch.rand(2, 3, BATCH, 5, 7, 3).double()
+    parts = [Independent(kind(*each), 3) for each in zip(means, 0.1 + spreads, strict=True)]
+    weights = torch.randn(BATCH, 3).double()
+    stacked, first = Stacked(parts), parts[0]
+    inner = Mixture(weights, stacked)
+    outer = Mixture(weights[:, :2], Stacked([inner, first]))
+    mean = torch.einsum("bk,kbhwc->bhwc", share(weights), means)
+    two = share(weights[:, :2])
+    folded = Mixture(weights[:2, :2], Reshaped(first, (2, 2)))
+    wanted = {
+        first: means[0],
+        stacked: means.movedim(0, 1),
+        Reshaped(first, (2, 2)): means[0].reshape(2, 2, 5, 7, 3),
+        Mixture(weights[:, :1], Stacked([first])): means[0],
+        inner: mean,
+        outer: torch.einsum("bk,kbhwc->bhwc", two, torch.stack([mean, means[0]])),
+        folded: torch.einsum("bk,bkhwc->bhwc", share(weights[:2, :2]), means[0].reshape(2, 2, 5, 7, 3)),
+    }
+    for density, color in wanted.items():
+        found = images(density, {"color"})
+        assert found.keys() == {"color"}
+        close(found["color"], color)
+        for channels in ({"mask"}, {"color", "depth"}):
+            with pytest.raises(UserError, match=f"draws no {', '.join(sorted(channels))}"):
+                images(density, channels)
+    squares = torch.stack([part.variance for part in parts]) + means.square()
+    close(inner.mean, mean)
+    close(inner.variance, torch.einsum("bk,kbhwc->bhwc", share(weights), squares) - mean.square())
 
 
 CHARTS = [(name, row) for name, row in ROWS if row.target.kind == "angle" and restricted(name, row)]

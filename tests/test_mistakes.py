@@ -109,6 +109,7 @@ density_head=bernouli | Did you mean 'bernoulli'?
 uncertainty.ensemble.members=3 | No uncertainty is chosen
 metrics=[accuracy] | Did you mean 'metric'?
 metric=[acuracy] | Did you mean 'accuracy'?
+experiment=moons/vanilla_128 metric=[accuracy,psnr] | Categorical of event_shape () draws no color
 objective=[outlier] | Did you mean 'outlier_exposure'?
 renderer=zbufer | Did you mean 'zbuffer'?
 experiment=moons/vanilla_128 density_head=scvae | density_head scvae, of which

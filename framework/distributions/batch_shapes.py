@@ -1,6 +1,6 @@
 """Densities with another batch_shape: several side by side, or one batch folded; what wrappers mix is made of these."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import ClassVar
 
 import torch
@@ -15,6 +15,7 @@ from framework.distributions.protocol import (
     arc,
     cdf,
     estimate,
+    images,
     mahalanobis,
     marginal,
     median,
@@ -262,6 +263,20 @@ def _(density: Reshaped, value: Tensor) -> Slope | None:
         return None
     log_prob, *others = found
     return Slope(log_prob.reshape(shape), *(each.reshape(*shape, *density.event_shape) for each in others))
+
+
+@images.register
+def _(density: Stacked, channels: Collection[str]) -> dict[str, Tensor]:
+    parts = [images(one, channels) for one in density.densities]
+    axis = len(density.batch_shape) - 1
+    return {name: torch.stack([part[name] for part in parts], axis) for name in parts[0]}
+
+
+@images.register
+def _(density: Reshaped, channels: Collection[str]) -> dict[str, Tensor]:
+    inner = len(density.density.batch_shape)
+    found = images(density.density, channels)
+    return {name: one.reshape(*density.batch_shape, *one.shape[inner:]) for name, one in found.items()}
 
 
 @peaks.register

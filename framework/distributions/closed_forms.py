@@ -1,5 +1,7 @@
 """What torch's own densities answer in closed form, and the normal quantile."""
 
+from collections.abc import Collection
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,6 +15,7 @@ from framework.distributions.protocol import (
     about,
     estimate,
     exactly,
+    images,
     mahalanobis,
     marginal,
     median,
@@ -122,6 +125,13 @@ def _(density: Normal, temperature: Tensor) -> Distribution:
 def _(density: MultivariateNormal, temperature: Tensor) -> Distribution:
     scale = density.scale_tril * temperature.sqrt()
     return MultivariateNormal(density.loc, scale_tril=scale, validate_args=False)
+
+
+@images.register
+def _(density: Independent, channels: Collection[str]) -> dict[str, Tensor]:
+    if len(density.event_shape) != 3 or set(channels) != {"color"}:
+        return images.dispatch(Distribution)(density, channels)
+    return {"color": density.mean}
 
 
 @normals.register

@@ -1,7 +1,7 @@
 """The mixture, which every wrapper and mixture head returns, and quadratures of the density of one angle."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import ClassVar
 
 import torch
@@ -19,6 +19,7 @@ from framework.distributions.protocol import (
     arc,
     cdf,
     estimate,
+    images,
     mahalanobis,
     marginal,
     median,
@@ -133,16 +134,21 @@ class Mixture(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """Of reals, (*batch, number); angles and classes have none."""
+        """Of reals, (*batch, *event); angles and classes have none."""
         first, offset, shares = self._moments()
-        return first + (shares * offset).sum(-2)
+        return first + (shares * offset).sum(self._axis)
 
     @property
     def variance(self) -> Tensor:
         """Of each real, by the law of total variance."""
         _, offset, shares = self._moments()
-        apart = offset - (shares * offset).sum(-2, keepdim=True)
-        return (shares * (self.components.variance + apart.square())).sum(-2)
+        apart = offset - (shares * offset).sum(self._axis, keepdim=True)
+        return (shares * (self.components.variance + apart.square())).sum(self._axis)
+
+    @property
+    def _axis(self) -> int:
+        """Of the components, among the dimensions of a value."""
+        return -1 - len(self.event_shape)
 
     def _moments(self) -> tuple[Tensor, Tensor, Tensor]:
         """Mean of the first component, how far the components' means are from it, and their weights.
@@ -156,7 +162,9 @@ class Mixture(Distribution):
             )
         means = self.components.mean
         # about one of them: weights of float32 sum to 1 but for 1e-7, of means far from 0 that is much
-        return means[..., 0, :], means - means[..., :1, :], self.log_weights.exp().unsqueeze(-1)
+        first = means.select(self._axis, 0)
+        weights = self.log_weights.exp()[(..., *(None,) * len(self.event_shape))]
+        return first, means - first.unsqueeze(self._axis), weights
 
     def entropy(self) -> Tensor:
         """Nats. Exact for classes, by quadrature for one number.
@@ -288,6 +296,18 @@ def _(density: Mixture, value: Tensor) -> Slope | None:
 def _(density: Mixture) -> Tensor:
     found = peaks(density.components).movedim(-1 - len(density.event_shape), 0)  # (K, peak, *batch, *event)
     return found.flatten(0, 1)
+
+
+@images.register
+def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
+    """Of one component its own; of several over images their mean. Of several over anything else none: what components
+    draw at points of their own shows no point of the mixture."""
+    if density.log_weights.shape[-1] == 1:
+        axis = len(density.batch_shape)
+        return {name: found.squeeze(axis) for name, found in images(density.components, channels).items()}
+    if len(density.event_shape) != 3 or set(channels) != {"color"}:
+        return images.dispatch(Distribution)(density, channels)
+    return {"color": density.mean}
 
 
 @scales.register

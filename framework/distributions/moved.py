@@ -1,5 +1,6 @@
 """A density of reals in another frame: what is known of Y, asked of X = location + scale · Y."""
 
+from collections.abc import Collection
 from typing import ClassVar
 
 import torch
@@ -13,6 +14,7 @@ from framework.distributions.protocol import (
     about,
     cdf,
     estimate,
+    images,
     mahalanobis,
     marginal,
     median,
@@ -154,6 +156,11 @@ def _(density: Moved, value: Tensor) -> Slope | None:
         return None
     pull, stiffness = found.pull / density.scale, found.stiffness / density.scale.square()
     return Slope(found.log_prob - density.log_volume, pull, stiffness)
+
+
+@images.register
+def _(density: Moved, channels: Collection[str]) -> dict[str, Tensor]:
+    return images(density.density, channels)  # the frame is one of numbers: what is seen stays as it is
 
 
 @peaks.register

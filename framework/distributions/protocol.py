@@ -20,7 +20,7 @@ In shapes `*batch` is the batch_shape, `*event` the event_shape, and `*sample` a
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import singledispatch
 from typing import NamedTuple
 
@@ -308,6 +308,23 @@ def slope(density: Distribution, value: Tensor) -> Slope | None:
     1977).
     """
     return None
+
+
+@singledispatch
+def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor]:
+    """What the density's point prediction looks like: the channels asked for and no others, each (*batch, height,
+    width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels` says: "color" is linear light.
+
+    Of a density over images, event_shape (height, width, number), "color" is the mean. Default: it draws none.
+
+    Raises:
+        UserError: nobody has said what the density draws, or it does not draw one of the channels.
+    """
+    raise UserError(
+        f"{type(density).__name__} of event_shape {tuple(density.event_shape)} draws no {', '.join(sorted(channels))}. "
+        "Register what it draws with `framework.distributions.protocol.images.register`, or leave out the metric or "
+        "picture that needs it."
+    )
 
 
 class ValueSet(ABC):

@@ -1,6 +1,7 @@
 """Densities raised to a power 1/T and normalised: broader than before for T > 1, narrower below."""
 
 import math
+from collections.abc import Collection
 from typing import ClassVar
 
 import torch
@@ -10,7 +11,16 @@ from torch.distributions import Categorical, Distribution, constraints
 
 from framework.distributions.circular import Circular, grid, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import Estimate, Slope, estimate, peaks, slope, tempered, with_error
+from framework.distributions.protocol import (
+    Estimate,
+    Slope,
+    estimate,
+    images,
+    peaks,
+    slope,
+    tempered,
+    with_error,
+)
 from framework.errors import UserError
 
 POINTS, MOST_POINTS = 1024, 2**15
@@ -223,6 +233,11 @@ def _(density: CircularPower, value: Tensor) -> Estimate:
         of_normaliser = torch.where(around == 0, 0.0, density.powers.softmax(0) * around).sum(0)
         error = (found.standard_error + of_normaliser) / density.temperature.to(log_prob)
     return with_error(log_prob, error, found.samples, found.unresolved)
+
+
+@images.register
+def _(density: CircularPower, channels: Collection[str]) -> dict[str, Tensor]:
+    return images(density.density, channels)  # drawn at the mode, which a power keeps
 
 
 @peaks.register

@@ -1,6 +1,6 @@
 """Runs a predictor over a split: metrics, per group and in all, and what the prediction costs."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -77,12 +77,17 @@ def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
 
 
 def predicted(
-    predictor: Predictor, batch: Batch, samples: int, draw: Draw, split: Split = "test"
+    predictor: Predictor,
+    batch: Batch,
+    samples: int,
+    draw: Draw,
+    split: Split = "test",
+    reads: Collection[str] = (),
 ) -> Prediction:
     """What is predicted for a batch, whatever mode asks: what is drawn for it is a function of `draw`."""
     with draw(split):
         density = predictor(batch["input"])
-    return Prediction(density, batch, samples, split, draw)
+    return Prediction(density, batch, samples, split, draw, reads)
 
 
 def _update(
@@ -93,11 +98,12 @@ def _update(
     draw: Draw,
     split: Split = "test",
 ) -> None:
-    prediction = predicted(predictor, batch, samples, draw, split)
-    for metric in metrics:
-        if split in metric.splits:
-            with draw(f"{split} {type(metric).__name__}"):
-                metric.update(prediction)
+    readers = [metric for metric in metrics if split in metric.splits]
+    reads = {channel for metric in readers for channel in metric.reads}
+    prediction = predicted(predictor, batch, samples, draw, split, reads)
+    for metric in readers:
+        with draw(f"{split} {type(metric).__name__}"):
+            metric.update(prediction)
 
 
 def _numbers(metrics: Sequence[Metric]) -> dict[str, float]:

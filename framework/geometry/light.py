@@ -13,6 +13,10 @@ def linear(stored: UInt8[Tensor, "*any"]) -> Float[Tensor, "*any"]:
 
 def eight_bit(light: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
     """8-bit numbers of light; what lies outside of [0, 1] is cut off."""
+    return (encoded(light) * 255).round().to(torch.uint8)
+
+
+def encoded(light: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """The same before they are rounded, in [0, 1]; with a gradient where light is inside of [0, 1]."""
     light = light.clamp(0, 1)
-    share = torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
-    return (share * 255).round().to(torch.uint8)
+    return torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=1e-8) ** (1 / 2.4) - 0.055)

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import ClassVar
 
 import torch
@@ -14,6 +14,7 @@ from framework.distributions.protocol import estimate, exactly, marginal, median
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target
+from framework.testing.balls import Ball, ball
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
 from framework.testing.rows import MetricRow
@@ -108,7 +109,8 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
     """Every property of one metric on predictions of `row.target`."""
-    whole = _predictions(row, SAMPLES)
+    reads = build().reads
+    whole = _predictions(row, SAMPLES, reads)
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "named numbers": (0.0, lambda worst: _named(build, whole, worst)),
         "nothing seen is NaN": (0.0, lambda worst: _nothing(build, whole, worst)),
@@ -117,7 +119,10 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
         "states merge": (1e-9, lambda worst: _merge(build, whole, worst)),
         "reset and copy": (0.0, lambda worst: _reset(build, whole, worst)),
         "perfect beats random": (0.0, lambda worst: _perfect(build, row, worst)),
+        "only the images it names": (0.0, lambda worst: _images(build, whole, worst)),
     }
+    if not reads:
+        del checks["only the images it names"]
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield examined(name, row.limits.get(name, limit), check)
@@ -126,11 +131,13 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
 Slices = Callable[[Tensor, Split], Prediction]
 
 
-def _predictions(row: MetricRow, count: int) -> Slices:
+def _predictions(row: MetricRow, count: int, reads: Collection[str]) -> Slices:
     """Indices and split → the prediction of those samples of one fixed set; as outliers they have other densities, most
-    of them broader."""
+    of them broader. Where images are read, they show balls."""
     target = values(row.target, (count,))
     fields = {name: make(count) for name, make in row.fields.items()}
+    if reads:
+        fields = {**ball(_place(row, target), row.size), **fields}
     generator = torch.Generator().manual_seed(SEED)
     location = (
         torch.randn(target.shape, generator=generator) if row.target.kind != "class" else torch.zeros(())
@@ -147,11 +154,22 @@ def _predictions(row: MetricRow, count: int) -> Slices:
         else:
             about = logits[index] if row.target.kind == "class" else location[index]
             density = density_about(row.target, about)
+        if reads:
+            density = Ball(density, about, row.size)
         batch = {"target": target[index], "index": index, "group": torch.zeros_like(index)}
         batch |= {name: field[index] for name, field in fields.items()}
         return Prediction(density, batch, split=split)
 
     return some
+
+
+def _place(row: MetricRow, target: Tensor) -> Tensor:
+    """What `density_about` reads for a density about the target: of classes logits."""
+    return (
+        3.0 * torch.nn.functional.one_hot(target, len(row.target.names))
+        if row.target.kind == "class"
+        else target
+    )
 
 
 def _feed(metric: Metric, some: Slices, part: Tensor) -> None:
@@ -245,17 +263,18 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
     latter.
     """
     metric = build()
-    some = _predictions(row, SAMPLES)
+    some = _predictions(row, SAMPLES, metric.reads)
     index = torch.arange(SAMPLES)
     breadth = torch.full((SAMPLES,), 2.0)
 
     def about(location: Tensor, outliers: Tensor | None) -> dict[str, Tensor]:
         batch = some(index, "test").batch
-        if row.target.kind == "class":
-            location = 3.0 * torch.nn.functional.one_hot(location, len(row.target.names))
+        location = _place(row, location)
         judged = build()
         for split in judged.splits:
             density = density_about(row.target, location.float(), outliers if split == "outliers" else None)
+            if judged.reads:
+                density = Ball(density, location.float(), row.size)
             judged.update(Prediction(density, batch, split=split))
         return judged.compute()
 
@@ -267,3 +286,11 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
         ahead = good[key] - bad[key] if way == "higher" else bad[key] - good[key]
         told = f"{key}: {good[key].item():.4g} about the target, {bad[key].item():.4g} elsewhere"
         worst.count(not (ahead > 0 or good[key].isnan().item()), told)
+
+
+def _images(build: Make, some: Slices, worst: Worst) -> None:
+    """Each asked for alone, since the prediction was not told: those that `reads` names, each once."""
+    metric, prediction = build(), some(torch.arange(SAMPLES), build().splits[0])
+    metric.update(prediction)
+    asked = prediction.density.asked  # type: ignore[attr-defined]  # a Ball
+    worst.same("images drawn", sorted(map(sorted, asked)), sorted([name] for name in metric.reads))

@@ -90,8 +90,9 @@ class MetricRow:
 
     Attributes:
         name: what distinguishes it from the plugin's other rows.
-        target: what is predicted.
+        target: what is predicted; a metric that reads images sees a ball there (`framework.testing.balls`).
         fields: further fields of a batch that it reads: number of samples → tensor with that first dimension.
+        size: height and width of the images that are predicted, where it reads some.
         config, limits, leave_out: as in HeadRow.
     """
 
@@ -99,6 +100,7 @@ class MetricRow:
     target: Target
     config: Mapping[str, Any] = field(default_factory=dict)
     fields: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
+    size: tuple[int, int] = (24, 32)
     limits: Mapping[str, float] = field(default_factory=dict)
     leave_out: Mapping[str, str] = field(default_factory=dict)
 

@@ -1,6 +1,7 @@
 """A density with a uniform floor."""
 
 import math
+from collections.abc import Collection
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from framework.distributions.protocol import (
     about,
     arc,
     estimate,
+    images,
     marginal,
     median,
     peaks,
@@ -124,6 +126,11 @@ def _(density: Floored, value: Tensor) -> Slope | None:
 @peaks.register
 def _(density: Floored) -> Tensor:
     return peaks(density.density)
+
+
+@images.register
+def _(density: Floored, channels: Collection[str]) -> dict[str, Tensor]:
+    return images(density.density, channels)  # drawn at the mode, which a floor does not move
 
 
 @scales.register

@@ -1,0 +1,67 @@
+"""The simplest density that draws images: where a ball is."""
+
+from collections.abc import Collection
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.batch_shapes import Reshaped
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import images
+
+CHANNELS = frozenset({"color", "mask", "depth"})
+
+
+def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANNELS) -> dict[str, Tensor]:
+    """Pictures of a ball, its first number to the right, its last one downwards, an eighth of a side for each 1.
+
+    Args:
+        place: (batch, number).
+        size: height and width of the pictures, pixels.
+    """
+    height, width = size
+    row, column = ((torch.arange(side) + 0.5) / side for side in size)
+    across, down = (
+        (side - 0.5 - place[:, number, None].float() / 8) * length / min(size)
+        for side, number, length in ((column, 0, width), (row, -1, height))
+    )
+    bulge = 0.3**2 - across[:, None, :].square() - down[:, :, None].square()
+    mask = bulge >= 0
+    shade = torch.stack(
+        [0.2 + 8 * bulge, 0.5 + across[:, None, :].expand_as(bulge), torch.full_like(bulge, 0.3)], -1
+    )
+    drawn = {
+        "color": torch.where(mask[..., None], shade, 0.0).clamp(0, 1),
+        "mask": mask,
+        "depth": torch.where(mask, 3 - bulge.clamp(min=0).sqrt(), torch.inf),
+    }
+    return {channel: drawn[channel] for channel in sorted(channels)}
+
+
+class Ball(Mixture):
+    """A density, to the last bit, that draws a ball.
+
+    Args:
+        density: any, with batch_shape (batch,).
+        place, size: of its pictures, as of `ball`.
+
+    Attributes:
+        asked: channels of every drawing, in turn.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, density: Distribution, place: Tensor, size: tuple[int, int]) -> None:
+        self.place = place
+        self.size = size
+        self.asked: list[frozenset[str]] = []
+        shape = (*density.batch_shape, 1)
+        super().__init__(torch.zeros(shape, dtype=place.dtype), Reshaped(density, shape))
+
+
+@images.register
+def _(density: Ball, channels: Collection[str]) -> dict[str, Tensor]:
+    density.asked.append(frozenset(channels))
+    return ball(density.place, density.size, channels)

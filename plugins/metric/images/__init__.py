@@ -1,0 +1,1 @@
+"""How much predicted images look like the true ones: colours, silhouettes and depths."""

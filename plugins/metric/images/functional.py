@@ -1,0 +1,111 @@
+"""Errors and similarities of one image, (height, width) or (height, width, number), in float64."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+WINDOW, SIGMA = 11, 1.5
+"""Side and standard deviation of SSIM's Gaussian window, pixels (Wang et al. 2004, §III.C)."""
+C1, C2 = 0.01**2, 0.03**2
+"""(K1 L)² and (K2 L)² for a range L of 1 (Wang et al. 2004, §III.C)."""
+WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Of MS-SSIM's scales, the finest first (Wang, Simoncelli & Bovik 2003, §3.2)."""
+
+Image = Float[Tensor, "height width number"]
+Pixels = Float[Tensor, "*pixels number"]
+Mask = Bool[Tensor, "height width"]
+
+
+def psnr(predicted: Pixels, true: Pixels, ceiling: float) -> Float[Tensor, ""]:
+    """10 log₁₀(1 / mean squared error), dB, at most `ceiling`; NaN of no pixel."""
+    error = (predicted.double() - true.double()).square().mean()
+    return (-10 * error.log10()).clamp(max=ceiling)
+
+
+class Similarity(NamedTuple):
+    """Of every window that lies in the image, (number, height - 10, width - 10): SSIM, and its contrast and structure
+    alone."""
+
+    whole: Tensor
+    contrast: Tensor
+
+
+def similarity(predicted: Float[Tensor, "number height width"], true: Tensor) -> Similarity:
+    """Structural similarity (Wang et al. 2004, eq. 13) about every place."""
+    one, other = predicted.double(), true.double()
+    planes = torch.stack([one, other, one * one, other * other, one * other])
+    mean, mean_other, square, square_other, product = blurred(planes)
+    both = mean * mean_other
+    covariance = product - both
+    variance, variance_other = square - mean * mean, square_other - mean_other * mean_other
+    contrast = (2 * covariance + C2) / (variance + variance_other + C2)
+    return Similarity((2 * both + C1) / (mean * mean + mean_other * mean_other + C1) * contrast, contrast)
+
+
+def blurred(planes: Float[Tensor, "... height width"]) -> Float[Tensor, "... height_10 width_10"]:
+    """Means under the window, rows first and then columns: only where it lies in the image."""
+    place = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
+    weights = torch.exp(-place.square() / (2 * SIGMA**2))
+    weights = weights / weights.sum()
+    for axis in (-2, -1):
+        length = planes.shape[axis] - WINDOW + 1
+        # sums of shifted planes: half the time of a convolution in float64
+        planes = sum(weights[i] * planes.narrow(axis, i, length) for i in range(WINDOW))  # type: ignore[assignment]
+    return planes
+
+
+def ssim(predicted: Image, true: Image, mask: Mask | None) -> list[Float[Tensor, ""]]:
+    """Mean structural similarity over the image and, with a mask, over windows about its pixels; NaN where none is.
+
+    Args:
+        predicted, true: of at least 11 pixels a side.
+    """
+    found = similarity(predicted.movedim(-1, 0), true.movedim(-1, 0)).whole
+    if mask is None:
+        return [found.mean()]
+    half = WINDOW // 2
+    return [found.mean(), found[:, mask[half:-half, half:-half]].mean()]
+
+
+def ms_ssim(predicted: Image, true: Image, scales: int) -> Float[Tensor, ""]:
+    """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003, eq. 7), each number apart and then their mean.
+
+    Of fewer than five scales the weights of the finest ones, made to sum to what all five do. A mean contrast below 0,
+    of which no power is known, counts as 0.
+
+    Args:
+        predicted, true: of at least `least_side(scales)` pixels a side.
+    """
+    one, other = predicted.double().movedim(-1, 0), true.double().movedim(-1, 0)
+    weights = torch.tensor(WEIGHTS[:scales], dtype=one.dtype, device=one.device) * (
+        sum(WEIGHTS) / sum(WEIGHTS[:scales])
+    )
+    factors: list[Tensor] = []
+    for scale in range(scales):
+        if scale:
+            one, other = avg_pool2d(one, 2), avg_pool2d(other, 2)
+        found = similarity(one, other)
+        factors.append((found.whole if scale == scales - 1 else found.contrast).mean((-2, -1)).clamp(min=0))
+    return (torch.stack(factors) ** weights[:, None]).prod(0).mean()
+
+
+def least_side(scales: int) -> int:
+    """Pixels of the smallest image in whose coarsest scale a window lies: 176 of five."""
+    return WINDOW * 2 ** (scales - 1)
+
+
+def silhouette_iou(predicted: Mask, true: Mask) -> Float[Tensor, ""]:
+    """Pixels in both masks, of those in either; NaN where both are empty."""
+    return (predicted & true).sum().double() / (predicted | true).sum()
+
+
+def depth_error(predicted: Float[Tensor, "height width"], true: Tensor) -> list[Float[Tensor, ""]]:
+    """Mean |difference| over pixels where both see something, metres, and of the pixels where either does the share
+    where only one does; each NaN where there are none. Nothing is seen where the depth is infinite."""
+    seen, there = predicted.isfinite(), true.isfinite()
+    both = seen & there
+    gap = (predicted.double()[both] - true.double()[both]).abs()
+    return [gap.mean(), (seen ^ there).sum().double() / (seen | there).sum()]
