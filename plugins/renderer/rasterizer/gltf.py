@@ -1,0 +1,398 @@
+"""Reads glTF 2.0 (Khronos, 2021) files, .gltf and .glb: surfaces, their base colours, and where they stand.
+
+Light that materials reflect, animations and cameras are not read. What a number of the file names is looked for
+within bounds, and nothing is made larger than the file's size allows: it may be damaged, or a stranger's.
+"""
+
+import base64
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from framework.errors import DataError, quoted, shown
+from framework.renderer import Wrap
+from framework.storage.reading import guarded, read_bytes, room
+from plugins.renderer.rasterizer.parts import Part, Pictures, Subject, beside, subject
+
+NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+NEAREST = 9728
+UNDERSTOOD = (
+    "EXT_texture_webp",
+    "KHR_lights_punctual",
+    "KHR_materials_",  # all of them change how light is reflected
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+)
+"""Extensions that a file may require, or the beginnings of their names."""
+POINTS_AND_LINES, TRIANGLES, STRIP, FAN = (0, 1, 2, 3), 4, 5, 6
+
+
+@dataclass
+class Document:
+    """A file's description and what it refers to."""
+
+    content: dict[str, Any]
+    folder: Path
+    binary: bytes | None
+    size: int
+    buffers: dict[int, bytes] = field(default_factory=dict)
+    pictures: Pictures = field(default_factory=Pictures)
+    notes: list[str] = field(default_factory=list)
+
+    def item(self, kind: str, number: Any) -> dict[str, Any]:
+        """Number `number` of a kind of things: "meshes".
+
+        Raises:
+            ValueError: there is none.
+        """
+        items = self.content.get(kind, [])
+        if not isinstance(number, int) or not 0 <= number < len(items):
+            raise ValueError(f"it names number {quoted(number)} of its {kind}, of which it has {len(items)}")
+        return items[number]
+
+    def buffer(self, number: int) -> bytes:
+        if number not in self.buffers:
+            described = self.item("buffers", number)
+            if "uri" in described:
+                self.buffers[number] = self.referred(described["uri"])
+            elif number == 0 and self.binary is not None:
+                self.buffers[number] = self.binary
+            else:
+                raise ValueError(f"its buffer {number} is nowhere")
+        return self.buffers[number]
+
+    def referred(self, address: str) -> bytes:
+        """What a data: address holds, or a file beside this one."""
+        if address.startswith("data:"):
+            head, _, body = address.partition(",")
+            if not head.endswith(";base64"):
+                raise ValueError(f"it holds data as {quoted(head[-20:])}; wanted base64")
+            return base64.b64decode(body, validate=True)
+        file = beside(self.folder, unquote(address))
+        with guarded(file, "a part of a glTF file"):
+            found = read_bytes(file)
+        self.size += len(found)
+        return found
+
+    def view(self, number: Any) -> tuple[bytes | memoryview, int]:
+        """The bytes of a buffer view, and how far apart its elements are (0: close together)."""
+        described = self.item("bufferViews", number)
+        buffer = self.buffer(whole(described["buffer"]))
+        first, length = whole(described.get("byteOffset", 0)), whole(described["byteLength"])
+        if first + length > len(buffer):
+            raise ValueError(
+                f"its buffer has {len(buffer)} bytes, of which {first + length} are asked; it is cut short"
+            )
+        return memoryview(buffer)[first : first + length], whole(described.get("byteStride", 0))
+
+    def numbers(self, number: Any, width: int) -> NDArray:
+        """What an accessor stands for, (count, width): whole numbers as they are, or float64."""
+        described = self.item("accessors", number)
+        if WIDTHS.get(described["type"]) != width:
+            raise ValueError(f"wanted {width} numbers each, got {quoted(described['type'])}")
+        count, kind = whole(described["count"]), np.dtype(NUMBERS[described["componentType"]])
+        self.bounded(count * width * 8)
+        found = np.zeros((count, width), kind)
+        if "bufferView" in described:
+            found = self._elements(described["bufferView"], described, count, width, kind).copy()
+        if "sparse" in described:
+            sparse = described["sparse"]
+            changed, places = whole(sparse["count"]), sparse["indices"]
+            order = np.dtype(NUMBERS[places["componentType"]])
+            rows = self._elements(places["bufferView"], places, changed, 1, order)[:, 0]
+            found[rows] = self._elements(
+                sparse["values"]["bufferView"], sparse["values"], changed, width, kind
+            )
+        if kind.kind == "f":
+            return found.astype(np.float64)
+        if described.get("normalized"):  # section 3.11 "Animations", equations of normalized integers
+            return np.maximum(found.astype(np.float64) / np.iinfo(kind).max, -1)
+        return found
+
+    def _elements(
+        self, view: Any, described: dict[str, Any], count: int, width: int, kind: np.dtype
+    ) -> NDArray:
+        content, apart = self.view(view)
+        first, size = whole(described.get("byteOffset", 0)), width * kind.itemsize
+        apart = apart or size
+        if apart < size or (count and first + (count - 1) * apart + size > len(content)):
+            raise ValueError(
+                f"{count} elements were announced, but there are {len(content)} bytes; it is cut short"
+            )
+        return np.ndarray((count, width), kind, content, first, (apart, kind.itemsize))
+
+    def bounded(self, needed: int) -> None:
+        """Raises: ValueError: so many bytes are more than a file of this size may become."""
+        if needed > room(self.size):
+            raise ValueError(f"{self.size} bytes would become {needed}; it repeats itself, or is damaged")
+
+
+def read(file: Path) -> Subject:
+    """The surfaces of a file's scene, in base colours.
+
+    Raises:
+        DataError: the file, or one that it names, is missing, damaged or no glTF 2.0, needs an extension that is not
+            understood, or shows no surface.
+    """
+    with guarded(file, "glTF"):
+        document = _document(file)
+        version = str(document.content["asset"]["version"])
+        if not version.startswith("2."):
+            raise ValueError(f"it is of version {quoted(version)}; wanted 2.0")
+        missing = [
+            one for one in document.content.get("extensionsRequired", ()) if not one.startswith(UNDERSTOOD)
+        ]
+        if missing:
+            raise DataError(
+                f"{file}: it needs {shown(', '.join(missing))}, which is not understood; save it without, e.g. with "
+                "neither compressed geometry nor compressed textures."
+            )
+        parts = list(_parts(document))
+        return subject(parts, "y", document.notes)
+
+
+def _document(file: Path) -> Document:
+    content = read_bytes(file)
+    size, binary = len(content), None
+    if content[:4] == b"glTF":
+        first, binary = _chunks(content)
+        content = first
+    elif file.suffix.lower() == ".glb":
+        raise ValueError("wanted glTF in its first bytes")
+    described = json.loads(content)
+    if not isinstance(described, dict):
+        raise ValueError(f"it holds {type(described).__name__}")
+    return Document(described, file.parent, binary, size)
+
+
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """The description and the binary part of a .glb (section 4.4)."""
+    version, length = (int.from_bytes(content[place : place + 4], "little") for place in (4, 8))
+    if version != 2 or length > len(content):
+        raise ValueError(
+            f"its header announces version {version} and {length} bytes, but it has {len(content)}; wanted version 2, "
+            "whole"
+        )
+    found: dict[bytes, bytes] = {}
+    place = 12
+    while place + 8 <= length:
+        size = int.from_bytes(content[place : place + 4], "little")
+        kind = content[place + 4 : place + 8]
+        if place + 8 + size > length:
+            raise ValueError("a part of it goes on beyond its end")
+        found.setdefault(kind, content[place + 8 : place + 8 + size])
+        place += 8 + size
+    if b"JSON" not in found:
+        raise ValueError("it has no description")
+    return found[b"JSON"], found.get(b"BIN\0")
+
+
+def whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"wanted a whole number from 0, got {quoted(value)}")
+    return value
+
+
+def _parts(document: Document) -> Iterator[Part]:
+    """Parts where their nodes stand; a mesh that several nodes show is read for each."""
+    places = _places(document)
+    needed = 0
+    for number, place in places.items():
+        node = document.item("nodes", number)
+        if "mesh" not in node:
+            continue
+        mesh = document.item("meshes", node["mesh"])
+        if any(mesh.get("weights", ())) or any(node.get("weights", ())):
+            document.notes.append("its blend shapes are left out.")
+        for primitive in mesh["primitives"]:
+            if primitive.get("mode", TRIANGLES) in POINTS_AND_LINES:
+                document.notes.append("its points and lines are left out.")
+                continue
+            part = _part(document, primitive)
+            needed += 80 * (len(part.vertices) + len(part.faces))
+            document.bounded(needed)
+            if "skin" in node:
+                yield _skinned(document, part, primitive, document.item("skins", node["skin"]), places)
+            else:
+                yield _placed(part, place)
+
+
+def _places(document: Document) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """From each node's own axes to the scene's, of the nodes that the scene shows."""
+    scenes = document.content.get("scenes", [])
+    if scenes:
+        roots = document.item("scenes", document.content.get("scene", 0)).get("nodes", [])
+    else:
+        children = {child for node in document.content.get("nodes", []) for child in node.get("children", [])}
+        roots = [number for number in range(len(document.content.get("nodes", []))) if number not in children]
+    found: dict[int, NDArray] = {}
+    waiting = [(number, np.eye(4)) for number in roots]
+    while waiting:
+        number, above = waiting.pop()
+        node = document.item("nodes", number)
+        if number in found:
+            raise ValueError(f"its node {number} stands in two places, or in itself")
+        found[number] = above @ _transform(node)
+        waiting += [(child, found[number]) for child in reversed(node.get("children", []))]
+    return found
+
+
+def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """A node's matrix, or translation · rotation · scale (section 3.5.3)."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    found = np.eye(4)
+    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    turned = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    found[:3, :3] = turned * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+    found[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+    return found
+
+
+def _placed(part: Part, place: Float[np.ndarray, "4 4"]) -> Part:
+    with np.errstate(all="ignore"):  # what is not finite then is refused
+        vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
+        mirrored = np.linalg.det(place[:3, :3]) < 0  # section 3.7.4: the winding order is then reversed
+    return replace(part, vertices=vertices, faces=part.faces[:, ::-1] if mirrored else part.faces)
+
+
+def _skinned(
+    document: Document,
+    part: Part,
+    primitive: dict[str, Any],
+    skin: dict[str, Any],
+    places: dict[int, NDArray],
+) -> Part:
+    """As its joints stand without an animation; where the node itself stands does not count (section 3.7.3.3)."""
+    document.notes.append("it is shown in its rest pose.")
+    joints = np.stack([places[number] for number in skin["joints"]])
+    if "inverseBindMatrices" in skin:
+        inverse = document.numbers(skin["inverseBindMatrices"], 16).reshape(-1, 4, 4).mT
+        joints = joints @ inverse[: len(joints)]
+    moved = np.zeros_like(part.vertices)
+    attributes = primitive["attributes"]
+    ones = np.ones((len(part.vertices), 1))
+    for number in range(sum(name.startswith("JOINTS_") for name in attributes)):
+        chosen = document.numbers(attributes[f"JOINTS_{number}"], 4)
+        weights = document.numbers(attributes[f"WEIGHTS_{number}"], 4)
+        for corner in range(4):
+            of_vertices = joints[chosen[:, corner], :3]
+            document.bounded(of_vertices.nbytes)
+            with np.errstate(all="ignore"):
+                here = np.einsum("vij,vj->vi", of_vertices, np.concatenate([part.vertices, ones], 1))
+                moved += weights[:, corner, None] * here
+    return replace(part, vertices=moved)
+
+
+def _part(document: Document, primitive: dict[str, Any]) -> Part:
+    attributes = primitive["attributes"]
+    vertices = document.numbers(attributes["POSITION"], 3).astype(np.float64)
+    count = len(vertices)
+    order = np.arange(count)
+    if "indices" in primitive:
+        order = document.numbers(primitive["indices"], 1)[:, 0].astype(np.int64)
+    if order.size and order.max() >= count:
+        raise ValueError(f"a face names vertex {order.max()}, but there are only 0 to {count - 1}")
+    faces = _triangles(order, primitive.get("mode", TRIANGLES))
+    factor, described = _material(document, primitive)
+    colors = None if factor is None else np.tile(factor, (count, 1))
+    if "COLOR_0" in attributes:
+        width = WIDTHS[document.item("accessors", attributes["COLOR_0"])["type"]]
+        own = _each(document.numbers(attributes["COLOR_0"], width), count, "colour")[:, :3]
+        colors = own if colors is None else own * colors
+    part = Part(vertices, faces, colors)
+    return part if described is None else _textured(document, part, attributes, described)
+
+
+def _each(found: NDArray, count: int, what: str) -> NDArray:
+    if len(found) != count:
+        raise ValueError(f"{len(found)} entries of a {what} came for {count} vertices; wanted one each")
+    return found
+
+
+def _triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, "faces 3"]:
+    """Section 3.7.2.1, equations of primitive types."""
+    if mode == TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    inner = np.arange(max(len(order) - 2, 0))
+    if mode == STRIP:
+        return order[np.stack([inner, inner + 1 + inner % 2, inner + 2 - inner % 2], 1)]
+    if mode == FAN:
+        return order[np.stack([inner + 1, inner + 2, np.zeros_like(inner)], 1)]
+    raise ValueError(f"its mode is {quoted(mode)}; wanted 4, 5 or 6: triangles")
+
+
+def _material(
+    document: Document, primitive: dict[str, Any]
+) -> tuple[Float[np.ndarray, "3"] | None, dict[str, Any] | None]:
+    """The factor of the base colour, None where there is none, and what describes its texture."""
+    if "material" not in primitive:
+        return None, None
+    material = document.item("materials", primitive["material"])
+    glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    if glossy is not None:
+        factor, texture = glossy.get("diffuseFactor"), glossy.get("diffuseTexture")
+    else:
+        described = material.get("pbrMetallicRoughness", {})
+        factor, texture = described.get("baseColorFactor"), described.get("baseColorTexture")
+    if factor is None:
+        return None, texture
+    found = np.array(factor, np.float64).reshape(-1)[:3]
+    return (None if found.tolist() == [1, 1, 1] else found), texture
+
+
+def _textured(document: Document, part: Part, attributes: dict[str, Any], described: dict[str, Any]) -> Part:
+    moved = described.get("extensions", {}).get("KHR_texture_transform", {})
+    name = f"TEXCOORD_{whole(moved.get('texCoord', described.get('texCoord', 0)))}"
+    if name not in attributes:
+        document.notes.append("a part with a texture says no places in it, and is drawn without.")
+        return part
+    uv = _each(document.numbers(attributes[name], 2), len(part.vertices), "place in a texture").astype(
+        np.float64
+    )
+    if moved:
+        # KHR_texture_transform: translation · rotation · scale, counter-clockwise where v runs downwards: its text and
+        # its test model; the GLSL beside them turns the other way (github.com/KhronosGroup/glTF/issues/1563)
+        angle = float(moved.get("rotation", 0))
+        turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        uv = (uv * np.array(moved.get("scale", (1, 1)), np.float64)) @ turned.T
+        uv = uv + np.array(moved.get("offset", (0, 0)), np.float64)
+    texture = document.item("textures", described["index"])
+    sampler = document.item("samplers", texture["sampler"]) if "sampler" in texture else {}
+    wraps = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
+    return replace(
+        part,
+        image=_image(document, texture),
+        uv=np.stack([uv[:, 0], 1 - uv[:, 1]], 1),  # glTF's v runs downwards
+        wraps=wraps,
+        smooth=sampler.get("magFilter") != NEAREST,
+    )
+
+
+def _image(document: Document, texture: dict[str, Any]):
+    number = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
+    image = document.item("images", number)
+    known = document.pictures.known(number)
+    if known is not None:
+        return known
+    if "uri" in image:
+        content = document.referred(image["uri"])
+        name = "in the file" if image["uri"].startswith("data:") else quoted(image["uri"])
+    else:
+        content, name = bytes(document.view(image["bufferView"])[0]), f"{number}"
+    return document.pictures.decode(number, content, name)
