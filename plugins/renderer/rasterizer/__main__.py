@@ -41,7 +41,10 @@ class Parser(argparse.ArgumentParser):
     """One sentence for a mistake, and no usage before it."""
 
     def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{shown(message)}. --help says what there is.")
+        message = shown(message)
+        if message.startswith("unrecognized arguments: "):
+            message += "." + did_you_mean(message.split()[2].partition("=")[0], self._option_string_actions)
+        raise ConfigError(f"{message}{'' if message[-1] in '.?' else '.'} --help says what there is.")
 
 
 def number(low: float, high: float, unit: str, *, kind: type = float):
@@ -86,7 +89,7 @@ def background(text: str) -> tuple[int, int, int] | None:
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"{quoted(text)} came; wanted a colour, as white or #20a0ff, or transparent."
-            + did_you_mean(text, [*ImageColor.colormap, "transparent"]).rstrip("?")
+            + did_you_mean(text, ["transparent", *ImageColor.colormap])
         ) from None
     return red, green, blue
 
@@ -273,7 +276,5 @@ if __name__ == "__main__":
         sys.stderr.write("error: interrupted.\n")
         sys.exit(130)
     except OSError as error:
-        refused = unwritable(error)
-        if refused is None:
-            raise
-        sys.exit(f"error: {refused}")
+        other = f"{error.filename} cannot be written ({error.strerror}). Choose another place."
+        sys.exit(f"error: {unwritable(error) or other}")

@@ -8,6 +8,7 @@ import base64
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from framework.errors import DataError, quoted, shown
 from framework.renderer import Wrap
 from framework.storage.reading import guarded, read_bytes, room
-from plugins.renderer.rasterizer.parts import Part, Pictures, Subject, beside, subject
+from plugins.renderer.rasterizer.parts import MOST_PARTS, Part, Pictures, Subject, beside, subject
 
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -143,7 +144,7 @@ def read(file: Path) -> Subject:
         DataError: the file, or one that it names, is missing, damaged or no glTF 2.0, needs an extension that is not
             understood, or shows no surface.
     """
-    with guarded(file, "glTF"):
+    with guarded(file, "glTF"), np.errstate(all="ignore"):  # what is not finite in the end is refused
         document = _document(file)
         version = str(document.content["asset"]["version"])
         if not version.startswith("2."):
@@ -156,7 +157,12 @@ def read(file: Path) -> Subject:
                 f"{file}: it needs {shown(', '.join(missing))}, which is not understood; save it without, e.g. with "
                 "neither compressed geometry nor compressed textures."
             )
-        parts = list(_parts(document))
+        try:
+            parts = list(islice(_parts(document), MOST_PARTS + 1))
+        except KeyError as error:
+            raise ValueError(f"{shown(error)} is missing, or none of what may stand there") from error
+        if len(parts) > MOST_PARTS:
+            raise DataError(f"{file}: it has more than {MOST_PARTS} parts; join some of them in one mesh.")
         return subject(parts, "y", document.notes)
 
 
@@ -203,8 +209,9 @@ def whole(value: Any) -> int:
 
 
 def _parts(document: Document) -> Iterator[Part]:
-    """Parts where their nodes stand; a mesh that several nodes show is read for each."""
+    """Parts where their nodes stand; a mesh that several nodes show is there for each."""
     places = _places(document)
+    known: dict[tuple[int, int], Part] = {}
     needed = 0
     for number, place in places.items():
         node = document.item("nodes", number)
@@ -213,11 +220,12 @@ def _parts(document: Document) -> Iterator[Part]:
         mesh = document.item("meshes", node["mesh"])
         if any(mesh.get("weights", ())) or any(node.get("weights", ())):
             document.notes.append("its blend shapes are left out.")
-        for primitive in mesh["primitives"]:
+        for place_in_mesh, primitive in enumerate(mesh["primitives"]):
             if primitive.get("mode", TRIANGLES) in POINTS_AND_LINES:
                 document.notes.append("its points and lines are left out.")
                 continue
-            part = _part(document, primitive)
+            key = (node["mesh"], place_in_mesh)
+            part = known[key] = known.get(key) or _part(document, primitive)
             needed += 80 * (len(part.vertices) + len(part.faces))
             document.bounded(needed)
             if "skin" in node:
@@ -265,9 +273,8 @@ def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
 
 
 def _placed(part: Part, place: Float[np.ndarray, "4 4"]) -> Part:
-    with np.errstate(all="ignore"):  # what is not finite then is refused
-        vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
-        mirrored = np.linalg.det(place[:3, :3]) < 0  # section 3.7.4: the winding order is then reversed
+    vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
+    mirrored = np.linalg.det(place[:3, :3]) < 0  # section 3.7.4: the winding order is then reversed
     return replace(part, vertices=vertices, faces=part.faces[:, ::-1] if mirrored else part.faces)
 
 
@@ -293,9 +300,8 @@ def _skinned(
         for corner in range(4):
             of_vertices = joints[chosen[:, corner], :3]
             document.bounded(of_vertices.nbytes)
-            with np.errstate(all="ignore"):
-                here = np.einsum("vij,vj->vi", of_vertices, np.concatenate([part.vertices, ones], 1))
-                moved += weights[:, corner, None] * here
+            here = np.einsum("vij,vj->vi", of_vertices, np.concatenate([part.vertices, ones], 1))
+            moved += weights[:, corner, None] * here
     return replace(part, vertices=moved)
 
 
@@ -391,8 +397,7 @@ def _image(document: Document, texture: dict[str, Any]):
     if known is not None:
         return known
     if "uri" in image:
-        content = document.referred(image["uri"])
-        name = "in the file" if image["uri"].startswith("data:") else quoted(image["uri"])
+        content, name = document.referred(image["uri"]), shown(image["uri"], 60)
     else:
         content, name = bytes(document.view(image["bufferView"])[0]), f"{number}"
     return document.pictures.decode(number, content, name)

@@ -103,7 +103,7 @@ def _part(
     if image is None:
         with guarded(material.texture, "a texture"):
             content = read_bytes(material.texture)
-        image = pictures.decode(material.texture, content, quoted(material.texture.name))
+        image = pictures.decode(material.texture, content, str(material.texture))
     own, places = np.unique(places, return_inverse=True)
     wraps = material.wrap, material.wrap
     return Part(vertices, faces, colors, image, corners.uv[own], places.reshape(-1, 3), wraps)

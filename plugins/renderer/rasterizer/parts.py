@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 from torch import Tensor
 
-from framework.datasets.images import FORMATS
+from framework.datasets.images import FORMATS, LONGEST_SIDE
 from framework.errors import DataError, quoted
 from framework.geometry.camera import look_from
 from framework.geometry.light import linear
@@ -23,6 +23,8 @@ GREY = 0.55
 """Light of a surface whose colour its file does not say."""
 MOST_TEXELS = 2**26
 """Of all textures of a scene together: 0.8 GB as light."""
+MOST_PARTS = 10_000
+NOWHERE = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
 EDGE = 1e-4
 """Places in a texture that lie so little beyond its edge are rounding, and need no rule of what lies there."""
 
@@ -96,13 +98,17 @@ def _scene(part: Part, wrap: Wrap, smooth: bool) -> Scene:
     if part.image is not None and part.uv is not None:
         corners = part.faces if part.corners is None else part.corners
         texture = Texture(
-            (part.image,), torch.tensor(part.uv).float(), torch.tensor(corners), wrap=wrap, smooth=smooth
+            (part.image,),
+            torch.tensor(part.uv).float(),
+            torch.tensor(corners.copy()),
+            wrap=wrap,
+            smooth=smooth,
         )
     return Scene(
         torch.tensor(part.vertices),
-        torch.tensor(part.faces),
+        torch.tensor(part.faces.copy()),  # a view may run backwards
         torch.tensor(colors).float(),
-        look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1)),
+        NOWHERE,
         texture,
     )
 
@@ -149,21 +155,29 @@ class Pictures:
         try:
             with Image.open(BytesIO(content), formats=FORMATS) as image:
                 self._left -= image.width * image.height
-                if self._left < 0:
+                if self._left < 0 or max(image.size) > LONGEST_SIDE:
                     raise DataError(
-                        f"the texture {name} has {image.width} x {image.height} pixels, and all of them more than "
-                        f"{MOST_TEXELS}; make them smaller."
+                        f"the texture {name} has {image.width} x {image.height} pixels; wanted up to {LONGEST_SIDE} "
+                        f"along a side, and {MOST_TEXELS} of all textures together. Make it smaller."
                     )
                 plain = image.convert("RGBA") if "transparency" in image.info else image
-                pixels = torch.from_numpy(np.array(plain.convert("RGB")))
+                pixels = np.asarray(plain.convert("RGB"))
         except DataError:
             raise
         except Exception as error:
             raise DataError(
                 f"the texture {name} cannot be read as an image ({type(error).__name__}). Restore it."
             ) from error
-        self._decoded[key] = torch.cat([linear(rows) for rows in pixels.split(256)])
+        self._decoded[key] = torch.from_numpy(_light(pixels))
         return self._decoded[key]
+
+
+def _light(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    known = linear(torch.arange(256, dtype=torch.uint8)).numpy()
+    found = np.empty(pixels.size, np.float32)
+    for first in range(0, pixels.size, 2**20):  # the whole picture as an index would take twice its memory
+        found[first : first + 2**20] = known[pixels.reshape(-1)[first : first + 2**20]]
+    return found.reshape(pixels.shape)
 
 
 def beside(folder: Path, name: str) -> Path:
@@ -175,6 +189,7 @@ def beside(folder: Path, name: str) -> Path:
     plain = name.replace("\\", "/")
     try:
         found = (folder / plain).resolve()
+        found.exists()  # raises where there can be no file of this name
         inside = ":" not in plain and found.is_relative_to(folder.resolve())
     except (OSError, ValueError):
         inside = False

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.errors import DataError, did_you_mean, shown
 from framework.geometry import meshes
 from framework.geometry.light import linear
 from framework.geometry.mesh_files import COLOURS
@@ -29,6 +29,8 @@ def read(file: Path) -> Subject:
             in another folder.
     """
     suffix = file.suffix.lower()
+    if file.is_dir():
+        raise DataError(f"{file} is a folder; wanted a file whose name ends in {', '.join(UPWARDS)}.")
     if suffix not in UPWARDS:
         raise DataError(
             f"{file}: cannot be read; wanted a file whose name ends in {', '.join(UPWARDS)}."
@@ -75,5 +77,5 @@ def _textured(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) -> Pa
         notes.append(f"its texture {shown(name)} is not beside it: drawn without.")
         return part
     with guarded(texture, "a texture"):
-        image = Pictures().decode(name, read_bytes(texture), quoted(name))
+        image = Pictures().decode(name, read_bytes(texture), str(texture))
     return Part(part.vertices, part.faces, part.colors, image, mesh.attribute(places))
