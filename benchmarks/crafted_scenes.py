@@ -5,8 +5,39 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from benchmarks.crafted_files import HUGE, plain_png
+from benchmarks.damage import EXTREME, spoilt
 from plugins.renderer.rasterizer.sample_scenes import described, glb, packed, quad
+
+
+def in_glb(content: bytes, random: np.random.Generator) -> bytes:
+    """A value of the description, or bytes of the binary part, the lengths made right."""
+    size = int.from_bytes(content[12:16], "little")
+    text, binary = content[20 : 20 + size], content[28 + size :]
+    if random.random() < 0.3:
+        return packed(text, spoilt(binary, random))
+    return packed(in_gltf(text, random), binary)
+
+
+def in_gltf(content: bytes, random: np.random.Generator) -> bytes:
+    """A value of the description replaced by another one, by an extreme one, or taken out."""
+    whole = json.loads(content)
+    places = [*_places(whole)]
+    holder, key = places[int(random.integers(len(places)))]
+    other, of_other = places[int(random.integers(len(places)))]
+    values = [*EXTREME, -1, 0.5, -1e308, "x", "", None, True, [], {}, copy.deepcopy(other[of_other])]
+    holder[key] = values[int(random.integers(len(values)))]
+    if random.random() < 0.1:
+        del holder[key]
+    return json.dumps(whole).encode()
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        yield value, key
+        yield from _places(value[key])
 
 
 def crafted() -> Iterator[bytes]:

@@ -121,10 +121,10 @@ def subjects() -> Iterator[Reader]:
     """What a command draws, and the files beside it."""
     square = scenes.quad()
     camera = b'{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "R": [[1,0,0], [0,1,0], [0,0,1]], "t": [0,0,2], "size": [9, 9]}'
-    yield Reader(
-        "GLB, scenes", "one.glb", [scenes.glb(*square)], scene_files.read, crafted=[*crafted_scenes.crafted()]
-    )
-    yield Reader("GLTF, scenes", "one.gltf", [scenes.gltf(*square)], scene_files.read)
+    made = [*crafted_scenes.crafted()]
+    glb, gltf = scenes.glb(*square), scenes.gltf(*square)
+    yield Reader("GLB, scenes", "one.glb", [glb], scene_files.read, [crafted_scenes.in_glb], made)
+    yield Reader("GLTF, scenes", "one.gltf", [gltf], scene_files.read, [crafted_scenes.in_gltf])
     yield Reader("OBJ, scenes", "scene/one.obj", [scenes.OBJ], materials)
     yield Reader("MTL", "scene/one.mtl", [scenes.MTL], materials, crafted=crafted_scenes.MTLS)
     yield Reader(
