@@ -5,7 +5,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -47,10 +47,12 @@ class Parser(argparse.ArgumentParser):
         raise ConfigError(f"{message}{'' if message[-1] in '.?' else '.'} --help says what there is.")
 
 
-def number(low: float, high: float, unit: str, *, kind: type = float):
+def number(
+    low: float | int, high: float | int, unit: str, *, kind: type = float
+) -> Callable[[str], float | int]:
     """A reader of a number from `low` to `high`."""
 
-    def parse(text: str) -> float:
+    def parse(text: str) -> float | int:
         try:
             value = kind(text)
         except ValueError:
@@ -65,7 +67,7 @@ def number(low: float, high: float, unit: str, *, kind: type = float):
     return parse
 
 
-def distance(text: str) -> float | None:
+def distance(text: str) -> float | int | None:
     return None if text == "auto" else number(1e-6, 1e9, ", metres, or auto")(text)
 
 

@@ -95,8 +95,12 @@ class Document:
             )
         return memoryview(buffer)[first : first + length], whole(described.get("byteStride", 0))
 
-    def numbers(self, number: Any, width: int) -> NDArray:
-        """What an accessor stands for, (count, width): whole numbers as they are, or float64."""
+    def numbers(self, number: Any, width: int, *, shares: bool = False) -> NDArray:
+        """What an accessor stands for, (count, width): whole numbers as they are, or float64.
+
+        Args:
+            shares: whole numbers stand for shares of the largest one, whether the accessor says so or not.
+        """
         described = self.item("accessors", number)
         if WIDTHS.get(described["type"]) != width:
             raise ValueError(f"wanted {width} numbers each, got {quoted(described['type'])}")
@@ -115,7 +119,9 @@ class Document:
             )
         if kind.kind == "f":
             return found.astype(np.float64)
-        if described.get("normalized"):  # section 3.11 "Animations", equations of normalized integers
+        if shares or described.get(
+            "normalized"
+        ):  # section 3.11 "Animations", equations of normalized integers
             return np.maximum(found.astype(np.float64) / np.iinfo(kind).max, -1)
         return found
 
@@ -296,7 +302,7 @@ def _skinned(
     ones = np.ones((len(part.vertices), 1))
     for number in range(sum(name.startswith("JOINTS_") for name in attributes)):
         chosen = document.numbers(attributes[f"JOINTS_{number}"], 4)
-        weights = document.numbers(attributes[f"WEIGHTS_{number}"], 4)
+        weights = document.numbers(attributes[f"WEIGHTS_{number}"], 4, shares=True)
         for corner in range(4):
             of_vertices = joints[chosen[:, corner], :3]
             document.bounded(of_vertices.nbytes)
@@ -319,7 +325,7 @@ def _part(document: Document, primitive: dict[str, Any]) -> Part:
     colors = None if factor is None else np.tile(factor, (count, 1))
     if "COLOR_0" in attributes:
         width = WIDTHS[document.item("accessors", attributes["COLOR_0"])["type"]]
-        own = _each(document.numbers(attributes["COLOR_0"], width), count, "colour")[:, :3]
+        own = _each(document.numbers(attributes["COLOR_0"], width, shares=True), count, "colour")[:, :3]
         colors = own if colors is None else own * colors
     part = Part(vertices, faces, colors)
     return part if described is None else _textured(document, part, attributes, described)
