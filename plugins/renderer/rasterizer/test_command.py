@@ -1,5 +1,6 @@
 """The command: what its pictures show, cameras against formulas, films, and a sentence for every mistake."""
 
+import io
 import json
 import math
 import stat
@@ -46,7 +47,7 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def drawn(file: Path, folder: Path, *options: str, name: str = "one.png") -> Any:
     out = folder / name
     main([str(file), "--out", str(out), "--size", "48x40", *options])
-    return np.load(out) if out.suffix == ".npy" else Image.open(out)
+    return np.load(out) if out.suffix == ".npy" else Image.open(io.BytesIO(out.read_bytes()))
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
