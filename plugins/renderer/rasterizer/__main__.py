@@ -148,8 +148,8 @@ def parser() -> Parser:
     add(
         "--background",
         type=background,
-        default="white",
-        help="a colour, or transparent (.png); default: white",
+        default="gainsboro",
+        help="a colour, or transparent (.png); default: gainsboro",
     )
     add(
         "--supersampling",
