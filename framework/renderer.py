@@ -153,10 +153,11 @@ class Renderer(ABC):
     many as the scene's, float32 in [0, 1], background 0; "depth", float32, metres along the optical axis, background
     inf; "face", int32, index of the visible face, background -1; "mask", bool; "normal" 3, float32, of the visible
     face, of length 1, in world axes, to the side from which its corners run counter-clockwise; "barycentric" 3,
-    float32, weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping; the
-    background of the last three is 0."""
+    float32, weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping, 0
+    where it has none; the background of the last three is 0. One that does not draw "uv" refuses "color" of a scene
+    with a texture."""
 
-    differentiable: ClassVar[frozenset[str]] = frozenset()
+    differentiable: frozenset[str] = frozenset()
     """In what "color" has a gradient, that of pictures of areas and not of single points, of: "vertices", "colors",
     "texture" (its images), "uv", "rotation", "translation", "focal", "principal"."""
 

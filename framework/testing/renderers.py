@@ -7,13 +7,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.geometry.camera import Camera, look_from
+from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene
-from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.finding import Finding, Worst, examined
+from framework.testing.painted import barycentric, gradient, normal, texture, uv
 from framework.testing.rows import RendererRow
+from framework.testing.scenes import SIZE, camera, empty, sphere, square
 
 Make = Callable[[], Renderer]
-SIZE = (48, 64)
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
@@ -31,10 +32,15 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "one pixel, one row": (0.0, _small),
         "where the camera says": (0.0, _places),
         "what the near plane cuts": (2e-3, _cut),
-        "gradient": (0.05, _gradient),
     }
-    if not build().differentiable:
-        del checks["gradient"]
+    renderer = build()
+    for channel, check in (("normal", normal), ("barycentric", barycentric), ("uv", uv)):
+        if channel in renderer.channels:
+            checks[channel] = (0.02, check)
+    if "color" in renderer.channels:
+        checks["textures are drawn or refused"] = (1e-6, texture)
+    if renderer.differentiable:
+        checks["gradient"] = (0.05, gradient)
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield examined(
@@ -43,45 +49,6 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
                 lambda worst, check=check: check(build(), worst),
                 seconds=60.0,
             )
-
-
-def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
-    """A sphere about the origin, coloured by place, seen from four metres."""
-    theta = torch.linspace(0, math.pi, rings + 1, dtype=torch.float64)
-    phi = torch.arange(2 * rings, dtype=torch.float64) * (math.pi / rings)
-    grid = torch.stack(
-        [
-            torch.outer(theta.sin(), phi.cos()),
-            torch.outer(theta.sin(), phi.sin()),
-            theta.cos()[:, None].expand(-1, 2 * rings),
-        ],
-        -1,
-    )
-    row, column = torch.meshgrid(torch.arange(rings), torch.arange(2 * rings), indexing="ij")
-    a, b = row * 2 * rings + column, row * 2 * rings + (column + 1) % (2 * rings)
-    faces = torch.cat(
-        [torch.stack([a, a + 2 * rings, b], -1), torch.stack([b, a + 2 * rings, b + 2 * rings], -1)]
-    )
-    vertices = (radius * grid.reshape(-1, 3)).float()
-    return Scene(vertices, faces.reshape(-1, 3), (vertices / radius + 1) / 2, camera())
-
-
-def camera() -> Camera:
-    return look_from(0.3, 0.2, 0.1, distance=4.0, field_of_view=0.7, size=SIZE)
-
-
-def square(distance: float, side: float = 10.0) -> Scene:
-    """Two triangles across the whole view, `distance` metres in front of the camera, facing it."""
-    seen = camera()
-    corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double() * side / 2
-    corners[:, 2] = distance
-    world = (corners - seen.translation.double()) @ seen.rotation.double()
-    faces = torch.tensor([[0, 2, 1], [0, 3, 2]])
-    return Scene(world.float(), faces, torch.rand(4, 3, generator=torch.Generator().manual_seed(SEED)), seen)
-
-
-def empty(scene: Scene) -> Scene:
-    return replace(scene, faces=scene.faces[:0])
 
 
 def _channels(renderer: Renderer, worst: Worst) -> None:
@@ -94,6 +61,9 @@ def _channels(renderer: Renderer, worst: Worst) -> None:
         "depth": (torch.float32, SIZE),
         "face": (torch.int32, SIZE),
         "mask": (torch.bool, SIZE),
+        "normal": (torch.float32, (*SIZE, 3)),
+        "barycentric": (torch.float32, (*SIZE, 3)),
+        "uv": (torch.float32, (*SIZE, 2)),
     }
     for name in every:
         alone = renderer(replace(scene, colors=scene.colors if name == "color" else None), (name,))
@@ -170,6 +140,7 @@ def _bad_triangles(renderer: Renderer, worst: Worst) -> None:
 def _is_background(renderer: Renderer, scene: Scene, what: str, worst: Worst) -> None:
     drawn = renderer(scene, sorted(renderer.channels))
     background: dict[str, float] = {"color": 0.0, "depth": math.inf, "face": -1, "mask": 0}
+    background |= {"normal": 0.0, "barycentric": 0.0, "uv": 0.0}
     for name, value in drawn.items():
         if name in background:
             worst.count(value != background[name], f"{name} of a scene {what}")
@@ -256,7 +227,11 @@ def _small(renderer: Renderer, worst: Worst) -> None:
     for height, width in ((1, 1), (1, 64), (64, 1)):
         view = look_from(0.0, 0.0, 0.0, distance=4.0, field_of_view=0.1, size=(height, width))
         for name, value in renderer(replace(scene, camera=view), sorted(renderer.channels)).items():
-            shape = (height, width, 3) if name == "color" else (height, width)
+            shape = (
+                height,
+                width,
+                *{"color": (3,), "normal": (3,), "barycentric": (3,), "uv": (2,)}.get(name, ()),
+            )
             worst.same(f"{name} of {height} × {width}", tuple(value.shape), shape)
             if isinstance(value, Tensor) and value.is_floating_point() and name == "color":
                 worst.finite(f"{name} of {height} × {width}", value)
@@ -308,74 +283,3 @@ def _cut(renderer: Renderer, worst: Worst) -> None:
         off.where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m, wanted {true[at].item():.6g}"
     )
     worst.count(depth.isfinite() & (true > 60), "pixels above the floor's end are drawn")
-
-
-PART = 4
-"""Pictures along each axis, moved by parts of a pixel, whose mean stands for one of areas."""
-
-
-def _gradient(renderer: Renderer, worst: Worst) -> None:
-    """Of a weighted sum of pixels, relative to its differences: one direction in each parameter that `differentiable`
-    names. Weights that change slowly from pixel to pixel leave the grid of pixels no say."""
-    scene = sphere()
-    row, column = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
-    weight = torch.stack(
-        [(row / 9 + channel).sin() * (column / 11 - channel).cos() for channel in range(3)], -1
-    )
-    seen = scene.camera
-    assert scene.colors is not None
-    given = {
-        "vertices": scene.vertices.double(),
-        "colors": scene.colors.double(),
-        "rotation": seen.rotation.double(),
-        "translation": seen.translation.double(),
-        "focal": torch.tensor(seen.focal, dtype=torch.float64),
-        "principal": torch.tensor(seen.principal, dtype=torch.float64),
-    }
-    turn = torch.tensor([[0.0, -1, 0.3], [1, 0, -0.2], [-0.3, 0.2, 0]], dtype=torch.float64)
-    shape = given["vertices"]
-    ways = {
-        "vertices": 0.4 * shape[:, [1, 2, 0]].square() + torch.tensor([0.2, 0.1, 0.3], dtype=torch.float64),
-        "colors": shape.flip(-1).sin(),
-        "rotation": turn @ given["rotation"],
-        "translation": torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64),
-        "focal": torch.tensor([10.0, 8.0], dtype=torch.float64),
-        "principal": torch.tensor([3.0, -4.0], dtype=torch.float64),
-    }
-
-    def loss(step: torch.Tensor, name: str, parts: int) -> torch.Tensor:
-        at = {key: value + step * ways[key] if key == name else value for key, value in given.items()}
-        offsets = (torch.arange(parts) + 0.5) / parts - 0.5
-        drawn = [
-            renderer(
-                Scene(
-                    at["vertices"],
-                    scene.faces,
-                    at["colors"],
-                    replace(
-                        seen,
-                        rotation=at["rotation"],
-                        translation=at["translation"],
-                        focal=at["focal"],
-                        principal=at["principal"] + torch.stack([x, y]),
-                    ),
-                )
-            )["color"]
-            for x in offsets
-            for y in offsets
-        ]
-        return (torch.stack(drawn).mean(0) * weight).sum()
-
-    found, wanted = [], []
-    for name in sorted(renderer.differentiable):
-        step = torch.zeros((), dtype=torch.float64, requires_grad=True)
-        found.append(torch.autograd.grad(loss(step, name, PART), step)[0].item())
-        with torch.no_grad():
-            ends = [loss(torch.tensor(sign * 0.05, dtype=torch.float64), name, 4 * PART) for sign in (1, -1)]
-        wanted.append((ends[0] - ends[1]).item() / 0.1)
-    one, other = torch.tensor(found), torch.tensor(wanted)
-    said = ", ".join(
-        f"{name} {a:.4g} for {b:.4g}"
-        for name, a, b in zip(sorted(renderer.differentiable), found, wanted, strict=True)
-    )
-    worst.see(((one - other).norm() / other.norm()).reshape(1), lambda at: said)

@@ -1,17 +1,25 @@
 """One picture of one scene as a differentiable operation on tensors: compiled kernels forwards and backwards."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from plugins.renderer.rasterizer import gradient, nmr, raster, soft
+from framework.renderer import Report
+from plugins.renderer.rasterizer import nmr, raster, shading, soft
+from plugins.renderer.rasterizer.boundary import boundary
+from plugins.renderer.rasterizer.canvas import Box, Canvas, Corners, Lease
+from plugins.renderer.rasterizer.clipping import clipped
+from plugins.renderer.rasterizer.interior import interior, of_the_world
+from plugins.renderer.rasterizer.textures import Laid
 
 Gradient = Literal["boundary", "interior", "nmr", "soft"]
+Saving = Literal["view", "box", "hidden", "unchanged"]
+NUMBERS = {"normal": 3, "barycentric": 3, "uv": 2}
 
 
 @dataclass(frozen=True)
@@ -19,94 +27,192 @@ class View:
     """What a picture needs beside what it is differentiated in; plain numbers.
 
     Attributes:
-        faces: (faces, 3) int32 or int64.
-        beside: gives `gradient.neighbours` of them, when they are asked for.
+        faces: of the scene.
         near: metres.
         size: (height, width), pixels.
         cull: leave out faces seen from behind.
-        channels: to draw.
+        channels: to draw, in this order.
         gradient: see `Rasterizer`; "soft" draws another picture.
         softness: σ and γ of "soft".
+        savings: what to leave out, see `Rasterizer`.
         once: whether a pixel is one sample, and not the mean of several.
     """
 
-    faces: np.ndarray
-    beside: Callable[[], np.ndarray]
+    faces: Corners
     near: float
     size: tuple[int, int]
     cull: bool
-    channels: frozenset[str]
+    channels: tuple[str, ...]
     gradient: Gradient
     softness: tuple[float, float]
+    savings: frozenset[Saving]
     once: bool = True
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a picture is differentiated in, and the texture around it, as arrays.
+
+    Attributes:
+        lens: fx, fy, cx, cy, pixels.
+        laid: the texture; its texels are those of all images.
+    """
+
+    vertices: np.ndarray
+    colors: np.ndarray | None
+    rotation: np.ndarray
+    translation: np.ndarray
+    lens: np.ndarray
+    laid: Laid | None
+
+    @property
+    def paints(self) -> int:
+        """How many channels a colour has."""
+        return self.colors.shape[1] if self.colors is not None else cast(Laid, self.laid).texels.shape[1]
 
 
 @dataclass
 class Drawn:
-    """A picture and what its gradient reads; channels that nobody reads are of size 0.
+    """A picture and what its gradient reads.
 
     Attributes:
-        blend: what `color` was rounded from where the gradient is "soft" and something is in view.
+        channels: those asked for.
+        box: of the canvas, what may show a face.
+        blend: what the colour was rounded from where the gradient is "soft" and something is in view.
     """
 
-    seen: np.ndarray
-    screen: np.ndarray
-    box: tuple[int, int, int, int]
-    color: np.ndarray
-    depth: np.ndarray
-    face: np.ndarray
-    mask: np.ndarray
+    channels: dict[str, Tensor]
+    report: Report
+    lease: Lease
+    box: Box
     blend: soft.Blend | None
 
 
-def draw(
-    vertices: np.ndarray,
-    colors: np.ndarray | None,
-    rotation: np.ndarray,
-    translation: np.ndarray,
-    lens: np.ndarray,
-    view: View,
-) -> Drawn:
-    """The channels of a view; `lens` holds fx, fy, cx, cy, pixels."""
-    height, width = view.size
-    focal, principal = lens[:2], lens[2:]
-    blended = colors is not None and view.gradient == "soft"
-    want_face = "face" in view.channels or ("color" in view.channels and not blended)
-    want_depth = want_face or "depth" in view.channels
-    depth = np.full(view.size if want_depth else (0, 0), np.inf, np.float32)
-    face = np.full(view.size if want_face else (0, 0), -1, np.int32)
-    # Fresh zeros cost nothing until they are touched, which pixels that no face covers are not.
-    mask = np.zeros(view.size if "mask" in view.channels else (0, 0), np.bool_)
-    color = np.zeros((*view.size, colors.shape[1]) if colors is not None else (0, 0, 0), np.float32)
-    faces = view.faces
+def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
+    """The channels of a view. `learning`: keep what the gradient needs."""
+    lease = Lease(pool)
+    canvas, (height, width) = lease.canvas, view.size
+    faces, savings = view.faces.array, view.savings
+    numbers = outputs(given, view)
+    blended = "color" in numbers and view.gradient == "soft"
     margin = soft.reach(view.softness[0], view.size) if blended else 0.0
+    focal, principal = given.lens[:2], given.lens[2:]
+    place = (given.vertices, given.rotation, given.translation, focal, principal)
+    counts, box, blend, reused = (
+        np.zeros(len(raster.REASONS) + 1, np.int64),
+        (height, 0, width, 0),
+        None,
+        set(),
+    )
+    pose = np.concatenate([given.rotation.ravel(), given.translation, given.lens, [view.near]])
     bounds = (principal + margin, view.near, height + 2 * margin, width + 2 * margin)
-    if raster.out_of_view(vertices, rotation, translation, focal, *bounds):
-        faces = faces[:0]
-    count = len(vertices) if len(faces) else 0
-    seen, screen = np.empty((count, 3)), np.empty((count, 3))
-    box = (height, 0, width, 0)
-    blend = None
-    if len(faces):
-        hidden = raster.project(vertices, rotation, translation, focal, principal, view.near, seen, screen)
-        if blended and colors is not None:
-            blend = soft.blend(seen, screen, faces, colors, lens, view.cull, view.size, *view.softness)
-            color = blend.color.astype(np.float32)
-    if len(faces) and (want_depth or mask.size):
-        nothing = np.empty(0, np.int64)
-        box = raster.rasterise(screen, faces, nothing, view.cull, height, width, depth, face, mask)
-        if hidden:
-            corners, parts, numbers = raster.clipped(seen, faces, focal, principal, view.near)
-            if len(parts):
-                cut = raster.rasterise(corners, parts, numbers, view.cull, height, width, depth, face, mask)
-                box = tuple(least(*pair) for least, *pair in zip((min, max, min, max), box, cut, strict=True))
-        if colors is not None and not blended:
-            raster.shade(seen, screen, faces, colors, focal, principal, face, box, color)
-    return Drawn(seen, screen, box, color, depth, face, mask, blend)
+    if len(faces) == 0 or ("view" in savings and raster.out_of_view(*place[:4], *bounds)):
+        counts[raster.OUTSIDE] = len(faces)
+    else:
+        if "unchanged" not in savings:
+            canvas.forget()
+        if canvas.placed(given.vertices, pose):
+            reused.add("places")
+        else:
+            canvas.hidden = raster.project(*place, view.near, canvas.seen, canvas.screen)
+        if blended and given.colors is not None:
+            seen = (canvas.seen, canvas.screen, faces, given.colors, given.lens)
+            blend = soft.blend(*seen, view.cull, view.size, *view.softness)
+            numbers["color"][:] = blend.color
+        exact = set(numbers) - {"color"} if blended else set(numbers)
+        if learning and "depth" in numbers:
+            exact.add("face")  # which a depth's slope is led through
+        if canvas.has(view.faces, view.cull, view.size):
+            reused.add("faces")
+            box, counts = canvas.box, canvas.counts
+        elif exact == {"mask"}:
+            box = rasterised(given, view, canvas, None, None, numbers["mask"], None, counts)
+        elif exact:
+            canvas.cleared(view.size)
+            tiles = canvas.tiles if "hidden" in savings else None
+            box = rasterised(given, view, canvas, canvas.depth, canvas.face, None, tiles, counts)
+            canvas.shows(view.faces, view.cull, box, counts)
+        if "box" not in savings:
+            box = (0, height, 0, width)
+        if exact and canvas.has(view.faces, view.cull, view.size):
+            fill(given, view, canvas, numbers, box, blended)
+    left_out = {name: int(counts[place]) for place, name in raster.REASONS.items() if counts[place]}
+    visited = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
+    told = frozenset(reused)
+    report = Report(len(faces), int(counts[raster.DRAWN]), left_out, visited, told, frozenset(numbers))
+    channels = {name: torch.from_numpy(array) for name, array in numbers.items()}
+    return Drawn(channels, report, lease, box, blend)
+
+
+def outputs(given: Given, view: View) -> dict[str, np.ndarray]:
+    """Arrays for the channels, showing the background."""
+    made: dict[str, np.ndarray] = {}
+    for name in view.channels:
+        if name == "face":
+            made[name] = np.full(view.size, -1, np.int32)
+        elif name == "depth":
+            made[name] = np.full(view.size, np.inf, np.float32)
+        elif name == "mask":
+            made[name] = np.zeros(view.size, np.bool_)
+        else:
+            # Fresh zeros cost nothing until they are touched, which pixels that no face covers are not.
+            made[name] = np.zeros((*view.size, NUMBERS.get(name) or given.paints), np.float32)
+    return made
+
+
+def rasterised(
+    given: Given,
+    view: View,
+    canvas: Canvas,
+    depth: np.ndarray | None,
+    face: np.ndarray | None,
+    mask: np.ndarray | None,
+    tiles: tuple[np.ndarray, np.ndarray] | None,
+    counts: np.ndarray,
+) -> Box:
+    """Draw all faces, those that the near plane cuts as well, and count what became of them."""
+    faces = view.faces.array
+    if tiles is not None and depth is not None:
+        box = raster.front_to_back(canvas.screen, faces, view.cull, *view.size, depth, face, tiles, counts)
+    else:
+        box = raster.rasterise(
+            canvas.screen, faces, 0, None, view.cull, *view.size, depth, face, mask, None, counts
+        )
+    if canvas.hidden:
+        corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
+        if len(parts):
+            some = np.zeros_like(counts)
+            arrays = (depth, face, mask, None, some)
+            cut = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays)
+            counts[raster.DRAWN] += some[raster.DRAWN]
+            counts[raster.BEHIND] -= some[raster.DRAWN]
+            box = (min(box[0], cut[0]), max(box[1], cut[1]), min(box[2], cut[2]), max(box[3], cut[3]))
+    return box
+
+
+def fill(
+    given: Given, view: View, canvas: Canvas, numbers: dict[str, np.ndarray], box: Box, blended: bool
+) -> None:
+    """Fill the channels from the visible faces."""
+    top, bottom, left, right = box
+    part = (slice(top, bottom), slice(left, right))
+    for name, kept in (("depth", canvas.depth), ("face", canvas.face)):
+        if name in numbers:
+            numbers[name][part] = kept[part]
+    if "mask" in numbers:
+        np.greater_equal(canvas.face[part], 0, out=numbers["mask"][part])
+    places = (canvas.seen, canvas.screen)
+    faces, shown = view.faces.array, (given.lens, canvas.face, box)
+    if "color" in numbers and not blended:
+        shading.shade(*places, faces, given.colors, given.laid, *shown, numbers["color"])
+    if not {"normal", "barycentric", "uv"}.isdisjoint(numbers):
+        asked = [numbers.get(name) for name in ("normal", "barycentric", "uv")]
+        shading.inform(*places, given.vertices, faces, given.laid, *shown, *asked)
 
 
 class Picture(torch.autograd.Function):
-    """(color, depth, face, mask) of vertices, colours, rotation, translation and lens (fx, fy, cx, cy)."""
+    """The channels, in the view's order, of vertices, colours, rotation, translation, lens (fx, fy, cx, cy), uv and
+    images; `made` takes what was drawn."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -116,105 +222,125 @@ class Picture(torch.autograd.Function):
         rotation: Tensor,
         translation: Tensor,
         lens: Tensor,
+        uv: Tensor | None,
+        given: Given,
         view: View,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        shown = None if colors is None else colors.detach().contiguous().numpy()
-        place = vertices.detach().contiguous().numpy()
-        turn, shift, focus = (
-            part.detach().double().contiguous().numpy() for part in (rotation, translation, lens)
+        pool: list[Canvas],
+        made: list[Report],
+        *images: Tensor,
+    ) -> tuple[Tensor, ...]:
+        drawn = draw(given, view, pool, learning=True)
+        made.append(drawn.report)
+        ctx.set_materialize_grads(False)
+        ctx.given, ctx.view = given, view
+        ctx.drawn = replace(drawn, channels={})  # a picture that held itself would never be freed
+        ctx.color = None
+        if view.gradient == "nmr" and "color" in drawn.channels:
+            ctx.color = drawn.channels["color"].numpy().copy()
+        learned = (vertices, colors, rotation, translation, lens, uv)
+        ctx.types = [None if part is None else part.dtype for part in learned]
+        ctx.images = [(image.shape, image.dtype) for image in images]
+        ctx.mark_non_differentiable(
+            *[part for name, part in drawn.channels.items() if name not in ("color", "depth")]
         )
-        if any(ctx.needs_input_grad) and "depth" in view.channels:
-            view = replace(view, channels=view.channels | {"face"})  # which a depth's slope is led through
-        drawn = draw(place, shown, turn, shift, focus, view)
-        ctx.arrays, ctx.drawn, ctx.view = (place, shown, turn, shift, focus), drawn, view
-        ctx.types = [
-            None if part is None else part.dtype for part in (vertices, colors, rotation, translation, lens)
-        ]
-        color, depth, face, mask = map(torch.from_numpy, (drawn.color, drawn.depth, drawn.face, drawn.mask))
-        ctx.mark_non_differentiable(face, mask)
-        return color, depth, face, mask
+        return tuple(drawn.channels.values())
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, along_color: Tensor, along_depth: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
-        vertices, colors, rotation, _, lens = ctx.arrays
-        drawn: Drawn = ctx.drawn
-        slopes = [part.contiguous().numpy() for part in (along_color, along_depth)]
-        found = backward(vertices, colors, rotation, lens, drawn, ctx.view, *slopes)
-        return *(
-            None if part is None or kind is None else torch.from_numpy(part).to(kind)
-            for part, kind in zip(found, ctx.types, strict=True)
-        ), None
+    def backward(ctx: Any, *along: Tensor | None) -> tuple[Tensor | None, ...]:
+        slopes = {
+            name: slope.contiguous().numpy()
+            for name, slope in zip(ctx.view.channels, along, strict=True)
+            if slope is not None and name in ("color", "depth")
+        }
+        asked = ctx.needs_input_grad
+        found = backward(ctx.given, ctx.view, ctx.drawn, ctx.color, slopes, asked[:6], any(asked[10:]))
+        *first, of_texels = found
+        parts = [
+            torch.from_numpy(part).to(kind) if wanted and part is not None else None
+            for part, kind, wanted in zip(first, ctx.types, asked, strict=False)
+        ]
+        return *parts, None, None, None, None, *of_images(of_texels, ctx.images)
+
+
+def of_images(
+    of_texels: np.ndarray | None, images: Sequence[tuple[torch.Size, torch.dtype]]
+) -> list[Tensor | None]:
+    """The slopes of all texels as those of the images."""
+    found, start = [], 0
+    for shape, kind in images:
+        count = shape[0] * shape[1]
+        if of_texels is None:
+            found.append(None)
+        else:
+            found.append(torch.from_numpy(of_texels[start : start + count]).reshape(shape).to(kind))
+        start += count
+    return found
 
 
 def backward(
-    vertices: np.ndarray,
-    colors: np.ndarray | None,
-    rotation: np.ndarray,
-    lens: np.ndarray,
-    drawn: Drawn,
+    given: Given,
     view: View,
-    along_color: np.ndarray,
-    along_depth: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray, np.ndarray]:
-    """Slopes in vertices, colours, rotation, translation and lens, float64."""
-    of_vertices = np.zeros((len(vertices), 3))
-    of_colors = np.zeros((0, 0) if colors is None else colors.shape)
-    of_rotation, of_translation, of_lens = np.zeros((3, 3)), np.zeros(3), np.zeros(4)
-    if len(drawn.seen):
-        of_seen = np.zeros((len(vertices), 3))
-        deep = along_depth if "depth" in view.channels else np.zeros((0, 0), np.float32)
-        to_camera(colors, lens, drawn, view, along_color, deep, of_seen, of_colors, of_lens)
-        gradient.of_the_world(vertices, rotation, of_seen, of_vertices, of_rotation, of_translation)
-    return of_vertices, None if colors is None else of_colors, of_rotation, of_translation, of_lens
+    drawn: Drawn,
+    color: np.ndarray | None,
+    slopes: dict[str, np.ndarray],
+    asked: Sequence[bool],
+    of_images: bool,
+) -> tuple[np.ndarray | None, ...]:
+    """Slopes in vertices, colours, rotation, translation, lens, uv and texels, float64; of what was not asked for None
+    or what came along. `color` is the picture, where the kind of gradient reads it."""
+    canvas, laid, vertices = drawn.lease.canvas, given.laid, given.vertices
+    moving = any((asked[0], asked[2], asked[3], asked[4]))
+    of_colors = np.zeros(given.colors.shape) if asked[1] and given.colors is not None else None
+    of_uv = np.zeros(laid.uv.shape) if asked[5] and laid is not None else None
+    of_texels = np.zeros(laid.texels.shape) if of_images and laid is not None else None
+    of_vertices, of_rotation, of_translation = np.zeros(vertices.shape), np.zeros((3, 3)), np.zeros(3)
+    of_lens = np.zeros(4) if moving else None
+    if drawn.box[0] < drawn.box[1] or drawn.blend is not None:
+        of_seen = np.zeros(canvas.seen.shape) if moving else None
+        to_camera(given, view, drawn, color, slopes, of_seen, of_lens, of_colors, of_texels, of_uv)
+        if of_seen is not None:
+            of_the_world(vertices, given.rotation, of_seen, of_vertices, of_rotation, of_translation)
+    return of_vertices, of_colors, of_rotation, of_translation, of_lens, of_uv, of_texels
 
 
 def to_camera(
-    colors: np.ndarray | None,
-    lens: np.ndarray,
-    drawn: Drawn,
+    given: Given,
     view: View,
-    along_color: np.ndarray,
-    along_depth: np.ndarray,
-    of_seen: np.ndarray,
-    of_colors: np.ndarray,
-    of_lens: np.ndarray,
+    drawn: Drawn,
+    color: np.ndarray | None,
+    slopes: dict[str, np.ndarray],
+    of_seen: np.ndarray | None,
+    of_lens: np.ndarray | None,
+    of_colors: np.ndarray | None,
+    of_texels: np.ndarray | None,
+    of_uv: np.ndarray | None,
 ) -> None:
-    """Add the slopes in camera coordinates, colours and lens, by the kind of gradient."""
-    no_color, no_depth = np.zeros((0, 0, 0), np.float32), np.zeros((0, 0), np.float32)
-    shown = np.zeros((0, 0), np.float32) if colors is None else colors
-    visible = drawn.face.size > 0 and drawn.box[0] < drawn.box[1]
-    faces = (drawn.seen, view.faces, shown, lens, drawn.face, drawn.box)
-    if drawn.blend is not None:
-        soft.slopes(
-            drawn.seen, view.faces, shown, lens, drawn.blend, along_color, of_seen, of_colors, of_lens
-        )
-    if colors is None or view.gradient == "soft":
-        if visible:
-            gradient.interior(*faces, no_color, along_depth, of_seen, of_colors, of_lens)
-    elif visible and view.gradient == "nmr":
-        # of what faces do within, colours and depths alone
-        gradient.interior(
-            *faces, along_color, no_depth, np.zeros_like(of_seen), of_colors, np.zeros_like(of_lens)
-        )
-        gradient.interior(*faces, no_color, along_depth, of_seen, of_colors, of_lens)
-        picture = (drawn.face, drawn.color, along_color)
-        nmr.sweeps(drawn.seen, drawn.screen, view.faces, lens, *picture, of_seen, of_lens)
-    elif visible:
-        gradient.interior(*faces, along_color, along_depth, of_seen, of_colors, of_lens)
-        if view.gradient == "boundary":
-            gradient.boundary(
-                drawn.seen,
-                drawn.screen,
-                view.faces,
-                view.beside(),
-                colors,
-                lens,
-                drawn.face,
-                drawn.depth,
-                drawn.box,
-                view.once,
-                along_color,
-                of_seen,
-                of_lens,
+    """Add the slopes in camera coordinates, lens, colours and texture, by the kind of gradient."""
+    canvas, lens, colors, laid = drawn.lease.canvas, given.lens, given.colors, given.laid
+    along_color, along_depth = slopes.get("color"), slopes.get("depth")
+    faces = view.faces.array
+    surface = (canvas.seen, faces, colors, laid, lens, canvas.face, drawn.box, canvas.scratch(len(faces)))
+    of_paint = (of_colors, of_texels, of_uv)
+    visible = drawn.box[0] < drawn.box[1]
+    if view.gradient in ("nmr", "soft"):
+        if visible and along_depth is not None:
+            interior(*surface, None, along_depth, of_seen, of_lens, None, None, None)
+        if along_color is not None and drawn.blend is not None and colors is not None:
+            sums = (
+                np.zeros(shape) if of is None else of
+                for of, shape in ((of_seen, canvas.seen.shape), (of_colors, colors.shape), (of_lens, (4,)))
             )
+            soft.slopes(canvas.seen, faces, colors, lens, drawn.blend, along_color, *sums)
+        elif along_color is not None and visible and view.gradient == "nmr":
+            # of what faces do within, colours and textures alone
+            interior(*surface, along_color, None, None, None, *of_paint)
+            if of_seen is not None and of_lens is not None and color is not None:
+                picture = (canvas.face, color, along_color)
+                nmr.sweeps(canvas.seen, canvas.screen, faces, lens, *picture, of_seen, of_lens)
+    elif visible:
+        interior(*surface, along_color, along_depth, of_seen, of_lens, *of_paint)
+        if view.gradient == "boundary" and along_color is not None and of_seen is not None:
+            edges = (canvas.seen, canvas.screen, faces, view.faces.beside, colors, laid, lens)
+            picture = (canvas.face, canvas.depth, drawn.box, view.once)
+            boundary(*edges, *picture, along_color, of_seen, of_lens)

@@ -21,7 +21,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from plugins.renderer.rasterizer.gradient import along
+from plugins.renderer.rasterizer.boundary import along
 from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled
 
 LEAST_DISTANCE = 1e-4  # added to distances; half images, of the side that an edge moves along

@@ -1,17 +1,18 @@
-"""From triangles to pixels on one CPU core: project, rasterise, shade; compiled functions on NumPy arrays.
+"""From triangles to the pixels that they cover, on one CPU core; compiled functions on NumPy arrays.
 
 Corners are rounded to 1/256 pixel, and edge functions that are exact on those whole numbers (Pineda 1988)
 decide with the top-left rule which pixels a triangle covers: a pixel centre on the edge between two triangles
-belongs to exactly one of them. A visible face and its pixel give back the barycentric weights (`weights`).
+belongs to exactly one of them.
 
 Arrays:
     seen: (vertices, 3) float64: x right, y down, z forward from the camera, metres.
     screen: (vertices, 3) float64: column and row in 1/256 pixel, whole numbers, and 1 / depth in 1/metre; the
         last is 0 where a vertex cannot be drawn.
-    depth, face, mask: (height, width) float32, int32, bool; of size 0 where nobody reads them.
+    depth, face, mask: (height, width) float32, int32, bool.
     box: first row, past-the-last row, first column, past-the-last column of what may have been drawn.
 
-`no_type_check` keeps the type checks that tests switch on from wrapping a kernel before it is compiled.
+An argument that is None is compiled away. `no_type_check` keeps the type checks that tests switch on from wrapping a
+kernel before it is compiled.
 """
 
 from typing import no_type_check
@@ -25,6 +26,11 @@ EXACT = 2.0**25
 LARGEST = 1e100  # 1/256 pixel; a product of two coordinates and an inverse depth stays finite in float64
 NEAREST = 1e-100  # metres; likewise
 FARTHEST = 3e38  # metres; a depth that float32 holds
+TILE = 16  # pixels
+RUN = 256  # faces
+DRAWN, BEHIND, FLAT, BACK, OUTSIDE, HIDDEN = range(6)
+"""What became of a face."""
+REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HIDDEN: "hidden"}
 
 # Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
 compiled = njit(cache=True, nogil=True, error_model="numpy")
@@ -117,70 +123,6 @@ def on_screen(x, y, z, focal, principal, near, place):
 
 @compiled
 @no_type_check
-def clipped(seen, faces, focal, principal, near):
-    """What the near plane leaves of faces that it cuts: corners on the screen, triangles of them, the faces' numbers.
-
-    One corner in front gives a triangle, two give two. A corner on an edge is computed from the edge's vertices in the
-    order of their indices, so that neighbours get the same.
-    """
-    count = 0
-    for index in range(faces.shape[0]):
-        front = 0
-        for corner in range(3):
-            front += drawable(seen, faces[index, corner], near)
-        good = finite(seen, faces, index)
-        count += front if good and front < 3 else 0
-    corners = np.zeros((4 * count, 3))
-    parts = np.empty((count, 3), np.int64)
-    numbers = np.empty(count, np.int64)
-    part = corner_number = 0
-    for index in range(faces.shape[0]):
-        front = 0
-        for corner in range(3):
-            front += drawable(seen, faces[index, corner], near)
-        if front == 0 or front == 3 or not finite(seen, faces, index):
-            continue
-        first = corner_number
-        for corner in range(3):
-            here, following = faces[index, corner], faces[index, (corner + 1) % 3]
-            if drawable(seen, here, near):
-                x, y, z = seen[here, 0], seen[here, 1], seen[here, 2]
-                on_screen(x, y, z, focal, principal, near, corners[corner_number])
-                corner_number += 1
-            if drawable(seen, here, near) != drawable(seen, following, near):
-                low, high = min(here, following), max(here, following)
-                share = (near - seen[low, 2]) / (seen[high, 2] - seen[low, 2])
-                x = seen[low, 0] + share * (seen[high, 0] - seen[low, 0])
-                y = seen[low, 1] + share * (seen[high, 1] - seen[low, 1])
-                on_screen(x, y, near, focal, principal, near, corners[corner_number])
-                corner_number += 1
-        for second in range(first + 1, corner_number - 1):
-            parts[part, 0], parts[part, 1], parts[part, 2] = first, second, second + 1
-            numbers[part] = index
-            part += 1
-    return corners[:corner_number], parts[:part], numbers[:part]
-
-
-@compiled
-@no_type_check
-def drawable(seen, vertex, near):
-    """Whether a vertex is in front of the near plane."""
-    return seen[vertex, 2] >= near
-
-
-@compiled
-@no_type_check
-def finite(seen, faces, index):
-    """Whether the coordinates of a face's vertices are within what products of them can hold."""
-    for corner in range(3):
-        for axis in range(3):
-            if not abs(seen[faces[index, corner], axis]) <= FARTHEST:
-                return False
-    return True
-
-
-@compiled
-@no_type_check
 def owned(along_column, along_row):
     """Top-left rule: whether pixels exactly on an edge are the triangle's, by the edge function's slope."""
     return along_column > 0 or (along_column == 0 and along_row > 0)
@@ -195,56 +137,80 @@ def before(x, y, other_x, other_y):
 
 @compiled
 @no_type_check
-def rasterise(screen, faces, numbers, cull, height, width, depth, face, mask):
-    """Draw the faces, each pixel the nearest, among equal float32 depths that of the lowest number. Returns the box.
+def rasterise(screen, faces, first, numbers, cull, height, width, depth, face, mask, tiles, counts):
+    """Draw the faces into `depth` and `face`, or into `mask` alone; the others are None. Returns the box.
 
-    `cull` leaves out faces seen from behind. With `depth` of size 0 only `mask` is drawn, without depths; one
-    of the two is needed. `numbers` of the faces: of size 0 they are numbered as they come; else these are drawn over
-    what is there. `mask`, and `depth` and `face` with it, come cleared.
+    Each pixel shows the nearest, among equal float32 depths that of the lowest number. The arrays may hold what was
+    drawn before.
+
+    Args:
+        first, numbers: faces are numbered from `first` on where `numbers` is None; else by it, those with the same
+            number being parts of one.
+        cull: leave out faces seen from behind.
+        tiles: None, or (farthest, changed) of `TILE` × `TILE` pixels each: no depth in it is beyond `farthest`, and
+            so many pixels were written since that was looked up.
+        counts: what became of the faces is added, by `DRAWN` and so on.
     """
-    want_depth = depth.size > 0
-    want_face = face.size > 0
-    over = numbers.size > 0
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
     box_top, box_bottom, box_left, box_right = height, 0, width, 0
+    behind = flat = back = outside = hidden = drawn = 0
+    last_drawn = -1
     for index in range(faces.shape[0]):
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
         if near0 == 0 or near1 == 0 or near2 == 0:
+            behind += 1
             continue
         ax, ay = screen[a, 0], screen[a, 1]
         bx, by = screen[b, 0], screen[b, 1]
         cx, cy = screen[c, 0], screen[c, 1]
-        left, right = min(ax, bx, cx), max(ax, bx, cx)
-        top, bottom = min(ay, by, cy), max(ay, by, cy)
-        if right < 0 or bottom < 0 or left > last_x or top > last_y:
-            continue
-        # The pixel centres in the bounding box; clamped as floats, so that the casts are safe.
-        first_column = np.int64(np.ceil(max(left, 0.0) / SUBPIXELS))
-        last_column = np.int64(np.floor(min(right, last_x) / SUBPIXELS))
-        first_row = np.int64(np.ceil(max(top, 0.0) / SUBPIXELS))
-        last_row = np.int64(np.floor(min(bottom, last_y) / SUBPIXELS))
-        if first_column > last_column or first_row > last_row:
-            continue
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)  # exact up to EXACT
         # Counter-clockwise from outside has negative area where rows run downwards.
-        if area == 0 or (cull and area > 0):
-            continue
         if area < 0:
             area = -area
             bx, by, near1, cx, cy, near2 = cx, cy, near2, bx, by, near1
-        # The topmost, then leftmost corner first: the rounding of a depth then does not depend on the order
-        # in which a face names its corners, and two faces with the same corners are equally far.
-        if before(bx, by, ax, ay) and before(bx, by, cx, cy):
-            ax, ay, near0, bx, by, near1, cx, cy, near2 = bx, by, near1, cx, cy, near2, ax, ay, near0
-        elif before(cx, cy, ax, ay):
-            ax, ay, near0, bx, by, near1, cx, cy, near2 = cx, cy, near2, ax, ay, near0, bx, by, near1
+        elif area == 0:
+            flat += 1
+            continue
+        elif cull:
+            back += 1
+            continue
+        left, right = min(ax, bx, cx), max(ax, bx, cx)
+        top, bottom = min(ay, by, cy), max(ay, by, cy)
+        if right < 0 or bottom < 0 or left > last_x or top > last_y:
+            outside += 1
+            continue
+        # The pixel centres in the bounding box; clamped as floats, so that the casts are safe.
+        first_column = (np.int64(max(left, 0.0)) + 255) >> 8
+        last_column = np.int64(min(right, last_x)) >> 8
+        first_row = (np.int64(max(top, 0.0)) + 255) >> 8
+        last_row = np.int64(min(bottom, last_y)) >> 8
+        if first_column > last_column or first_row > last_row:
+            outside += 1
+            continue
+        least, most = min(near0, near1, near2), max(near0, near1, near2)
+        pixels = (first_row, last_row, first_column, last_column)
+        if tiles is not None and is_hidden(tiles, pixels, np.float32(1.0 / most)):
+            hidden += 1
+            continue
+        if numbers is None:
+            number = first + index
+            drawn += 1
+        else:
+            number = numbers[index]
+            drawn += 1 if number != last_drawn else 0
+            last_drawn = number
         box_top, box_bottom = min(box_top, first_row), max(box_bottom, last_row + 1)
         box_left, box_right = min(box_left, first_column), max(box_right, last_column + 1)
-        number = numbers[index] if over else index
+        if depth is not None:
+            # The topmost, then leftmost corner first: the rounding of a depth then does not depend on the order
+            # in which a face names its corners, and two faces with the same corners are equally far.
+            if before(bx, by, ax, ay) and before(bx, by, cx, cy):
+                ax, ay, near0, bx, by, near1, cx, cy, near2 = bx, by, near1, cx, cy, near2, ax, ay, near0
+            elif before(cx, cy, ax, ay):
+                ax, ay, near0, bx, by, near1, cx, cy, near2 = cx, cy, near2, ax, ay, near0, bx, by, near1
         if left < -EXACT or right > EXACT or top < -EXACT or bottom > EXACT:
             corners = (ax, ay, near0, bx, by, near1, cx, cy, near2)
-            pixels = (first_row, last_row, first_column, last_column)
             _draw_far(corners, pixels, number, depth, face, mask)
             continue
         x0, y0, x1, y1 = np.int64(ax), np.int64(ay), np.int64(bx), np.int64(by)
@@ -263,41 +229,83 @@ def rasterise(screen, faces, numbers, cull, height, width, depth, face, mask):
         column0, column1, column2 = column0 << 8, column1 << 8, column2 << 8
         row0, row1, row2 = row0 << 8, row1 << 8, row2 << 8
         scale0, scale1, scale2 = near0 / area, near1 / area, near2 / area
-        least, most = min(near0, near1, near2), max(near0, near1, near2)
+        written = 0
         for row in range(first_row, last_row + 1):
             edge0, edge1, edge2 = start0, start1, start2
             for column in range(first_column, last_column + 1):
-                if (edge0 | edge1 | edge2) >= 0:
-                    if want_depth:
-                        # 1 / depth is affine on the screen; clamped, it cannot leave the corners' range.
-                        inverse = (
-                            (edge0 + bias0) * scale0 + (edge1 + bias1) * scale1 + (edge2 + bias2) * scale2
-                        )
-                        distance = np.float32(1.0 / min(max(inverse, least), most))
-                        if distance < depth[row, column]:
-                            depth[row, column] = distance
-                            if want_face:
-                                face[row, column] = number
-                        elif (
-                            over
-                            and want_face
-                            and distance == depth[row, column]
-                            and number < face[row, column]
-                        ):
-                            face[row, column] = number
-                    else:
-                        mask[row, column] = True
+                if mask is not None:
+                    mask[row, column] |= (edge0 | edge1 | edge2) >= 0
+                if depth is not None and (edge0 | edge1 | edge2) >= 0:
+                    # 1 / depth is affine on the screen; clamped, it cannot leave the corners' range.
+                    inverse = (edge0 + bias0) * scale0 + (edge1 + bias1) * scale1 + (edge2 + bias2) * scale2
+                    distance = np.float32(1.0 / min(max(inverse, least), most))
+                    there = depth[row, column]
+                    if distance < there or (distance == there and number < face[row, column]):
+                        depth[row, column] = distance
+                        face[row, column] = number
+                        written += 1
                 edge0 += column0
                 edge1 += column1
                 edge2 += column2
             start0 += row0
             start1 += row1
             start2 += row2
-    if want_depth and mask.size > 0:
-        for row in range(box_top, box_bottom):
-            for column in range(box_left, box_right):
-                mask[row, column] = depth[row, column] < np.inf
+        if tiles is not None:
+            look_up(tiles, pixels, written, depth)
+    for place, count in ((DRAWN, drawn), (BEHIND, behind), (FLAT, flat), (BACK, back)):
+        counts[place] += count
+    counts[OUTSIDE] += outside
+    counts[HIDDEN] += hidden
     return box_top, box_bottom, box_left, box_right
+
+
+@compiled
+@no_type_check
+def is_hidden(tiles, pixels, nearest):
+    """Whether everything in a box of pixels was drawn nearer than `nearest`, as far as the tiles know."""
+    farthest, _ = tiles
+    first_row, last_row, first_column, last_column = pixels
+    for row in range(first_row // TILE, last_row // TILE + 1):
+        for column in range(first_column // TILE, last_column // TILE + 1):
+            if not nearest > farthest[row, column]:
+                return False
+    return True
+
+
+@compiled
+@no_type_check
+def look_up(tiles, pixels, written, depth):
+    """Note that pixels of a box were written, and look up how far a tile reaches when as many were as it has."""
+    farthest, changed = tiles
+    first_row, last_row, first_column, last_column = pixels
+    for row in range(first_row // TILE, last_row // TILE + 1):
+        for column in range(first_column // TILE, last_column // TILE + 1):
+            changed[row, column] += written
+            if changed[row, column] >= TILE * TILE:
+                changed[row, column] = 0
+                most = np.float32(0)
+                for y in range(row * TILE, min((row + 1) * TILE, depth.shape[0])):
+                    for x in range(column * TILE, min((column + 1) * TILE, depth.shape[1])):
+                        most = max(most, depth[y, x])
+                farthest[row, column] = most
+
+
+@compiled
+@no_type_check
+def front_to_back(screen, faces, cull, height, width, depth, face, tiles, counts):
+    """As `rasterise`, runs of `RUN` faces nearest first. Returns the box."""
+    runs = (faces.shape[0] + RUN - 1) // RUN
+    nearest = np.zeros(runs)
+    for run in range(runs):
+        for index in range(run * RUN, min((run + 1) * RUN, faces.shape[0])):
+            nearest[run] = max(nearest[run], screen[faces[index, 0], 2])
+    top, bottom, left, right = height, 0, width, 0
+    for run in np.argsort(-nearest):
+        some = faces[run * RUN : (run + 1) * RUN]
+        box = rasterise(screen, some, run * RUN, None, cull, height, width, depth, face, None, tiles, counts)
+        top, bottom = min(top, box[0]), max(bottom, box[1])
+        left, right = min(left, box[2]), max(right, box[3])
+    return top, bottom, left, right
 
 
 @compiled
@@ -318,17 +326,17 @@ def _draw_far(corners, pixels, number, depth, face, mask):
             inside = edge0 > 0 or (edge0 == 0 and owned0)
             inside = inside and (edge1 > 0 or (edge1 == 0 and owned1))
             inside = inside and (edge2 > 0 or (edge2 == 0 and owned2)) and edge0 + edge1 + edge2 > 0
-            if inside and depth.size > 0:
+            if not inside:
+                continue
+            if mask is not None:
+                mask[row, column] = True
+            if depth is not None:
                 inverse = (edge0 * near0 + edge1 * near1 + edge2 * near2) / (edge0 + edge1 + edge2)
                 distance = np.float32(1.0 / min(max(inverse, least), most))
-                if distance < depth[row, column]:
+                there = depth[row, column]
+                if distance < there or (distance == there and number < face[row, column]):
                     depth[row, column] = distance
-                    if face.size > 0:
-                        face[row, column] = number
-                elif face.size > 0 and distance == depth[row, column] and number < face[row, column]:
                     face[row, column] = number
-            elif inside:
-                mask[row, column] = True
 
 
 @compiled
@@ -338,63 +346,3 @@ def edges(ax, ay, bx, by, cx, cy, row, column):
     x, y = column * SUBPIXELS, row * SUBPIXELS
     ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
     return bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay
-
-
-@compiled
-@no_type_check
-def weights(screen, a, b, c, row, column):
-    """Perspective-correct barycentric weights of a face at a pixel inside it: (w / z) / Σ (w / z)."""
-    edge0, edge1, edge2 = edges(
-        screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1], row, column
-    )
-    part0, part1, part2 = edge0 * screen[a, 2], edge1 * screen[b, 2], edge2 * screen[c, 2]
-    scale = 1.0 / (part0 + part1 + part2)
-    return part0 * scale, part1 * scale, part2 * scale
-
-
-@compiled
-@no_type_check
-def weights_in_space(seen, a, b, c, ray_x, ray_y):
-    """Those of a face with corners behind the camera too: r·(b × c) and so on over their sum (Olano & Greer 1997)."""
-    part0 = volume(seen, b, c, ray_x, ray_y)
-    part1 = volume(seen, c, a, ray_x, ray_y)
-    part2 = volume(seen, a, b, ray_x, ray_y)
-    turn = 1.0 if part0 + part1 + part2 > 0 else -1.0
-    # rounding of corners may leave the pixel a little outside of the face
-    part0, part1, part2 = max(turn * part0, 0.0), max(turn * part1, 0.0), max(turn * part2, 0.0)
-    total = part0 + part1 + part2
-    if not (total > 0 and total < np.inf):  # seen edge-on
-        return 1.0 / 3, 1.0 / 3, 1.0 / 3
-    return part0 / total, part1 / total, part2 / total
-
-
-@compiled
-@no_type_check
-def volume(seen, a, b, ray_x, ray_y):
-    """r · (a × b) of two vertices and a ray (ray_x, ray_y, 1)."""
-    ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
-    bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
-    return ray_x * (ay * bz - az * by) + ray_y * (az * bx - ax * bz) + (ax * by - ay * bx)
-
-
-@compiled
-@no_type_check
-def shade(seen, screen, faces, colors, focal, principal, face, box, color):
-    """Fill `color` (height, width, channel) with interpolated colours where `face` shows a face."""
-    top, bottom, left, right = box
-    for row in range(top, bottom):
-        for column in range(left, right):
-            index = face[row, column]
-            if index >= 0:
-                a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-                if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
-                    weight0, weight1, weight2 = weights(screen, a, b, c, row, column)
-                else:
-                    ray_x, ray_y = (column - principal[0]) / focal[0], (row - principal[1]) / focal[1]
-                    weight0, weight1, weight2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
-                for channel in range(colors.shape[1]):
-                    color[row, column, channel] = (
-                        weight0 * colors[a, channel]
-                        + weight1 * colors[b, channel]
-                        + weight2 * colors[c, channel]
-                    )

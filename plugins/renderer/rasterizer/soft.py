@@ -21,7 +21,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from plugins.renderer.rasterizer.gradient import along
+from plugins.renderer.rasterizer.boundary import along
 from plugins.renderer.rasterizer.raster import compiled
 
 BACKGROUND = 1e-3  # ε, as published

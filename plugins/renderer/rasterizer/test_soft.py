@@ -9,7 +9,8 @@ from torch import Tensor
 
 from framework.geometry.camera import Camera
 from framework.renderer import Scene
-from plugins.renderer.rasterizer.drawing import View, backward, draw
+from plugins.renderer.rasterizer.canvas import Corners
+from plugins.renderer.rasterizer.drawing import Given, View, backward, draw
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_gradient import blob, camera, turned
 
@@ -73,20 +74,20 @@ def given(seed: int) -> tuple[list[Tensor], Tensor]:
 
 def view(faces: Tensor, cull: bool, sigma: float, gamma: float) -> View:
     return View(
-        faces.numpy(),
-        lambda: np.empty((0, 3), np.int64),
+        Corners(faces.numpy(), int(faces.max())),
         1e-3,
         SIZE,
         cull,
-        frozenset({"color"}),
+        ("color",),
         "soft",
         (sigma, gamma),
+        frozenset(),
     )
 
 
 def picture(parts: list[np.ndarray], seen: View) -> np.ndarray:
     """In float64, before it is rounded."""
-    drawn = draw(parts[0], parts[1], *parts[2:], seen)
+    drawn = draw(Given(*parts, None), seen, [], learning=True)
     assert drawn.blend is not None
     return drawn.blend.color
 
@@ -100,14 +101,13 @@ def test_picture_and_slopes_are_the_formulas(knobs: tuple[float, float], cull: b
         wanted = reference(*again, faces, cull, *knobs)
         arrays = [part.numpy() for part in parts]
         seen = view(faces, cull, *knobs)
-        drawn = draw(*arrays, seen)
+        drawn = draw(Given(*arrays, None), seen, [], learning=True)
         assert drawn.blend is not None
         np.testing.assert_allclose(drawn.blend.color, wanted.detach(), rtol=1e-9, atol=1e-12)
         slope = torch.randn(*SIZE, 2)
         (wanted * slope).sum().backward()
-        rest = (slope.numpy(), np.zeros((0, 0), np.float32))
-        found = backward(arrays[0], arrays[1], arrays[2], arrays[4], drawn, seen, *rest)
-        for one, other in zip(found, again, strict=True):
+        found = backward(Given(*arrays, None), seen, drawn, None, {"color": slope.numpy()}, [True] * 6, False)
+        for one, other in zip(found[:5], again, strict=True):
             assert other.grad is not None and other.grad.abs().max() > 0
             np.testing.assert_allclose(one, other.grad, rtol=1e-7, atol=1e-8 * float(other.grad.abs().max()))
 
@@ -118,9 +118,9 @@ def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> No
     parts, faces = given(5)
     arrays, seen = [part.numpy() for part in parts], view(faces, False, *knobs)
     slope = np.random.default_rng(0).normal(size=(*SIZE, 2)).astype(np.float32)
-    found = backward(
-        *(arrays[index] for index in (0, 1, 2, 4)), draw(*arrays, seen), seen, slope, np.zeros((0, 0))
-    )
+    scene = Given(*arrays, None)
+    drawn = draw(scene, seen, [], learning=True)
+    found = backward(scene, seen, drawn, None, {"color": slope}, [True] * 6, False)[:5]
     step = 1e-6 if knobs[1] > 1e-4 else 1e-8
     for number, got in enumerate(found):
         assert got is not None

@@ -1,0 +1,147 @@
+"""What one picture leaves for the next: arrays to draw in, checked faces, and geometry that may not have changed.
+
+Nothing is believed to be the same because it is the same object: what is kept is compared with what comes, number by
+number, which costs as much as reading it until the first difference.
+"""
+
+from functools import cached_property
+from typing import no_type_check
+
+import numpy as np
+
+from plugins.renderer.rasterizer import raster
+from plugins.renderer.rasterizer.boundary import neighbours
+
+BLOCK = 1024
+MOST = 8
+"""Of meshes and of canvases that wait for their next use."""
+
+Box = tuple[int, int, int, int]
+
+
+@raster.compiled
+@no_type_check
+def alike(one, other):
+    """Whether two flat arrays of one length hold the same bits."""
+    for start in range(0, one.shape[0], BLOCK):
+        differ = one[start] != other[start]
+        for place in range(start, min(start + BLOCK, one.shape[0])):
+            differ |= one[place] != other[place]
+        if differ:
+            return False
+    return True
+
+
+class Corners:
+    """Rows of three indices, as kernels read them: (faces, 3) int32, and the largest of them."""
+
+    def __init__(self, given: np.ndarray, largest: int) -> None:
+        self.array = given.astype(np.int32)
+        self.largest = largest
+
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """See `neighbours`."""
+        return neighbours(self.array)
+
+    def holds(self, given: np.ndarray) -> bool:
+        return given.shape == self.array.shape and alike(given.reshape(-1), self.array.reshape(-1))
+
+
+class Shelf:
+    """Meshes that were drawn lately, the latest first."""
+
+    def __init__(self) -> None:
+        self._kept: list[Corners] = []
+
+    def find(self, given: np.ndarray, largest: int) -> Corners:
+        """Of indices up to `largest`, an index above which, or below 0, is a ValueError with both ends of them."""
+        for place, kept in enumerate(self._kept):
+            if kept.holds(given) and kept.largest <= largest:
+                self._kept.insert(0, self._kept.pop(place))
+                return kept
+        found = int(raster.largest_index(given.reshape(-1).view(f"u{given.itemsize}")))
+        if given.size and found > largest:
+            raise ValueError(f"{given.min()} to {given.max()}")
+        new = Corners(given, found)
+        self._kept = [new, *self._kept[: MOST - 1]]
+        return new
+
+
+class Canvas:
+    """Arrays of one picture; see `raster`.
+
+    `depth` and `face` are clear outside of `box`; `counts` says what became of the faces that they show.
+    """
+
+    def __init__(self) -> None:
+        self.seen, self.screen = np.empty((0, 3)), np.empty((0, 3))
+        self.depth, self.face = np.empty((0, 0), np.float32), np.empty((0, 0), np.int32)
+        self.tiles: tuple[np.ndarray, np.ndarray] = np.empty((0, 0), np.float32), np.empty((0, 0), np.int64)
+        self.counts = np.zeros(0, np.int64)
+        self.box: Box = (0, 0, 0, 0)
+        self.hidden = 0
+        self._scratch = np.empty(0, np.int32), np.empty((0, 20)), np.empty(0, np.int32)
+        self._vertices = np.empty((0, 3))
+        self._pose = np.empty(0)
+        self._drawn: tuple[Corners, bool] | None = None
+
+    def placed(self, vertices: np.ndarray, pose: np.ndarray) -> bool:
+        """Whether `seen` and `screen` hold these vertices from this pose; if not they are taken to from now on."""
+        kept = self._vertices
+        if kept.shape == vertices.shape and kept.dtype == vertices.dtype and len(self._pose) == len(pose):
+            if bool((self._pose == pose).all()) and alike(vertices.reshape(-1), kept.reshape(-1)):
+                return True
+        else:
+            self._vertices = np.empty_like(vertices)
+            self.seen, self.screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 3))
+        self._vertices[:] = vertices
+        self._pose = pose
+        self._drawn = None
+        return False
+
+    def scratch(self, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What `interior` works with."""
+        most = min(faces, self.face.size)
+        if len(self._scratch[0]) != faces or len(self._scratch[2]) < most:
+            self._scratch = np.full(faces, -1, np.int32), np.empty((most, 20)), np.empty(most, np.int32)
+        return self._scratch
+
+    def forget(self) -> None:
+        """Take nothing for the same at the next picture."""
+        self._pose, self._drawn = np.empty(0), None
+
+    def has(self, corners: Corners, cull: bool, size: tuple[int, int]) -> bool:
+        """Whether `depth` and `face` show this mesh, in the place that `placed` was last asked for."""
+        return self.depth.shape == size and self._drawn == (corners, cull)
+
+    def cleared(self, size: tuple[int, int]) -> None:
+        """Make `depth`, `face`, tiles and counts ready to be drawn in."""
+        height, width = size
+        if self.depth.shape != size:
+            self.depth = np.full(size, np.inf, np.float32)
+            self.face = np.full(size, -1, np.int32)
+            tiles = -(-height // raster.TILE), -(-width // raster.TILE)
+            self.tiles = np.full(tiles, np.inf, np.float32), np.zeros(tiles, np.int64)
+        else:
+            top, bottom, left, right = self.box
+            self.depth[top:bottom, left:right] = np.inf
+            self.face[top:bottom, left:right] = -1
+            self.tiles[0].fill(np.inf)
+            self.tiles[1].fill(0)
+        self._drawn, self.box = None, (0, height, 0, width)  # whatever happens before `shows`
+
+    def shows(self, corners: Corners, cull: bool, box: Box, counts: np.ndarray) -> None:
+        self._drawn, self.box, self.counts = (corners, cull), box, counts
+
+
+class Lease:
+    """A canvas while a picture, or the gradient that a picture may still be asked for, needs it."""
+
+    def __init__(self, pool: list[Canvas]) -> None:
+        self._pool = pool
+        self.canvas = pool.pop() if pool else Canvas()
+
+    def __del__(self) -> None:
+        if len(self._pool) < MOST:
+            self._pool.append(self.canvas)

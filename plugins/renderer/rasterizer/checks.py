@@ -1,0 +1,254 @@
+"""Whether a scene can be drawn: what came, what was wanted; and what kernels read of it, as arrays."""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.errors import did_you_mean
+from framework.geometry.camera import Camera
+from framework.renderer import Scene, Texture
+from plugins.renderer.rasterizer import raster
+from plugins.renderer.rasterizer.canvas import Corners, Shelf
+from plugins.renderer.rasterizer.drawing import Given, Gradient
+from plugins.renderer.rasterizer.textures import FARTHEST_UV, WRAPS, Laid
+
+CHANNELS = ("color", "depth", "face", "mask", "normal", "barycentric", "uv")
+PAINTED = ("color", "uv")
+"""Channels that read a texture."""
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A scene that can be drawn.
+
+    Attributes:
+        faces: of the scene.
+        corners: of its texture.
+        lens: fx, fy, cx, cy, pixels.
+        learning: whether a gradient may be asked for.
+    """
+
+    scene: Scene
+    vertices: Tensor
+    colors: Tensor | None
+    texture: Texture | None
+    faces: Corners
+    corners: Corners | None
+    lens: np.ndarray
+    near: float
+    learning: bool
+
+    @property
+    def uv_and_images(self) -> tuple[Tensor | None, tuple[Tensor, ...]]:
+        return (None, ()) if self.texture is None else (self.texture.uv, self.texture.images)
+
+    def given(self, times: int, colored: bool) -> tuple[Given, Tensor]:
+        """As arrays, with so many samples a pixel along each axis; and the lens as a tensor, which may be learned."""
+        camera = self.scene.camera
+        numbers = self.lens
+        lens = torch.from_numpy(numbers)
+        if self.learning and any(isinstance(part, Tensor) for part in (camera.focal, camera.principal)):
+            parts = [torch.as_tensor(part, dtype=torch.float64) for part in (camera.focal, camera.principal)]
+            lens = torch.cat(parts)
+        if times > 1:  # the middle of pixel 0 is that of its samples
+            shift = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
+            lens = (lens + 0.5 * shift) * times - 0.5 * shift
+            numbers = lens.detach().numpy()
+        return Given(
+            array(self.vertices),
+            array(self.colors) if colored and self.colors is not None else None,
+            array(camera.rotation).astype(np.float64),
+            array(camera.translation).astype(np.float64),
+            numbers,
+            self.laid,
+        ), lens
+
+    @cached_property
+    def laid(self) -> Laid | None:
+        texture, corners = self.texture, self.corners
+        if texture is None or corners is None:
+            return None
+        flat = [array(image).reshape(-1, image.shape[2]) for image in texture.images]
+        sides = [image.shape[:2] for image in texture.images]
+        starts = np.cumsum([0, *[height * width for height, width in sides]])
+        images = np.array([(start, *side) for start, side in zip(starts, sides, strict=False)], np.int64)
+        shown = np.zeros(len(corners.array), np.int32)
+        if texture.shown is not None:
+            shown = array(texture.shown).astype(np.int32)
+        texels = flat[0] if len(flat) == 1 else np.concatenate(flat)
+        return Laid(
+            texels,
+            images.reshape(-1, 3),
+            array(texture.uv),
+            corners.array,
+            shown,
+            WRAPS[texture.wrap],
+            texture.smooth,
+        )
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradient) -> Ready:
+    """The scene, checked for these channels.
+
+    Raises:
+        ValueError: says what came and what was wanted.
+    """
+    check_channels(channels)
+    vertices = numbers("vertices", scene.vertices)
+    faces = indices("faces", scene.faces, len(vertices), "vertices", shelf)
+    lens = check_camera(scene.camera)
+    camera = scene.camera
+    learned = [vertices, camera.rotation, camera.translation, camera.focal, camera.principal]
+    colors = texture = corners = None
+    if "color" in channels:
+        if scene.colors is None and scene.texture is None:
+            raise ValueError(
+                '"color" was asked of a scene without colours; give colors or a texture, or ask other channels.'
+            )
+        if scene.colors is not None:
+            colors = numbers("colors", scene.colors)
+            if len(colors) != len(vertices):
+                raise ValueError(f"{len(colors)} colors came for {len(vertices)} vertices; wanted one each.")
+        learned.append(colors)
+    if scene.texture is not None and not set(PAINTED).isdisjoint(channels):
+        if gradient == "soft" and "color" in channels:
+            raise ValueError(
+                "gradient=soft blends colours per vertex, and the scene has a texture; choose gradient=boundary, or "
+                "give colors alone."
+            )
+        texture, corners = check_texture(
+            scene.texture, faces, None if colors is None else colors.shape[1], shelf
+        )
+        learned += [texture.uv, *texture.images]
+    learning = torch.is_grad_enabled() and any(
+        isinstance(part, Tensor) and part.requires_grad for part in learned
+    )
+    near = max(float(camera.near), raster.NEAREST)
+    return Ready(scene, vertices, colors, texture, faces, corners, lens, near, learning)
+
+
+def check_channels(channels: Collection[str]) -> None:
+    if isinstance(channels, str):
+        raise ValueError(
+            f"channels came as the string {channels!r}; wanted a collection, e.g. ({channels!r},)."
+        )
+    for name in channels:
+        if name not in CHANNELS:
+            raise ValueError(
+                f"{name!r} is no channel of rasterizer.{did_you_mean(name, CHANNELS)} "
+                f"It draws {', '.join(CHANNELS)}."
+            )
+
+
+def check_device(name: str, tensor: Tensor) -> None:
+    if tensor.device.type != "cpu":
+        raise ValueError(f"{name} came on {tensor.device}; rasterizer draws on the CPU: give {name}.cpu().")
+
+
+def check_shape(name: str, tensor: Tensor, columns: int | None) -> None:
+    check_device(name, tensor)
+    if tensor.ndim != 2 or tensor.shape[1] < 1 or (columns is not None and tensor.shape[1] != columns):
+        wanted = "channels, 1 or more" if columns is None else columns
+        raise ValueError(f"{name} came with the shape {tuple(tensor.shape)}; wanted ({name}, {wanted}).")
+
+
+def indices(name: str, given: Tensor, count: int, of: str, shelf: Shelf) -> Corners:
+    """Rows of three indices, all below `count`."""
+    check_shape(name, given, 3)
+    if given.dtype not in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64):
+        raise ValueError(f"{name} came as {given.dtype}; wanted whole numbers, e.g. torch.int64.")
+    kept = given.dtype in (torch.int32, torch.int64)
+    try:
+        return shelf.find(array(given if kept else given.long()), count - 1)
+    except ValueError as error:
+        raise ValueError(
+            f"{name} name the {of} {error}; wanted 0 to {count - 1}, since the scene has {count} {of}."
+        ) from None
+
+
+def numbers(name: str, tensor: Tensor, columns: int | None = 3) -> Tensor:
+    """Coordinates or colours in a type that kernels take."""
+    check_shape(name, tensor, None if name == "colors" else columns)
+    return floating(name, tensor)
+
+
+def floating(name: str, tensor: Tensor) -> Tensor:
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name} came as {tensor.dtype}; wanted floating point, e.g. torch.float32.")
+    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
+
+
+def check_texture(
+    texture: Texture, faces: Corners, channels: int | None, shelf: Shelf
+) -> tuple[Texture, Corners]:
+    """A texture in types that kernels take, and its corners."""
+    if not texture.images:
+        raise ValueError("a texture came without images; wanted one or more.")
+    if texture.wrap not in WRAPS:
+        raise ValueError(f"wrap came as {texture.wrap!r}; wanted one of {', '.join(WRAPS)}.")
+    images = []
+    wanted = channels if channels is not None else texture.images[0].shape[-1]
+    for image in texture.images:
+        check_device("an image of a texture", image)
+        if image.ndim != 3 or 0 in image.shape or image.shape[2] != wanted:
+            raise ValueError(
+                f"an image of a texture came with the shape {tuple(image.shape)}; wanted (height, width, {wanted}), as "
+                "the other images and the colors have them."
+            )
+        images.append(floating("an image of a texture", image))
+    if len({image.dtype for image in images}) > 1:
+        images = [image.double() for image in images]
+    uv = numbers("uv", texture.uv, 2)
+    if uv.numel() and not bool((uv.detach().abs() <= FARTHEST_UV).all()):
+        raise ValueError(
+            f"uv holds a number that is not finite, or beyond {FARTHEST_UV:g}; wanted places near 0 to 1."
+        )
+    corners = indices("texture.faces", texture.faces, len(uv), "places", shelf)
+    count = len(faces.array)
+    shown = texture.shown
+    if len(corners.array) != count or (shown is not None and shown.shape != (count,)):
+        raise ValueError(
+            f"texture.faces came for {len(corners.array)} faces"
+            + ("" if shown is None else f" and texture.shown with the shape {tuple(shown.shape)}")
+            + f"; wanted {count}, since the scene has {count} faces."
+        )
+    if shown is not None and count and not (int(shown.min()) >= -1 and int(shown.max()) < len(images)):
+        raise ValueError(
+            f"texture.shown names the images {int(shown.min())} to {int(shown.max())}; wanted -1 to {len(images) - 1}."
+        )
+    return Texture(tuple(images), uv, texture.faces, shown, texture.wrap, texture.smooth), corners
+
+
+def check_camera(camera: Camera) -> np.ndarray:
+    """Its lens, (fx, fy, cx, cy), float64."""
+    for name, side in (("height", camera.height), ("width", camera.width)):
+        if not 1 <= side <= 2**16:
+            raise ValueError(f"camera.{name} = {side}; wanted 1 to {2**16} pixels.")
+    check_device("camera.rotation", camera.rotation)
+    check_device("camera.translation", camera.translation)
+    rotation, translation = camera.rotation.shape, camera.translation.shape
+    if rotation != (3, 3) or translation != (3,):
+        raise ValueError(
+            f"camera.rotation and camera.translation came with the shapes {tuple(rotation)} and "
+            f"{tuple(translation)}; wanted (3, 3) and (3,)."
+        )
+    lens = [
+        float(number)
+        for part in (camera.focal, camera.principal)
+        for number in (part.tolist() if isinstance(part, Tensor) else part)
+    ]
+    everything = (*lens, *camera.rotation.reshape(-1).tolist(), *camera.translation.tolist())
+    if not all(map(math.isfinite, everything)) or not 0 < camera.near < math.inf or min(lens[:2]) <= 0:
+        raise ValueError(
+            f"camera holds a number that is not finite, or a focal or near that is not above 0: {camera}."
+        )
+    return np.array(lens)

@@ -1,0 +1,166 @@
+"""What a visible face shows at its pixels: colours, textures, normals; compiled functions on arrays of `raster`.
+
+Args:
+    colors: (vertices, channels), or None for white ones.
+    laid: `textures.Laid`, or None.
+    lens: fx, fy, cx, cy, pixels.
+    face: (height, width) int32, the face that each pixel of `box` shows; -1: none.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+
+from plugins.renderer.rasterizer.raster import compiled, edges
+from plugins.renderer.rasterizer.textures import among_texels, mixed, uv_at
+
+
+@compiled
+@no_type_check
+def weights(screen, a, b, c, row, column):
+    """Perspective-correct barycentric weights of a face at a pixel inside it: (w / z) / Σ (w / z)."""
+    edge0, edge1, edge2 = edges(
+        screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1], row, column
+    )
+    part0, part1, part2 = edge0 * screen[a, 2], edge1 * screen[b, 2], edge2 * screen[c, 2]
+    scale = 1.0 / (part0 + part1 + part2)
+    return part0 * scale, part1 * scale, part2 * scale
+
+
+@compiled
+@no_type_check
+def weights_in_space(seen, a, b, c, ray_x, ray_y):
+    """Those of a face with corners behind the camera too: r·(b × c) and so on over their sum (Olano & Greer 1997)."""
+    part0 = volume(seen, b, c, ray_x, ray_y)
+    part1 = volume(seen, c, a, ray_x, ray_y)
+    part2 = volume(seen, a, b, ray_x, ray_y)
+    turn = 1.0 if part0 + part1 + part2 > 0 else -1.0
+    # rounding of corners may leave the pixel a little outside of the face
+    part0, part1, part2 = max(turn * part0, 0.0), max(turn * part1, 0.0), max(turn * part2, 0.0)
+    total = part0 + part1 + part2
+    if not (total > 0 and total < np.inf):  # seen edge-on
+        return 1.0 / 3, 1.0 / 3, 1.0 / 3
+    return part0 / total, part1 / total, part2 / total
+
+
+@compiled
+@no_type_check
+def volume(seen, a, b, ray_x, ray_y):
+    """r · (a × b) of two vertices and a ray (ray_x, ray_y, 1)."""
+    ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
+    bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
+    return ray_x * (ay * bz - az * by) + ray_y * (az * bx - ax * bz) + (ax * by - ay * bx)
+
+
+@compiled
+@no_type_check
+def weights_at(seen, screen, faces, lens, index, row, column):
+    """Barycentric weights of a face at a pixel that shows it."""
+    a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+    if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
+        return weights(screen, a, b, c, row, column)
+    return weights_in_space(seen, a, b, c, (column - lens[2]) / lens[0], (row - lens[3]) / lens[1])
+
+
+@compiled
+@no_type_check
+def light(faces, colors, laid, index, w0, w1, w2, picture, row, column):
+    """Fill a pixel of a picture, (height, width, channels), with what a face shows at barycentric weights."""
+    if colors is None:
+        for channel in range(picture.shape[2]):
+            picture[row, column, channel] = 1.0
+    else:
+        a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+        for channel in range(picture.shape[2]):
+            picture[row, column, channel] = (
+                w0 * colors[a, channel] + w1 * colors[b, channel] + w2 * colors[c, channel]
+            )
+    if laid is not None:
+        tint(laid, index, w0, w1, w2, picture, row, column)
+
+
+@compiled
+@no_type_check
+def tint(laid, index, w0, w1, w2, picture, row, column):
+    """Multiply a pixel by what the texture of a face shows there, if it has one."""
+    if laid.shown[index] < 0:
+        return
+    u, v = uv_at(laid, index, w0, w1, w2)
+    place = among_texels(laid, laid.shown[index], u, v)
+    for channel in range(picture.shape[2]):
+        picture[row, column, channel] *= mixed(laid, place, channel)
+
+
+@compiled
+@no_type_check
+def shade(seen, screen, faces, colors, laid, lens, face, box, color):
+    """Fill `color` (height, width, channel) where a face is seen."""
+    top, bottom, left, right = box
+    for row in range(top, bottom):
+        for column in range(left, right):
+            index = face[row, column]
+            if index < 0:
+                continue
+            # as `weights_at` and `light` do, in place: their calls would take as long again
+            a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+            if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
+                w0, w1, w2 = weights(screen, a, b, c, row, column)
+            else:
+                ray_x, ray_y = (column - lens[2]) / lens[0], (row - lens[3]) / lens[1]
+                w0, w1, w2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
+            if colors is None:
+                for channel in range(color.shape[2]):
+                    color[row, column, channel] = 1.0
+            if colors is not None:
+                for channel in range(color.shape[2]):
+                    color[row, column, channel] = (
+                        w0 * colors[a, channel] + w1 * colors[b, channel] + w2 * colors[c, channel]
+                    )
+            if laid is not None:
+                tint(laid, index, w0, w1, w2, color, row, column)
+
+
+@compiled
+@no_type_check
+def inform(seen, screen, vertices, faces, laid, lens, face, box, normal, barycentric, uv):
+    """Fill those that are not None, (height, width, 3 or 2), where a face is seen."""
+    top, bottom, left, right = box
+    last = -1
+    x = y = z = 0.0
+    for row in range(top, bottom):
+        for column in range(left, right):
+            index = face[row, column]
+            if index < 0:
+                continue
+            if normal is not None:
+                if index != last:
+                    x, y, z = normal_of(vertices, faces, index)
+                    last = index
+                normal[row, column, 0], normal[row, column, 1], normal[row, column, 2] = x, y, z
+            w0, w1, w2 = weights_at(seen, screen, faces, lens, index, row, column)
+            if barycentric is not None:
+                barycentric[row, column, 0] = w0
+                barycentric[row, column, 1] = w1
+                barycentric[row, column, 2] = w2
+            if uv is not None and laid is not None and laid.shown[index] >= 0:
+                uv[row, column, 0], uv[row, column, 1] = uv_at(laid, index, w0, w1, w2)
+
+
+@compiled
+@no_type_check
+def normal_of(vertices, faces, index):
+    """Of length 1, to the side from which a face's corners run counter-clockwise; 0 of one without area."""
+    edge = np.empty((2, 3))
+    for which in range(2):
+        for axis in range(3):
+            start, end = vertices[faces[index, 0], axis], vertices[faces[index, which + 1], axis]
+            edge[which, axis] = np.float64(end) - np.float64(start)
+        largest = np.abs(edge[which]).max()
+        if not (largest > 0 and largest < np.inf):
+            return 0.0, 0.0, 0.0
+        edge[which] /= largest
+    x = edge[0, 1] * edge[1, 2] - edge[0, 2] * edge[1, 1]
+    y = edge[0, 2] * edge[1, 0] - edge[0, 0] * edge[1, 2]
+    z = edge[0, 0] * edge[1, 1] - edge[0, 1] * edge[1, 0]
+    length = np.sqrt(x * x + y * y + z * z)
+    return (x / length, y / length, z / length) if length > 0 else (0.0, 0.0, 0.0)
