@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import ImageColor
 
-from framework.errors import ConfigError, UserError, did_you_mean, quoted, shown
+from framework.errors import ConfigError, DataError, UserError, did_you_mean, quoted, shown
 from framework.geometry.camera import Camera
 from framework.renderer import Report
 from framework.storage.files import unwritable
@@ -180,6 +180,10 @@ def main(arguments: list[str]) -> None:
     subject = read(given.scene)
     for note in subject.notes:
         sys.stderr.write(f"note: {given.scene}: {note}\n")
+    if given.channel == "uv" and subject.scene.texture is None:
+        raise DataError(
+            f"{given.scene}: it has no texture; wanted one for --channel uv. Ask for another channel."
+        )
     up = given.up or subject.up
     around = turntable.ball(subject.scene)
     if given.camera is not None:
@@ -199,10 +203,14 @@ def main(arguments: list[str]) -> None:
     def frames() -> Iterator[NDArray]:
         for place in cameras:
             scene = staged.seen(place)
-            if given.report and not seconds:
-                renderer(scene, (given.channel,))  # the first makes compiled code and buffers
             began = time.perf_counter()
-            drawn = renderer(scene, (given.channel,))[given.channel]
+            try:
+                if given.report and not seconds:  # the first makes compiled code
+                    Rasterizer(supersampling=renderer.supersampling)(scene, (given.channel,))
+                    began = time.perf_counter()
+                drawn = renderer(scene, (given.channel,))[given.channel]
+            except ValueError as error:  # what the renderer cannot draw, in a sentence
+                raise DataError(f"{given.scene}: {error}") from error
             seconds.append(time.perf_counter() - began)
             if given.channel == "color" and not numbers:
                 yield pictures.color(drawn, given.background)

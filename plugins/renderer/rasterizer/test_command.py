@@ -68,6 +68,39 @@ def test_a_cube_shows_the_side_that_the_camera_faces(cube: Path, tmp_path: Path,
         np.testing.assert_allclose(middle, [19.5, 23.5], atol=0.05)
 
 
+@pytest.mark.parametrize("name", ["one.glb", "one.obj"])
+def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str) -> None:
+    """Red and green above, blue and white below, seen from the front: at the middles of texels those are exact."""
+    four = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+    square = trimesh.Trimesh(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
+    )
+    uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    white = trimesh.visual.material.SimpleMaterial(Image.fromarray(four), diffuse=[255] * 4)
+    square.visual = trimesh.visual.TextureVisuals(uv, material=white)
+    square.export(tmp_path / name)
+    out = tmp_path / "seen.png"
+    fov = 2 * math.degrees(math.atan(1 / 5))
+    view = [
+        "--azimuth",
+        "0",
+        "--elevation",
+        "0",
+        "--distance",
+        "5",
+        "--fov",
+        f"{fov}",
+        "--supersampling",
+        "1",
+    ]
+    main(
+        [str(tmp_path / name), *view, "--size", "42x42", "--no-shade", "--out", str(out)]
+    )  # an odd count a texel
+    pixels = np.asarray(Image.open(io.BytesIO(out.read_bytes())), int)
+    found = pixels[[[10, 10], [31, 31]], [[10, 31], [10, 31]]]
+    assert np.abs(found - four).max() <= 1
+
+
 def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
     cube: Path, tmp_path: Path
 ) -> None:
@@ -272,7 +305,8 @@ def test_a_film_is_what_ffmpeg_makes_of_the_frames(
         (["--size", "9999x9999"], "samples. Ask for a smaller --size or --supersampling"),
         (["--turntable", "2.5"], "'2.5' came; wanted a whole number from 2 to 3600"),
         (["--supersampling", "0"], "wanted a whole number from 1 to 16"),
-        (["--channel", "dept"], "wanted one of color, depth, face, mask"),
+        (["--channel", "dept"], "wanted one of barycentric, color, depth, face, mask, normal, uv."),
+        (["--channel", "uv"], "has no texture"),
         (["--channel", "dept"], "Did you mean 'depth'? --help"),
         (["--background", "whit"], "Did you mean 'white'?"),
         (["--azimut", "3"], "Did you mean '--azimuth'?"),
