@@ -19,6 +19,7 @@ from framework.renderer import Report
 from framework.storage.files import unwritable
 from framework.storage.progress import tracked
 from plugins.renderer.rasterizer import pictures, turntable
+from plugins.renderer.rasterizer.parts import Axis
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.scene_files import UPWARDS, read
 
@@ -33,6 +34,8 @@ examples:
   python -m plugins.renderer.rasterizer chair.glb --turntable 60 --out chair.gif
   python -m plugins.renderer.rasterizer chair.glb --camera camera.json --channel depth --out depth.npy
 """
+VIEW = {"azimuth": 30.0, "elevation": 15.0, "tilt": 0.0, "distance": "auto", "fov": 40.0, "size": (480, 640)}
+"""What no camera file says."""
 MOST_SAMPLES = 2**26
 """Of a picture: with colours and depth they take 2 GB."""
 
@@ -67,8 +70,8 @@ def number(
     return parse
 
 
-def distance(text: str) -> float | int | None:
-    return None if text == "auto" else number(1e-6, 1e9, ", metres, or auto")(text)
+def distance(text: str) -> float | int | str:
+    return text if text == "auto" else number(1e-6, 1e9, ", metres, or auto")(text)
 
 
 def size(text: str) -> tuple[int, int]:
@@ -118,24 +121,14 @@ def parser() -> Parser:
     add("scene", type=Path, help=f"a file whose name ends in {', '.join(UPWARDS)}; its textures beside it")
     add("--out", type=Path, help=".png, .gif, .mp4 or .npy; default: outputs/<scene>.png, .gif of a film")
     angle = number(-3600, 3600, " degrees")
-    add(
-        "--azimuth",
-        type=angle,
-        default=30.0,
-        help="degrees around the subject, 0 sees its front; default: 30",
-    )
-    add("--elevation", type=angle, default=15.0, help="degrees above the horizon; default: 15")
-    add("--tilt", type=angle, default=0.0, help="degrees by which the camera rolls; default: 0")
+    add("--azimuth", type=angle, help="degrees around the subject, 0 sees its front; default: 30")
+    add("--elevation", type=angle, help="degrees above the horizon; default: 15")
+    add("--tilt", type=angle, help="degrees by which the camera rolls; default: 0")
     add(
         "--distance", type=distance, help="metres from the subject's centre; default: auto, all of it is seen"
     )
-    add(
-        "--fov",
-        type=number(0.1, 170, " degrees"),
-        default=40.0,
-        help="degrees from top to bottom; default: 40",
-    )
-    add("--size", type=size, default=(480, 640), help="WIDTHxHEIGHT in pixels; default: 640x480")
+    add("--fov", type=number(0.1, 170, " degrees"), help="degrees from top to bottom; default: 40")
+    add("--size", type=size, help="WIDTHxHEIGHT in pixels; default: 640x480")
     add("--up", choices=("y", "z"), help="the subject's vertical axis; default: y, but z of .off and .stl")
     add("--camera", type=Path, help="a file with K, R, t, size instead of the above; see below")
     add("--turntable", type=number(2, 3600, "", kind=int), help="frames of a film once around the subject")
@@ -186,12 +179,7 @@ def main(arguments: list[str]) -> None:
         )
     up = given.up or subject.up
     around = turntable.ball(subject.scene)
-    if given.camera is not None:
-        camera = turntable.read_camera(given.camera)
-    else:
-        angles = math.radians(given.azimuth), math.radians(given.elevation), math.radians(given.tilt)
-        fov = math.radians(given.fov)
-        camera = turntable.looking_at(around, up, angles, given.distance, fov, given.size)
+    camera = chosen_camera(given, around, up)
     check_size(camera, given, out)
     count = given.turntable or 1
     cameras = tracked(turntable.around(camera, around.centre, up, count), "drawing", count, "frames")
@@ -219,6 +207,8 @@ def main(arguments: list[str]) -> None:
 
     with torch.no_grad():
         pictures.write(out, frames(), given.rate)
+    if renderer.report is not None and not renderer.report.drawn:
+        sys.stderr.write(f"note: {given.scene}: no face of it is seen in the last picture.\n")
     if given.report:
         sys.stderr.write(told(renderer.report, seconds))
     sys.stdout.write(f"{out}\n")
@@ -234,6 +224,9 @@ def check(given: argparse.Namespace, out: Path) -> None:
         )
     if out.is_dir():
         raise ConfigError(f"--out {out} is a folder; wanted the name of a file.")
+    twice = [name for name in VIEW if getattr(given, name) is not None]
+    if given.camera is not None and twice:
+        raise ConfigError(f"--{twice[0]} came beside --camera, whose file says it; wanted one of the two.")
     film = suffix in (".gif", ".mp4")
     if film and given.turntable is None:
         raise ConfigError(
@@ -251,6 +244,16 @@ def check(given: argparse.Namespace, out: Path) -> None:
         raise ConfigError(f"--channel {given.channel} came, which pictures do not hold; wanted a .npy.")
     if suffix == ".mp4":
         pictures.encoder()
+
+
+def chosen_camera(given: argparse.Namespace, around: turntable.Ball, up: Axis) -> Camera:
+    if given.camera is not None:
+        return turntable.read_camera(given.camera)
+    chosen = {name: getattr(given, name) for name in VIEW}
+    chosen = {name: VIEW[name] if value is None else value for name, value in chosen.items()}
+    angles = math.radians(chosen["azimuth"]), math.radians(chosen["elevation"]), math.radians(chosen["tilt"])
+    far = None if chosen["distance"] == "auto" else chosen["distance"]
+    return turntable.looking_at(around, up, angles, far, math.radians(chosen["fov"]), chosen["size"])
 
 
 def check_size(camera: Camera, given: argparse.Namespace, out: Path) -> None:

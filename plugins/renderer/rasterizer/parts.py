@@ -23,6 +23,8 @@ GREY = 0.55
 """Light of a surface whose colour its file does not say."""
 MOST_TEXELS = 2**26
 """Of all textures of a scene together: 0.8 GB as light."""
+FARTHEST = 1e30
+"""Coordinates beyond have depths that float32 cannot say."""
 MOST_PARTS = 10_000
 NOWHERE = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
 EDGE = 1e-4
@@ -75,8 +77,8 @@ def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subje
     """Join the parts of a file.
 
     Raises:
-        DataError: there are no faces, a coordinate is not finite, or textures go on beyond their edges in different
-            ways.
+        DataError: there are no faces, a coordinate is not finite or too large, or textures go on beyond their edges
+            in different ways.
     """
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -85,6 +87,8 @@ def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subje
         for what, numbers in (("coordinate", part.vertices), ("place in a texture", part.uv)):
             if numbers is not None and not np.isfinite(numbers).all():
                 raise DataError(f"a {what} is not finite; restore the file from its source.")
+        if np.abs(part.vertices).max() > FARTHEST:
+            raise DataError(f"a coordinate is beyond {FARTHEST:g}; wanted metres. Scale it down.")
     wrap, smooth = _wrap(parts), all(part.smooth for part in parts if part.image is not None)
     scene = joined([_scene(part, wrap, smooth) for part in parts])
     plain = [torch.full((len(part.vertices),), _plain(part)) for part in parts]

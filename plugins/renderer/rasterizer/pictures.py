@@ -48,7 +48,8 @@ class Stage:
         if self.normals is None or scene.colors is None:
             return scene
         place = -(camera.rotation.double().T @ camera.translation.double())
-        towards = torch.nn.functional.normalize(place - scene.vertices, dim=1)
+        towards = place - scene.vertices
+        towards = towards / towards.norm(dim=1, keepdim=True).clamp(min=1e-300)
         cosine = (self.normals * towards).sum(1).abs().float()
         light = torch.where(self.normals.any(1), AMBIENT + (1 - AMBIENT) * cosine, 1.0)
         colors = torch.cat([scene.colors[:, :-1] * light[:, None], scene.colors[:, -1:]], 1)

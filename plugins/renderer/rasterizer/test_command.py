@@ -316,6 +316,7 @@ def test_a_film_is_what_ffmpeg_makes_of_the_frames(
         (["--out", "one.png", "--turntable", "9"], "holds one picture; wanted .gif, .mp4 or .npy"),
         (["--out", "one.gif", "--turntable", "9", "--channel", "depth"], "whose numbers films do not hold"),
         (["--out", "one.gif", "--turntable", "9", "--background", "transparent"], "with colours and a .png alone"),
+        (["--camera", "gone.json", "--fov", "40"], "--fov came beside --camera, whose file says it"),
         (["--camera", "gone.json"], "gone.json: no such file; wanted a camera"),
         (["--camera", "cube.ply"], "wanted a file whose name ends in .json or .yaml"),
     ],
@@ -339,6 +340,31 @@ def test_the_command_says_where_it_wrote_and_its_report_on_request(
     main([str(cube), "--size", "9x9", "--report"])
     said = capsys.readouterr().err
     assert "ms a frame (median of 1)" in said and len(said.splitlines()) <= 2
+
+
+def test_extreme_subjects_are_drawn_or_get_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same picture whatever the size, from where a coordinate's last digits are as large as a pixel."""
+    ball = trimesh.creation.icosphere(2)
+    shown = []
+    for scale, move in ((1.0, 0.0), (1e-20, 0.0), (1e29, 0.0), (1e-3, 1e6), (1e40, 0.0)):
+        vertices = ball.vertices * scale + move
+        lines = [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()] + [
+            f"3 {a} {b} {c}" for a, b, c in ball.faces
+        ]
+        (tmp_path / "ball.off").write_text("\n".join([f"OFF\n{len(vertices)} {len(ball.faces)} 0", *lines]))
+        if scale == 1e40:
+            with pytest.raises(DataError, match=r"ball\.off: a coordinate is beyond 1e\+30"):
+                drawn(tmp_path / "ball.off", tmp_path)
+        else:
+            shown.append(np.asarray(drawn(tmp_path / "ball.off", tmp_path), int))
+    assert len(np.unique(shown[0])) > 20
+    assert all(np.abs(one - shown[0]).max() <= 2 for one in shown)
+    assert "no face" not in capsys.readouterr().err
+    (tmp_path / "flat.off").write_text("OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n")
+    assert len(np.unique(np.asarray(drawn(tmp_path / "flat.off", tmp_path)))) == 1
+    assert "flat.off: no face of it is seen in the last picture." in capsys.readouterr().err
 
 
 def test_as_a_program_it_ends_with_a_sentence_and_no_stack_trace(cube: Path, tmp_path: Path) -> None:
