@@ -171,23 +171,24 @@ def rasterised(
     counts: np.ndarray,
 ) -> Box:
     """Draw all faces, those that the near plane cuts as well, and count what became of them."""
-    faces = view.faces.array
-    if tiles is not None and depth is not None:
-        box = raster.front_to_back(canvas.screen, faces, view.cull, *view.size, depth, face, tiles, counts)
-    else:
-        box = raster.rasterise(
-            canvas.screen, faces, 0, None, view.cull, *view.size, depth, face, mask, None, counts
-        )
-    if canvas.hidden:
+    faces, box = view.faces.array, (view.size[0], 0, view.size[1], 0)
+    cut = 0
+    if canvas.hidden:  # what the near plane cuts is near, and hides what comes later
         corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
         if len(parts):
-            some = np.zeros_like(counts)
-            arrays = (depth, face, mask, None, some)
-            cut = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays)
-            counts[raster.DRAWN] += some[raster.DRAWN]
-            counts[raster.BEHIND] -= some[raster.DRAWN]
-            box = (min(box[0], cut[0]), max(box[1], cut[1]), min(box[2], cut[2]), max(box[3], cut[3]))
-    return box
+            arrays = (depth, face, mask, tiles, counts)
+            box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays)
+            cut = int(counts[raster.DRAWN])
+            counts.fill(0)
+    if tiles is not None and depth is not None:
+        all_of_it = (canvas.screen, faces, view.cull, *view.size, depth, face, tiles, counts)
+        rest = raster.front_to_back(*all_of_it)
+    else:
+        arrays = (depth, face, mask, None, counts)
+        rest = raster.rasterise(canvas.screen, faces, 0, None, view.cull, *view.size, *arrays)
+    counts[raster.DRAWN] += cut
+    counts[raster.BEHIND] -= cut
+    return (min(box[0], rest[0]), max(box[1], rest[1]), min(box[2], rest[2]), max(box[3], rest[3]))
 
 
 def fill(

@@ -1,0 +1,272 @@
+"""What is left out changes no bit of a picture, and the report of it is true, against brute force."""
+
+import copy
+import gc
+import itertools
+import pickle
+import tracemalloc
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.geometry.camera import Camera, look_from
+from framework.renderer import Scene, Texture, joined
+from plugins.renderer.rasterizer.drawing import Saving
+from plugins.renderer.rasterizer.renderer import Rasterizer
+from plugins.renderer.rasterizer.test_gradient import blob
+
+SAVINGS = get_args(Saving)
+EVERY = ("color", "depth", "face", "mask", "normal", "barycentric", "uv")
+
+
+def seen(distance: float = 4.0, size: tuple[int, int] = (60, 70), azimuth: float = 0.4) -> Camera:
+    return look_from(azimuth, 0.2, 0.1, distance, 0.6, size)
+
+
+def crowd(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
+    """Bodies before and behind one another, some out of view or through the near plane; one has a texture."""
+    vertices, faces, colors = blob(8)
+    subjects = []
+    for number in range(count):
+        place = torch.tensor(random.uniform(-1.5, 1.5, 3) * random.choice([0.5, 1, 3]))
+        subject = Scene((vertices + place).float(), faces, colors.float(), camera)
+        if number == 1:
+            image = torch.tensor(random.uniform(0, 1, (4, 5, 3)), dtype=torch.float32)
+            uv = torch.tensor(random.uniform(0, 1, (len(vertices), 2)), dtype=torch.float32)
+            subject = replace(subject, texture=Texture((image,), uv, faces))
+        subjects.append(subject)
+    return joined(subjects)
+
+
+def alike(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@settings(deadline=None, max_examples=15, derandomize=True)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_savings_change_no_bit(seed: int, cull: bool) -> None:
+    random = np.random.default_rng(seed)
+    scene = crowd(seen(float(random.uniform(0.3, 6))), random)
+    plain = Rasterizer(cull=cull, savings=())(scene, EVERY)
+    for count in range(1, len(SAVINGS) + 1):
+        for chosen in itertools.combinations(SAVINGS, count):
+            renderer = Rasterizer(cull=cull, savings=chosen)
+            assert alike(plain, renderer(scene, EVERY)), chosen
+            assert alike(plain, renderer(scene, EVERY)), (chosen, "again")
+            mask = renderer(scene, ("mask",))["mask"]
+            assert torch.equal(mask, plain["mask"]), chosen
+
+
+@settings(deadline=None, max_examples=15, derandomize=True)
+@given(st.integers(0, 2**32 - 1))
+def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int) -> None:
+    """Scenes that change in one part at a time, in place and past torch's own count of changes too."""
+    random = np.random.default_rng(seed)
+    renderer = Rasterizer(savings=SAVINGS)
+    scene = crowd(seen(), random)
+    for _ in range(12):
+        change = random.integers(8)
+        if change == 0:
+            scene = crowd(seen(), random, int(random.integers(1, 4)))
+        elif change == 1:
+            scene.vertices.numpy()[random.integers(len(scene.vertices))] += 0.3
+        elif change == 2:
+            scene.faces.numpy()[random.integers(len(scene.faces))] = 0
+        elif change == 3:
+            scene.colors.data.mul_(0.9)  # type: ignore[union-attr]
+        elif change == 4:
+            scene = replace(scene, camera=seen(azimuth=float(random.uniform(0, 6))))
+        elif change == 5:
+            scene = replace(scene, camera=replace(scene.camera, height=int(random.integers(1, 90))))
+        elif change == 6:
+            scene = replace(scene, camera=replace(scene.camera, near=float(random.uniform(0.1, 4))))
+        else:
+            renderer.cull = not renderer.cull
+        channels = [name for name in EVERY if random.random() < 0.4]
+        new = Rasterizer(cull=renderer.cull, savings=())
+        got = renderer(scene, channels)
+        assert alike(got, new(scene, channels)), (change, channels)
+        for picture in got.values():
+            picture.numpy()[...] = 7  # they are the caller's
+
+
+def test_what_did_not_change_is_not_computed_again() -> None:
+    scene = crowd(seen(), np.random.default_rng(0))
+    renderer = Rasterizer()
+    renderer(scene, ("color",))
+    assert renderer.report is not None and renderer.report.reused == frozenset()
+    first = renderer.report
+    renderer(scene, ("depth",))
+    assert renderer.report is not None and renderer.report.reused == {"places", "faces"}
+    assert (renderer.report.left_out, renderer.report.drawn) == (first.left_out, first.drawn)
+    renderer(replace(scene, faces=scene.faces.flip(0)), ("depth",))
+    assert renderer.report.reused == {"places"}
+    renderer(replace(scene, vertices=scene.vertices + 1e-6), ("depth",))
+    assert renderer.report.reused == frozenset()
+    again = Rasterizer(savings=("view", "box", "hidden"))
+    for _ in range(2):
+        again(scene, ("color",))
+        assert again.report is not None and again.report.reused == frozenset()
+
+
+def by_hand(scene: Scene, cull: bool) -> dict[str, int]:
+    """What becomes of the faces of a scene in front of the near plane, one by one."""
+    camera = scene.camera
+    pixels, depth = camera.projected(scene.vertices.double())
+    assert (depth >= camera.near).all()
+    corner = (pixels * 256).round().numpy()[scene.faces.numpy()]
+    counts = {"flat": 0, "back": 0, "outside": 0, "drawn": 0}
+    for a, b, c in corner:
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+        low = np.maximum(np.ceil(np.min([a, b, c], 0) / 256), 0)
+        high = np.minimum(np.floor(np.max([a, b, c], 0) / 256), [camera.width - 1, camera.height - 1])
+        if area == 0:
+            counts["flat"] += 1
+        elif cull and area > 0:
+            counts["back"] += 1
+        elif (low > high).any():
+            counts["outside"] += 1
+        else:
+            counts["drawn"] += 1
+    return counts
+
+
+@pytest.mark.parametrize("cull", [False, True])
+@pytest.mark.parametrize("shift", [0.0, 0.8, 3.0])
+def test_the_report_is_what_brute_force_counts(cull: bool, shift: float) -> None:
+    vertices, faces, colors = blob(12)
+    degenerate = torch.cat([faces, faces[:5, [0, 0, 1]]])
+    camera = replace(seen(), rotation=seen().rotation.double(), translation=seen().translation.double())
+    scene = Scene(vertices + torch.tensor([shift, 0, 0]), degenerate, colors, camera)
+    renderer = Rasterizer(cull=cull, savings=("box",))
+    for channels in (("color",), ("mask",), ("color", "depth", "face")):
+        picture = renderer(scene, channels)
+        report = renderer.report
+        assert report is not None
+        wanted = by_hand(scene, cull)
+        assert report.faces == len(degenerate) == sum(wanted.values())
+        assert report.drawn == wanted.pop("drawn")
+        assert dict(report.left_out) == {name: count for name, count in wanted.items() if count}
+        assert report.channels == set(channels) and report.visited <= 60 * 70
+        rows, columns = np.nonzero(picture[channels[0]].reshape(60, 70, -1).numpy().any(-1))
+        if channels != ("color", "depth", "face") and len(rows):
+            assert report.visited >= (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
+
+
+def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
+    vertices, faces, colors = blob(12)
+    scene = Scene(vertices, faces, colors, seen())
+    renderer = Rasterizer(savings=SAVINGS)
+    renderer(replace(scene, vertices=vertices + 50))
+    report = renderer.report
+    assert report is not None and dict(report.left_out) == {"outside": len(faces)} and report.visited == 0
+    renderer(replace(scene, camera=replace(scene.camera, near=8.0)), ("mask",))
+    assert renderer.report is not None and dict(renderer.report.left_out) == {"outside": len(faces)}
+    no_view = Rasterizer(savings=())
+    no_view(replace(scene, camera=replace(scene.camera, near=8.0)), ("mask",))
+    assert no_view.report is not None and dict(no_view.report.left_out) == {"behind": len(faces)}
+    half = Rasterizer()
+    half(replace(scene, camera=replace(scene.camera, near=4.0)), ("mask",))
+    assert half.report is not None and 0 < half.report.left_out["behind"] < len(faces)
+    corners = torch.tensor([[-4.0, -4, 2], [4, -4, 2], [4, 4, 2], [-4, 4, 2]]).double()
+    wall = (corners - scene.camera.translation) @ scene.camera.rotation.double()
+    before = Scene(wall, torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.rand(4, 3).double(), scene.camera)
+    both = joined([scene, before])
+    close = Rasterizer(savings=SAVINGS)
+    picture = close(both, ("color", "face"))
+    assert alike(picture, Rasterizer(savings=())(both, ("color", "face")))
+    assert (picture["face"] >= len(faces)).all()
+    assert close.report is not None and close.report.left_out["hidden"] > 0.8 * len(faces)
+    floor = torch.tensor([[-90.0, -90, -1.5], [90, -90, -1.5], [90, 90, -1.5], [-90, 90, -1.5]]).double()
+    under = joined([scene, replace(before, vertices=floor), replace(before, vertices=floor + 0.01)])
+    assert alike(
+        close(under, ("face",)), Rasterizer(savings=())(under, ("face",))
+    )  # what the near plane cuts
+
+
+def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
+    """Several views before one backward pass, as in fitting to many cameras, give the sum of their gradients."""
+    vertices, faces, colors = blob(8)
+    views = [seen(azimuth=azimuth) for azimuth in (0.1, 1.7, 3.1, 4.4)]
+
+    def slope(renderer: Rasterizer, cameras: list[Camera]) -> torch.Tensor:
+        learned = vertices.clone().requires_grad_()
+        pictures = [renderer(Scene(learned, faces, colors, camera))["color"] for camera in cameras]
+        renderer(Scene(vertices + 1, faces, colors, views[0]))
+        loss = torch.stack([picture.square().sum() for picture in pictures]).sum()
+        return torch.autograd.grad(loss, learned)[0]
+
+    renderer = Rasterizer()
+    together = slope(renderer, views)
+    apart = torch.stack([slope(Rasterizer(), [camera]) for camera in views]).sum(0)
+    assert torch.allclose(together, apart, rtol=1e-12)
+    sides = renderer.batch([Scene(vertices, faces, colors, camera) for camera in views], ("color",))
+    assert all(
+        alike(one, renderer(Scene(vertices, faces, colors, camera)))
+        for one, camera in zip(sides, views, strict=True)
+    )
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
+    """Of different sizes and meshes, with gradients, and without where none are wanted."""
+    random = np.random.default_rng(1)
+    scenes = [
+        crowd(seen(size=(int(random.integers(1, 80)), int(random.integers(1, 80)))), random, 2)
+        for _ in range(9)
+    ]
+    learned = [scene.vertices.clone().requires_grad_() for scene in scenes]
+    given = [replace(scene, vertices=vertices) for scene, vertices in zip(scenes, learned, strict=True)]
+    renderer, before = Rasterizer(), torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        found = renderer.batch(given, ("color", "depth"))
+        with torch.no_grad():
+            assert not any(picture["color"].requires_grad for picture in renderer.batch(given))
+        assert renderer.batch([]) == []
+    finally:
+        torch.set_num_threads(before)
+    for picture, scene, vertices in zip(found, given, learned, strict=True):
+        alone = Rasterizer()(scene, ("color", "depth"))
+        assert alike(picture, alone)
+        one, other = (
+            torch.autograd.grad(drawn["color"].square().sum(), vertices)[0] for drawn in (picture, alone)
+        )
+        assert torch.equal(one, other)
+
+
+def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
+    """Whether gradients are asked for or not; and nothing is kept when pictures are gone."""
+    vertices, faces, colors = blob(40)
+    scene = Scene(vertices, faces, colors, seen(size=(300, 300)))
+    renderer = Rasterizer(cull=True)
+    own = 300 * 300 * 3 * 4
+    for number in range(3):
+        renderer(replace(scene, vertices=vertices + 0.01 * number))
+    tracemalloc.start()
+    for number in range(3, 8):
+        moved = replace(scene, vertices=vertices + 0.01 * number)
+        tracemalloc.reset_peak()
+        start = tracemalloc.get_traced_memory()[0]
+        renderer(moved)
+        assert tracemalloc.get_traced_memory()[1] - start < own + 50_000
+    tracemalloc.stop()
+    learned = vertices.clone().requires_grad_()
+    for _ in range(20):
+        renderer(replace(scene, vertices=learned))["color"].sum().backward()
+    gc.collect()
+    assert len(renderer._pool) <= 2
+    assert not [thing for thing in gc.get_objects() if type(thing).__name__ == "PictureBackward"]
+
+
+def test_a_renderer_can_be_copied_and_sent_to_another_process() -> None:
+    scene = crowd(seen(), np.random.default_rng(0))
+    renderer = Rasterizer()
+    picture = renderer(scene, EVERY)
+    for other in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer))):
+        assert alike(other(scene, EVERY), picture)

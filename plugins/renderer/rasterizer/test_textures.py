@@ -1,0 +1,151 @@
+"""Textures against torch's own sampling, and what faces say of themselves against one another."""
+
+import itertools
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from framework.geometry.camera import look_from
+from framework.renderer import Scene, Texture, Wrap, joined
+from plugins.renderer.rasterizer.renderer import Rasterizer
+from plugins.renderer.rasterizer.test_gradient import blob, camera
+
+
+def covered(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bool = True) -> Scene:
+    """A round body with a small image on it, several times; corners share vertices, but not places in the image."""
+    vertices, faces, colors = blob(10)
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(5, 7, colors.shape[1], generator=generator, dtype=torch.float64).to(kind)
+    places = torch.arange(3 * len(faces)).reshape(-1, 3)
+    uv = 1.5 * vertices[faces].reshape(-1, 3)[:, :2].to(kind) + 0.3
+    uv = uv + 0.02 * torch.rand(uv.shape, generator=generator).to(kind)
+    texture = Texture((image,), uv, places, wrap=wrap, smooth=smooth)
+    return Scene(vertices, faces, None, camera(), texture)
+
+
+def sampled(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
+    """Bilinear samples at places (row, column, 2) in [-1, 2] by torch."""
+    if wrap == "repeat":  # five copies each way, the middle one from 0 to 1
+        image, uv, wrap = image.repeat(5, 5, 1), (uv + 2) / 5, "clamp"
+    grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], -1)
+    mode = {"clamp": "border", "mirror": "reflection"}[wrap]
+    found = grid_sample(image.movedim(-1, 0)[None], grid[None], padding_mode=mode, align_corners=False)
+    return found[0].movedim(0, -1)
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+@pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
+def test_colours_and_slopes_are_those_of_sampling_at_the_places_that_faces_show(
+    wrap: Wrap, kind: torch.dtype
+) -> None:
+    scene = covered(kind, wrap)
+    assert scene.texture is not None
+    image, uv = scene.texture.images[0].clone().requires_grad_(), scene.texture.uv.clone().requires_grad_()
+    learned = replace(scene, texture=replace(scene.texture, images=(image,), uv=uv))
+    found = Rasterizer(gradient="interior")(learned, ("color", "barycentric", "face", "uv", "mask"))
+    face, mask = found["face"].long(), found["mask"]
+    weights = found["barycentric"].double()
+    again, places = image.detach().clone().requires_grad_(), uv.detach().clone().requires_grad_()
+    place = (weights[..., None] * places[scene.texture.faces[face.clamp(min=0)]]).sum(-2)
+    assert (place.detach() - found["uv"])[mask].abs().max() < 1e-6
+    wanted = sampled(again.double(), place.double(), wrap) * mask[..., None]
+    assert (found["color"] - wanted).abs().max() < 3e-6
+    slope = torch.randn(found["color"].shape, generator=torch.Generator().manual_seed(2))
+    got = torch.autograd.grad((found["color"] * slope).sum(), (image, uv))
+    expected = torch.autograd.grad((wanted * slope).sum(), (again, places))
+    # slopes are those of corners that are not rounded to 1/256 pixel: a place may then lie beyond a texel's middle,
+    # where the slope in it jumps
+    for one, other, limit in zip(got, expected, (1e-3, 0.03), strict=True):
+        assert one.dtype == kind
+        assert (one - other).norm() < limit * other.norm()
+
+
+def test_the_texel_that_a_place_lies_in_is_shown_where_it_is_not_smooth() -> None:
+    scene = covered(smooth=False)
+    assert scene.texture is not None
+    found = Rasterizer()(scene, ("color", "uv", "mask"))
+    image = scene.texture.images[0]
+    place = found["uv"].double()
+    column, row = (place[..., 0] * 7).floor() % 7, ((1 - place[..., 1]) * 5).floor() % 5
+    wanted = image[row.long(), column.long()] * found["mask"][..., None]
+    near = ((place * torch.tensor([7, 5]) - (place * torch.tensor([7, 5])).round()).abs() < 1e-4).any(-1)
+    assert torch.equal(found["color"][~near], wanted[~near].float())
+    assert near[found["mask"]].float().mean() < 0.01
+
+
+def test_joined_subjects_show_what_each_shows_alone() -> None:
+    """Textured, coloured, both, none of them; each image its own, whatever stands before it."""
+    textured = covered()
+    assert textured.texture is not None
+    vertices, faces, colors = blob(10)
+    right, down = torch.tensor([0.9, 0.0, 0.0]), torch.tensor([0.0, 0.0, -0.9])
+    small = torch.rand(2, 3, colors.shape[1], generator=torch.Generator().manual_seed(3)).double()
+    other = replace(textured, texture=replace(textured.texture, images=(small,)), vertices=vertices + right)
+    plain = Scene(vertices + down, faces, colors, camera())
+    both = replace(other, vertices=vertices + down + right, colors=colors)
+    subjects = [textured, other, plain, both]
+    wide = look_from(0.3, 0.2, 0.1, distance=9.0, field_of_view=0.6, size=(70, 90))
+    subjects = [replace(subject, camera=wide) for subject in subjects]
+    renderer = Rasterizer()
+    whole = renderer(joined(subjects), ("color", "face", "uv"))
+    seen = 0
+    for number, subject in enumerate(subjects):
+        alone = renderer(subject, ("color", "face", "uv"))
+        low, high = number * len(faces), (number + 1) * len(faces)
+        here = (whole["face"] >= low) & (whole["face"] < high)
+        seen += int(here.sum())
+        assert here.sum() > 100
+        for name in ("color", "uv"):
+            assert torch.equal(whole[name][here], alone[name][here])
+    assert seen == (whole["face"] >= 0).sum()
+
+
+@pytest.mark.parametrize(("colored", "textured"), list(itertools.product([False, True], repeat=2))[1:])
+def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None:
+    vertices, faces, colors = blob(4)
+    plain = Scene(vertices, faces, colors if colored else None, camera())
+    scene = joined([plain, replace(plain, texture=covered().texture if textured else None), plain])
+    assert len(scene.vertices) == 3 * len(vertices) and scene.faces.max() == 3 * len(vertices) - 1
+    assert (scene.colors is not None) == colored and (scene.texture is not None) == textured
+    if scene.texture is not None:
+        assert scene.texture.shown is not None and set(scene.texture.shown.tolist()) == {-1, 0}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"images": ()}, "without images"),
+        ({"images": (torch.zeros(0, 4, 3),)}, "shape (0, 4, 3)"),
+        ({"images": (torch.zeros(2, 2, 3), torch.zeros(2, 2, 1))}, "shape (2, 2, 1)"),
+        ({"images": (torch.zeros(2, 2, 3, dtype=torch.uint8),)}, "torch.uint8; wanted floating point"),
+        ({"uv": torch.full((30, 2), torch.nan)}, "not finite"),
+        ({"uv": torch.full((30, 2), 1e9)}, "beyond 1e+06"),
+        ({"uv": torch.zeros(30, 3)}, "shape (30, 3)"),
+        ({"faces": torch.full((4, 3), 99)}, "99 to 99; wanted 0 to 29"),
+        ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, "came for 5 faces"),
+        ({"shown": torch.zeros(3, dtype=torch.int64)}, "shown with the shape (3,)"),
+        ({"shown": torch.full((4,), 1)}, "images 1 to 1; wanted -1 to 0"),
+        ({"wrap": "around"}, "'around'; wanted one of repeat"),
+    ],
+)
+def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
+    change: dict[str, object], sentence: str
+) -> None:
+    corners = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
+    faces = torch.arange(12).reshape(4, 3)
+    texture = Texture((torch.rand(2, 2, 3),), torch.rand(30, 2), faces)
+    for name, value in change.items():
+        object.__setattr__(texture, name, value)  # past the type checks that only tests have
+    with pytest.raises(ValueError) as caught:
+        Rasterizer()(Scene(corners, faces, None, camera(), texture))
+    assert sentence in str(caught.value)
+
+
+def test_the_blended_picture_refuses_textures() -> None:
+    with pytest.raises(ValueError, match="gradient=soft blends colours per vertex"):
+        Rasterizer(gradient="soft")(covered())
+    assert Rasterizer(gradient="soft")(covered(), ("mask", "uv"))["mask"].any()
+    assert "texture" not in Rasterizer(gradient="soft").differentiable
