@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import save as to_safetensors
 
 from benchmarks import crafted_files as crafted
+from benchmarks import crafted_scenes
 from benchmarks import damaged_files as whole
 from benchmarks.damage import Reader, spoilt
 from benchmarks.damaged_files import (
@@ -42,6 +43,8 @@ from plugins.data.images_with_angles.table import read_table
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.pascal3d import layout
 from plugins.encoder.inception_resnet_v2.weights import read_weights
+from plugins.renderer.rasterizer import sample_scenes as scenes
+from plugins.renderer.rasterizer import scene_files, turntable
 
 warnings.simplefilter("ignore")  # of what libraries say of damage
 
@@ -82,6 +85,7 @@ def records(file: Path) -> object:
 def readers() -> Iterator[Reader]:
     """In the order of the report."""
     yield from clouds()
+    yield from subjects()
     yield from tables_and_images()
     yield from labels()
     yield from models()
@@ -111,6 +115,36 @@ def clouds() -> Iterator[Reader]:
         [in_zip],
         [*crafted.npz("points")],
     )
+
+
+def subjects() -> Iterator[Reader]:
+    """What a command draws, and the files beside it."""
+    square = scenes.quad()
+    camera = b'{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "R": [[1,0,0], [0,1,0], [0,0,1]], "t": [0,0,2], "size": [9, 9]}'
+    made = [*crafted_scenes.crafted()]
+    glb, gltf = scenes.glb(*square), scenes.gltf(*square)
+    yield Reader("GLB, scenes", "one.glb", [glb], scene_files.read, [crafted_scenes.in_glb], made)
+    yield Reader("GLTF, scenes", "one.gltf", [gltf], scene_files.read, [crafted_scenes.in_gltf])
+    yield Reader("OBJ, scenes", "scene/one.obj", [scenes.OBJ], materials)
+    yield Reader("MTL", "scene/one.mtl", [scenes.MTL], materials, crafted=crafted_scenes.MTLS)
+    yield Reader(
+        "PNG, textures",
+        "scene/one.png",
+        [image("PNG"), image("JPEG")],
+        materials,
+        [in_png],
+        [*crafted.images()],
+    )
+    yield Reader("JSON, cameras", "camera.json", [camera], turntable.read_camera)
+
+
+def materials(file: Path) -> object:
+    """An OBJ file with what it names, one of which is damaged."""
+    whole = {".obj": scenes.OBJ, ".mtl": scenes.MTL, ".png": image("PNG")}
+    for suffix, content in whole.items():
+        if suffix != file.suffix and not file.with_suffix(suffix).exists():
+            file.with_suffix(suffix).write_bytes(content)
+    return scene_files.read(file.with_suffix(".obj"))
 
 
 def tables_and_images() -> Iterator[Reader]:

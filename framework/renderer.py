@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import ClassVar, Literal
 
 import torch
@@ -89,7 +90,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
     if not scenes:
         raise ValueError("no scene came; wanted one or more to join.")
     counts = [len(scene.vertices) for scene in scenes]
-    first = [sum(counts[:index]) for index in range(len(scenes))]
+    first = accumulate(counts[:-1], initial=0)
     faces = [scene.faces + start for scene, start in zip(scenes, first, strict=True)]
     colors = None
     if any(scene.colors is not None for scene in scenes):

@@ -1,0 +1,170 @@
+"""A glTF 2.0 document (Khronos, 2021): its description, and the numbers and files that it refers to.
+
+What a number of the file names is looked for within bounds, and nothing is made larger than the file's size allows: it
+may be damaged, or a stranger's.
+"""
+
+import base64
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from framework.errors import quoted
+from framework.storage.reading import guarded, read_bytes, room
+from plugins.renderer.rasterizer.parts import Pictures, beside
+
+NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+@dataclass
+class Document:
+    """A file's description and what it refers to."""
+
+    content: dict[str, Any]
+    folder: Path
+    binary: bytes | None
+    size: int
+    buffers: dict[int, bytes] = field(default_factory=dict)
+    pictures: Pictures = field(default_factory=Pictures)
+    notes: list[str] = field(default_factory=list)
+
+    def item(self, kind: str, number: Any) -> dict[str, Any]:
+        """Number `number` of a kind of things: "meshes".
+
+        Raises:
+            ValueError: there is none.
+        """
+        items = self.content.get(kind, [])
+        if not isinstance(number, int) or not 0 <= number < len(items):
+            raise ValueError(f"it names number {quoted(number)} of its {kind}, of which it has {len(items)}")
+        return items[number]
+
+    def buffer(self, number: int) -> bytes:
+        if number not in self.buffers:
+            described = self.item("buffers", number)
+            if "uri" in described:
+                self.buffers[number] = self.referred(described["uri"])
+            elif number == 0 and self.binary is not None:
+                self.buffers[number] = self.binary
+            else:
+                raise ValueError(f"its buffer {number} is nowhere")
+        return self.buffers[number]
+
+    def referred(self, address: str) -> bytes:
+        """What a data: address holds, or a file beside this one."""
+        if address.startswith("data:"):
+            head, _, body = address.partition(",")
+            if not head.endswith(";base64"):
+                raise ValueError(f"it holds data as {quoted(head[-20:])}; wanted base64")
+            return base64.b64decode(body, validate=True)
+        file = beside(self.folder, unquote(address))
+        with guarded(file, "a part of a glTF file"):
+            found = read_bytes(file)
+        self.size += len(found)
+        return found
+
+    def view(self, number: Any) -> tuple[bytes | memoryview, int]:
+        """The bytes of a buffer view, and how far apart its elements are (0: close together)."""
+        described = self.item("bufferViews", number)
+        buffer = self.buffer(whole(described["buffer"]))
+        first, length = whole(described.get("byteOffset", 0)), whole(described["byteLength"])
+        if first + length > len(buffer):
+            raise ValueError(
+                f"its buffer has {len(buffer)} bytes, of which {first + length} are asked; it is cut short"
+            )
+        return memoryview(buffer)[first : first + length], whole(described.get("byteStride", 0))
+
+    def numbers(self, number: Any, width: int, *, shares: bool = False) -> NDArray:
+        """What an accessor stands for, (count, width): whole numbers as they are, or float64.
+
+        Args:
+            shares: whole numbers stand for shares of the largest one, whether the accessor says so or not.
+        """
+        described = self.item("accessors", number)
+        if WIDTHS.get(described["type"]) != width:
+            raise ValueError(f"wanted {width} numbers each, got {quoted(described['type'])}")
+        count, kind = whole(described["count"]), np.dtype(NUMBERS[described["componentType"]])
+        self.bounded(count * width * 8)
+        found = np.zeros((count, width), kind)
+        if "bufferView" in described:
+            found = self._elements(described["bufferView"], described, count, width, kind).copy()
+        if "sparse" in described:
+            sparse = described["sparse"]
+            changed, places = whole(sparse["count"]), sparse["indices"]
+            order = np.dtype(NUMBERS[places["componentType"]])
+            rows = self._elements(places["bufferView"], places, changed, 1, order)[:, 0]
+            found[rows] = self._elements(
+                sparse["values"]["bufferView"], sparse["values"], changed, width, kind
+            )
+        if kind.kind == "f":
+            return found.astype(np.float64)
+        if shares or described.get(
+            "normalized"
+        ):  # section 3.11 "Animations", equations of normalized integers
+            return np.maximum(found.astype(np.float64) / np.iinfo(kind).max, -1)
+        return found
+
+    def _elements(
+        self, view: Any, described: dict[str, Any], count: int, width: int, kind: np.dtype
+    ) -> NDArray:
+        content, apart = self.view(view)
+        first, size = whole(described.get("byteOffset", 0)), width * kind.itemsize
+        apart = apart or size
+        if apart < size or (count and first + (count - 1) * apart + size > len(content)):
+            raise ValueError(
+                f"{count} elements were announced, but there are {len(content)} bytes; it is cut short"
+            )
+        return np.ndarray((count, width), kind, content, first, (apart, kind.itemsize))
+
+    def bounded(self, needed: int) -> None:
+        """Raises: ValueError: so many bytes are more than a file of this size may become."""
+        if needed > room(self.size):
+            raise ValueError(f"{self.size} bytes would become {needed}; it repeats itself, or is damaged")
+
+
+def opened(file: Path) -> Document:
+    content = read_bytes(file)
+    size, binary = len(content), None
+    if content[:4] == b"glTF":
+        first, binary = _chunks(content)
+        content = first
+    elif file.suffix.lower() == ".glb":
+        raise ValueError("wanted glTF in its first bytes")
+    described = json.loads(content)
+    if not isinstance(described, dict):
+        raise ValueError(f"it holds {type(described).__name__}")
+    return Document(described, file.parent, binary, size)
+
+
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """The description and the binary part of a .glb (section 4.4)."""
+    version, length = (int.from_bytes(content[place : place + 4], "little") for place in (4, 8))
+    if version != 2 or length > len(content):
+        raise ValueError(
+            f"its header announces version {version} and {length} bytes, but it has {len(content)}; wanted version 2, "
+            "whole"
+        )
+    found: dict[bytes, bytes] = {}
+    place = 12
+    while place + 8 <= length:
+        size = int.from_bytes(content[place : place + 4], "little")
+        kind = content[place + 4 : place + 8]
+        if place + 8 + size > length:
+            raise ValueError("a part of it goes on beyond its end")
+        found.setdefault(kind, content[place + 8 : place + 8 + size])
+        place += 8 + size
+    if b"JSON" not in found:
+        raise ValueError("it has no description")
+    return found[b"JSON"], found.get(b"BIN\0")
+
+
+def whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"wanted a whole number from 0, got {quoted(value)}")
+    return value

@@ -1,0 +1,175 @@
+"""Reads what Wavefront OBJ files say of colours: places in textures, and the materials of an MTL file beside them."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from framework.errors import DataError, quoted, shown
+from framework.geometry import mesh_files
+from framework.geometry.mesh_files import text_lines
+from framework.renderer import Wrap
+from framework.storage.reading import guarded, read_bytes
+from plugins.renderer.rasterizer.parts import Part, Pictures, beside
+
+MOST_MATERIALS = 10_000
+OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
+"""Options of a texture that do not change where it lies or what it repeats, and how many words follow each."""
+
+
+@dataclass
+class Material:
+    """Attributes:
+    color: linear; None where none is said. What is written is taken for light, as Blender writes it.
+    texture: a file beside the MTL file.
+    wrap: beyond the texture's edges.
+    """
+
+    color: Float[np.ndarray, "3"] | None = None
+    texture: Path | None = None
+    wrap: Wrap = "repeat"
+
+
+@dataclass
+class Corners:
+    """What stands beside the vertices of an OBJ's faces.
+
+    Attributes:
+        uv: places in textures, u to the right, v upwards.
+        rows: of `uv`, a row per triangle; -1 where a corner has none.
+        materials: the name of each triangle's, "" for none.
+        libraries: files with materials.
+    """
+
+    uv: Float[np.ndarray, "places 2"]
+    rows: Int[np.ndarray, "faces 3"]
+    materials: list[str]
+    libraries: list[str] = field(default_factory=list)
+
+
+def parts(file: Path, content: bytes, mesh: Part, pictures: Pictures, notes: list[str]) -> list[Part]:
+    """The mesh of an OBJ file, whose content was read, cut by its materials.
+
+    Raises:
+        DataError: a file that it names lies elsewhere, or is damaged. One that is missing is noted alone.
+        ValueError: a face names a place that is not there.
+    """
+    corners = _corners(content)
+    known: dict[str, Material] = {}
+    for name in corners.libraries:
+        library = beside(file.parent, name)
+        if library.exists():
+            known |= _materials(library)
+        else:
+            notes.append(f"its materials {shown(name)} are not beside it: drawn without.")
+    names = list(dict.fromkeys(corners.materials))
+    if len(names) > MOST_MATERIALS:
+        raise DataError(f"it has {len(names)} materials; wanted at most {MOST_MATERIALS}.")
+    number = {name: place for place, name in enumerate(names)}
+    of_faces = np.array([number[name] for name in corners.materials], np.int64)
+    order = np.argsort(of_faces, kind="stable")
+    edges = np.searchsorted(of_faces[order], np.arange(len(names) + 1))
+    found = []
+    for place, name in enumerate(names):
+        rows = order[edges[place] : edges[place + 1]]
+        found.append(_part(mesh, rows, corners, known.get(name, Material()), pictures, notes))
+    return found
+
+
+def _part(
+    mesh: Part,
+    rows: Int[np.ndarray, "chosen"],
+    corners: Corners,
+    material: Material,
+    pictures: Pictures,
+    notes: list[str],
+) -> Part:
+    used, faces = np.unique(mesh.faces[rows], return_inverse=True)
+    vertices, faces = mesh.vertices[used], faces.reshape(-1, 3)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    if material.color is not None:
+        colors = np.tile(material.color, (len(used), 1)) * (1 if colors is None else colors)
+    places = corners.rows[rows]
+    if material.texture is None or not material.texture.is_file():
+        if material.texture is not None:
+            notes.append(f"its texture {shown(material.texture.name)} is not beside it: drawn without.")
+        return Part(vertices, faces, colors)
+    if (places < 0).any():
+        notes.append("a part with a texture says no places in it, and is drawn without.")
+        return Part(vertices, faces, colors)
+    image = pictures.known(material.texture)
+    if image is None:
+        with guarded(material.texture, "a texture"):
+            content = read_bytes(material.texture)
+        image = pictures.decode(material.texture, content, str(material.texture))
+    own, places = np.unique(places, return_inverse=True)
+    wraps = material.wrap, material.wrap
+    return Part(vertices, faces, colors, image, corners.uv[own], places.reshape(-1, 3), wraps)
+
+
+def _corners(content: bytes) -> Corners:
+    points, words, counts, before, materials, libraries = [], [], [], [], [], []
+    material = ""
+    for line in text_lines(re.sub(rb"\\[ \t]*\r?\n", b" ", content)):
+        key, *rest = line.split()
+        if key == b"vt":
+            points.append(b" ".join([*rest, b"0"][:2]))  # v is 0 where only u is said
+        elif key == b"f":
+            words += [word.partition(b"/")[2].partition(b"/")[0] or b"0" for word in rest]
+            counts.append(len(rest))
+            before.append(len(points))
+            materials.append(material)
+        elif key == b"usemtl":
+            material = b" ".join(rest).decode("utf-8", "replace")
+        elif key == b"mtllib":
+            libraries.append(b" ".join(rest).decode("utf-8", "replace"))
+    uv = mesh_files.rows(points, "place in a texture", 2)
+    places = mesh_files.numbers(words, np.int64)
+    sizes = np.array(counts, np.int64)
+    places = np.where(places < 0, places + np.repeat(np.array(before, np.int64), sizes), places - 1)
+    if places.size and not (places.min() >= -1 and places.max() < len(uv)):
+        raise ValueError(
+            f"a face names place {places.max() + 1} in a texture, but there are only 1 to {len(uv)}"
+        )
+    triangles = mesh_files.fans(sizes, places)
+    repeated = np.repeat(np.arange(len(sizes)), sizes - 2)
+    return Corners(
+        uv, triangles, [materials[face] for face in repeated.tolist()], list(dict.fromkeys(libraries))
+    )
+
+
+def _materials(library: Path) -> dict[str, Material]:
+    """The colours (Kd) and textures (map_Kd) of an MTL file, by name."""
+    found: dict[str, Material] = {}
+    with guarded(library, "an MTL file"):
+        current = Material()
+        for line in text_lines(read_bytes(library)):
+            key, *rest = line.split(None, 1)
+            said = rest[0].strip() if rest else b""
+            if key == b"newmtl":
+                current = found.setdefault(said.decode("utf-8", "replace"), Material())
+            elif key == b"Kd":
+                color = mesh_files.rows([said], "colour Kd", 3)[0]
+                if not np.isfinite(color).all():
+                    raise ValueError(f"its colour Kd is {color.tolist()}; wanted three numbers from 0 to 1")
+                current.color = color
+            elif key == b"map_Kd":
+                _texture(current, said.decode("utf-8", "replace").split(" "), library.parent)
+    return found
+
+
+def _texture(material: Material, words: list[str], folder: Path) -> None:
+    while words and words[0].startswith("-"):
+        if words[0] == "-clamp" and len(words) > 1:
+            material.wrap = "clamp" if words[1] == "on" else "repeat"
+            words = words[2:]
+        elif words[0] in OPTIONS:
+            words = words[1 + OPTIONS[words[0]] :]
+        else:
+            raise ValueError(
+                f"its texture has the option {quoted(words[0])}, which is not understood; save it without"
+            )
+    if words:
+        material.texture = beside(folder, " ".join(words).strip())

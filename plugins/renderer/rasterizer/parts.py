@@ -1,0 +1,204 @@
+"""Pieces of a scene as files hold them, and how they become one scene."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image
+from torch import Tensor
+
+from framework.datasets.images import FORMATS, LONGEST_SIDE
+from framework.errors import DataError, quoted
+from framework.geometry.camera import look_from
+from framework.geometry.light import linear
+from framework.renderer import Scene, Texture, Wrap, joined
+
+Axis = Literal["y", "z"]
+GREY = 0.55
+"""Light of a surface whose colour its file does not say."""
+MOST_TEXELS = 2**26
+"""Of all textures of a scene together: 0.8 GB as light."""
+FARTHEST = 1e30
+"""Coordinates beyond have depths that float32 cannot say."""
+MOST_PARTS = 10_000
+NOWHERE = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
+EDGE = 1e-4
+"""Places in a texture that lie so little beyond its edge are rounding, and need no rule of what lies there."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Triangles of one material.
+
+    Attributes:
+        vertices: metres, or what unit the file has.
+        faces: rows of `vertices`, counter-clockwise seen from outside.
+        colors: linear in [0, 1], multiplied with the texture's; None where the file says none.
+        image: the texture, linear in [0, 1], rows from top to bottom.
+        uv: places in it, u to the right, v upwards.
+        corners: rows of `uv` per face; None: those of `vertices`.
+        wraps: what lies beyond the image's edges along u and v.
+        smooth: interpolate between its texels.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    colors: Float[np.ndarray, "vertices 3"] | None = None
+    image: Float[Tensor, "height width 3"] | None = None
+    uv: Float[np.ndarray, "places 2"] | None = None
+    corners: Int[np.ndarray, "faces 3"] | None = None
+    wraps: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    smooth: bool = True
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a file shows.
+
+    Attributes:
+        scene: in the file's own axes and unit; its camera means nothing.
+        plain: vertices of parts that have one colour and no texture: only light shows their form.
+        up: the axis that points upwards where the file's format has a custom.
+        notes: what the file has and the scene has not, a sentence each.
+    """
+
+    scene: Scene
+    plain: Bool[Tensor, "vertices"]
+    up: Axis
+    notes: tuple[str, ...] = ()
+
+
+def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subject:
+    """Join the parts of a file.
+
+    Raises:
+        DataError: there are no faces, a coordinate is not finite or too large, or textures go on beyond their edges
+            in different ways.
+    """
+    parts = [part for part in parts if len(part.faces)]
+    if not parts:
+        raise DataError("it has no faces, only points or lines; wanted a surface. Make a mesh of them first.")
+    for part in parts:
+        for what, numbers in (("coordinate", part.vertices), ("place in a texture", part.uv)):
+            if numbers is not None and not np.isfinite(numbers).all():
+                raise DataError(f"a {what} is not finite; restore the file from its source.")
+        if np.abs(part.vertices).max() > FARTHEST:
+            raise DataError(f"a coordinate is beyond {FARTHEST:g}; wanted metres. Scale it down.")
+    wrap, smooth = _wrap(parts), all(part.smooth for part in parts if part.image is not None)
+    scene = joined([_scene(part, wrap, smooth) for part in parts])
+    plain = [torch.full((len(part.vertices),), _plain(part)) for part in parts]
+    return Subject(scene, torch.cat(plain), up, tuple(dict.fromkeys(notes)))
+
+
+def _scene(part: Part, wrap: Wrap, smooth: bool) -> Scene:
+    light = 1.0 if part.image is not None else GREY
+    colors = np.full_like(part.vertices, light) if part.colors is None else part.colors.clip(0, 1)
+    texture = None
+    if part.image is not None and part.uv is not None:
+        corners = part.faces if part.corners is None else part.corners
+        texture = Texture(
+            (part.image,),
+            torch.tensor(part.uv).float(),
+            torch.tensor(corners.copy()),
+            wrap=wrap,
+            smooth=smooth,
+        )
+    return Scene(
+        torch.tensor(part.vertices),
+        torch.tensor(part.faces.copy()),  # a view may run backwards
+        torch.tensor(colors).float(),
+        NOWHERE,
+        texture,
+    )
+
+
+def _plain(part: Part) -> bool:
+    return part.image is None and (part.colors is None or bool((part.colors == part.colors[0]).all()))
+
+
+def _wrap(parts: Sequence[Part]) -> Wrap:
+    """What lies beyond the edges of all textures: a scene has one rule. Only parts that reach beyond need theirs."""
+    named: set[Wrap] = set()
+    needed: set[Wrap] = set()
+    for part in parts:
+        if part.uv is None or part.image is None:
+            continue
+        places = part.uv[np.unique(part.faces if part.corners is None else part.corners)]
+        beyond = np.any((places < -EDGE) | (places > 1 + EDGE), axis=0)
+        named.update(part.wraps)
+        needed.update(wrap for wrap, reaches in zip(part.wraps, beyond, strict=True) if reaches)
+    if len(needed) > 1:
+        raise DataError(
+            f"its textures go on beyond their edges in different ways ({', '.join(sorted(needed))}); wanted one way "
+            "in a scene. Change the samplers, or draw the parts apart."
+        )
+    return next(iter(needed or named)) if len(needed or named) == 1 else "clamp"
+
+
+class Pictures:
+    """Decodes the textures of one file, each once, within a bound on all of them together."""
+
+    def __init__(self) -> None:
+        self._decoded: dict[object, Float[Tensor, "height width 3"]] = {}
+        self._left = MOST_TEXELS
+
+    def known(self, key: object) -> Float[Tensor, "height width 3"] | None:
+        return self._decoded.get(key)
+
+    def decode(self, key: object, content: bytes, name: str) -> Float[Tensor, "height width 3"]:
+        """Light of an image file's content, rows from top to bottom; transparency is ignored.
+
+        Raises:
+            DataError: it is no image, or too large.
+        """
+        try:
+            with Image.open(BytesIO(content), formats=FORMATS) as image:
+                self._left -= image.width * image.height
+                if self._left < 0 or max(image.size) > LONGEST_SIDE:
+                    raise DataError(
+                        f"the texture {name} has {image.width} x {image.height} pixels; wanted up to {LONGEST_SIDE} "
+                        f"along a side, and {MOST_TEXELS} of all textures together. Make it smaller."
+                    )
+                plain = image.convert("RGBA") if "transparency" in image.info else image
+                pixels = np.asarray(plain.convert("RGB"))
+        except DataError:
+            raise
+        except Exception as error:
+            raise DataError(
+                f"the texture {name} cannot be read as an image ({type(error).__name__}). Restore it."
+            ) from error
+        self._decoded[key] = torch.from_numpy(_light(pixels))
+        return self._decoded[key]
+
+
+def _light(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    known = linear(torch.arange(256, dtype=torch.uint8)).numpy()
+    found = np.empty(pixels.size, np.float32)
+    for first in range(0, pixels.size, 2**20):  # the whole picture as an index would take twice its memory
+        found[first : first + 2**20] = known[pixels.reshape(-1)[first : first + 2**20]]
+    return found.reshape(pixels.shape)
+
+
+def beside(folder: Path, name: str) -> Path:
+    """The file that another one in `folder` names; none but those in the same folder, and below it, are read.
+
+    Raises:
+        DataError: it is an address, or lies elsewhere.
+    """
+    plain = name.replace("\\", "/")
+    try:
+        found = (folder / plain).resolve()
+        found.exists()  # raises where there can be no file of this name
+        inside = ":" not in plain and found.is_relative_to(folder.resolve())
+    except (OSError, ValueError):
+        inside = False
+    if not plain or not inside:
+        raise DataError(
+            f"it names {quoted(name)}; wanted a file in its own folder, since others are not read. Copy it there."
+        )
+    return folder / plain

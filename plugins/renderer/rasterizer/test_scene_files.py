@@ -1,0 +1,460 @@
+"""Scenes from files against trimesh, against formulas written out, and against each other."""
+
+import json
+import os
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from framework.errors import DataError
+from framework.renderer import Scene
+from plugins.renderer.rasterizer import parts
+from plugins.renderer.rasterizer.sample_scenes import (
+    MTL,
+    OBJ,
+    ORDER,
+    PLACES,
+    UV,
+    described,
+    glb,
+    packed,
+    png,
+    quad,
+)
+from plugins.renderer.rasterizer.scene_files import UPWARDS, read
+
+FOUR = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+"""Red and green above, blue and white below."""
+REAL = os.environ.get("REAL_DATA_ROOT")
+
+
+def light(stored: NDArray) -> NDArray:
+    """Of 8-bit sRGB (IEC 61966-2-1), as written there."""
+    share = stored / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def part(image: bytes | None = None, **changes: Any) -> tuple[dict[str, Any], list[NDArray | bytes]]:
+    """A square of one node and one material, from (0, 0) to (1, 1), its texture upright; `changes` to its material."""
+    content: dict[str, Any] = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}
+        ],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, **changes}}],
+        "textures": [{"source": 0}],
+        "images": [{"bufferView": 3}],
+    }
+    return content, [PLACES, UV, ORDER, image or png(FOUR)]
+
+
+def written(
+    folder: Path,
+    content: dict[str, Any],
+    arrays: list[NDArray | bytes],
+    name: str = "one.glb",
+    change: Callable[[dict[str, Any]], object] = lambda _: None,
+) -> Path:
+    """A .glb, or a .gltf with one file beside it; `change` is made to the whole description."""
+    whole, binary = described(content, arrays)
+    file = folder / name
+    if name.endswith(".gltf"):
+        whole["buffers"][0]["uri"] = "one%20part.bin"
+        (folder / "one part.bin").write_bytes(binary)
+    change(whole)
+    text = json.dumps(whole).encode()
+    file.write_bytes(packed(text, binary) if name.endswith(".glb") else text)
+    return file
+
+
+def texel(scene: Scene, face: int, corner: int, inwards: float = 0.1) -> NDArray:
+    """The texture's nearest texel a little inside of a face's corner, by the contract: u right, v upwards."""
+    texture = scene.texture
+    assert texture is not None
+    places = texture.uv[texture.faces[face]].numpy()
+    u, v = places[corner] + inwards * (places.mean(0) - places[corner])
+    image = texture.images[0 if texture.shown is None else int(texture.shown[face])].numpy()
+    height, width = image.shape[:2]
+    return image[int((1 - v) * height), int(u * width)]
+
+
+@pytest.mark.parametrize("name", ["one.glb", "one.gltf"])
+def test_a_texture_stands_upright(tmp_path: Path, name: str) -> None:
+    scene = read(written(tmp_path, *part(), name=name)).scene
+    wanted = {(0, 0): FOUR[1, 0], (1, 0): FOUR[1, 1], (1, 1): FOUR[0, 1], (0, 1): FOUR[0, 0]}
+    for face, corner in product(range(2), range(3)):
+        x, y, _ = scene.vertices[scene.faces[face, corner]].int().tolist()
+        np.testing.assert_allclose(texel(scene, face, corner), light(wanted[x, y]), atol=1e-6)
+    assert scene.texture is not None
+    reference = trimesh.load(written(tmp_path, *part(), name="two.glb"), force="mesh", process=False)
+    np.testing.assert_allclose(scene.texture.uv, reference.visual.uv, atol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "kind"), [*product([3, 4], ["<f4", "u1", "<u2"])])
+def test_colours_are_multiplied_in_linear_light(tmp_path: Path, width: int, kind: str) -> None:
+    shares = np.array([[0.1, 0.5, 1, 1], [1, 0, 0.25, 0], [0.6, 0.7, 0.8, 1], [0, 0, 0, 1]])[:, :width]
+    full = 1 if kind == "<f4" else np.iinfo(kind).max
+    stored = (shares * full).astype(kind)
+    content, arrays = part(baseColorFactor=[0.5, 0.25, 1, 1])
+    content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 3
+    content["images"] = [{"bufferView": 4}]
+    found = read(written(tmp_path, content, [*arrays[:3], stored, arrays[3]]))
+    assert found.scene.colors is not None and found.scene.texture is not None and not found.plain.any()
+    np.testing.assert_allclose(found.scene.colors, stored[:, :3] / full * [0.5, 0.25, 1], atol=1e-6)
+    np.testing.assert_allclose(found.scene.texture.images[0], light(FOUR), atol=1e-6)
+
+
+def test_what_has_no_colour_is_grey_and_what_has_one_is_lit_alike(tmp_path: Path) -> None:
+    content, arrays = part()
+    del content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    for factor, wanted in ((None, [parts.GREY] * 3), ([0.1, 0.2, 0.3, 0.5], [0.1, 0.2, 0.3])):
+        if factor:
+            content["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = factor
+        found = read(written(tmp_path, content, arrays))
+        assert found.plain.all() and found.scene.texture is None and found.scene.colors is not None
+        np.testing.assert_allclose(found.scene.colors, np.tile(wanted, (4, 1)), atol=1e-6)
+
+
+def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
+    """Trees of turned, stretched and mirrored nodes: corners, and on which side faces show."""
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        nodes: list[dict[str, Any]] = []
+        for number in range(6):
+            turn = random.normal(size=4)
+            moves = {
+                "rotation": (turn / np.linalg.norm(turn)).tolist(),
+                "translation": random.normal(size=3).tolist(),
+            }
+            moves["scale"] = (random.uniform(0.5, 2, 3) * random.choice([-1, 1], 3)).tolist()
+            matrix = trimesh.transformations.random_rotation_matrix(random.random(3)) * [1, 2, -1, 1]
+            nodes.append({"mesh": 0, **(moves if number % 2 else {"matrix": matrix.T.ravel().tolist()})})
+            if number:
+                nodes[int(random.integers(number))].setdefault("children", []).append(number)
+        content, arrays = part()
+        file = written(tmp_path, {**content, "nodes": nodes}, arrays)
+        scene, reference = read(file).scene, trimesh.load(file, force="mesh", process=False)
+        ours = scene.vertices[scene.faces].numpy()
+        theirs = reference.vertices[reference.faces]
+        areas = [
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            for corners in (ours, theirs)
+        ]
+        found, wanted = (
+            np.concatenate([corners.mean(1), area], 1)
+            for corners, area in zip((ours, theirs), areas, strict=True)
+        )
+        np.testing.assert_allclose(np.sort(found, 0), np.sort(wanted, 0), atol=1e-5)
+        distance = np.linalg.norm(found[:, None] - wanted, axis=2)
+        assert (distance.min(0) < 1e-5).all() and (distance.min(1) < 1e-5).all()
+
+
+@pytest.mark.parametrize(("mode", "order"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
+def test_strips_and_fans_are_the_triangles_that_they_stand_for(
+    tmp_path: Path, mode: int, order: list[int]
+) -> None:
+    """All face z. Their vertices are interleaved with places in the texture, and one is said anew (sparse)."""
+    content, arrays = part()
+    content["meshes"][0]["primitives"][0]["mode"] = mode
+    content["images"] = [{"bufferView": 2}]
+    rows, values = {"bufferView": 3, "componentType": 5121}, {"bufferView": 4}
+    numbers = {"bufferView": 0, "componentType": 5126, "count": 4}
+    content["accessors"] = [
+        {**numbers, "type": "VEC3", "sparse": {"count": 1, "indices": rows, "values": values}},
+        {**numbers, "type": "VEC2", "byteOffset": 12},
+    ]
+    mixed = np.concatenate([PLACES, UV], 1).tobytes()
+    moved = np.array([5, 5, 0], "<f4").tobytes()
+    given = [mixed, np.array(order, "<u2"), arrays[3], b"\2", moved]
+    scene = read(
+        written(tmp_path, content, given, change=lambda whole: whole["bufferViews"][0].update(byteStride=20))
+    ).scene
+    corners = scene.vertices[scene.faces]
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
+    assert (area > 0).all()
+    assert float(area.sum()) == 5.0  # a kite: (0, 0), (1, 0), (5, 5), (0, 1)
+    assert scene.texture is not None
+    np.testing.assert_allclose(scene.texture.uv, np.stack([UV[:, 0], 1 - UV[:, 1]], 1))
+
+
+def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    inverse, weights = random.normal(size=(2, 4, 4)), random.uniform(0.1, 1, (4, 4))
+    inverse[:, 3] = [0, 0, 0, 1]
+    weights[:, 2:] = 0
+    weights /= weights.sum(1, keepdims=True)
+    joints = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [1, 1, 0, 0]], "u1")
+    content, arrays = part()
+    content["meshes"][0]["primitives"][0]["attributes"] |= {"JOINTS_0": 3, "WEIGHTS_0": 4}
+    content["nodes"] = [
+        {"mesh": 0, "skin": 0, "translation": [9, 9, 9]},
+        {"translation": [1, 2, 3], "children": [2]},
+        {"scale": [1, 2, 1], "rotation": [0, 0, 0.6, 0.8]},
+    ]
+    content["scenes"] = [{"nodes": [0, 1]}]
+    content["skins"] = [{"joints": [2, 1], "inverseBindMatrices": 5}]
+    content["images"] = [{"bufferView": 6}]
+    stored = inverse.transpose(0, 2, 1).reshape(2, 16).astype("<f4")
+    found = read(written(tmp_path, content, [*arrays[:3], joints, weights.astype("<f4"), stored, arrays[3]]))
+    assert found.notes == ("it is shown in its rest pose.",)
+    first, second = np.eye(4), np.eye(4)
+    first[:3, 3] = [1, 2, 3]
+    cos, sin = 0.8**2 - 0.6**2, 2 * 0.6 * 0.8  # half the angle stands in the file
+    second[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.diag([1, 2, 1])
+    places = [first @ second, first]
+    for vertex in range(4):
+        point = np.append(PLACES[vertex], 1)
+        wanted = sum(
+            weights[vertex, k] * (places[joints[vertex, k]] @ inverse[joints[vertex, k]] @ point)
+            for k in range(4)
+        )
+        np.testing.assert_allclose(found.scene.vertices[vertex], wanted[:3], atol=1e-5)
+
+
+def test_a_texture_may_be_moved_turned_and_scaled(tmp_path: Path) -> None:
+    """Counter-clockwise as one looks at the image, whose v runs downwards: from right to up, which is -v."""
+    content, arrays = part()
+    moved = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [2, 3]}
+    content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["extensions"] = {
+        "KHR_texture_transform": moved
+    }
+    texture = read(written(tmp_path, content, arrays)).scene.texture
+    assert texture is not None
+    u, v = UV.T
+    downwards = np.stack([0.25 + 3 * v, 0.5 - 2 * u], 1)  # (2u, 0) becomes (0, -2u), (0, 3v) becomes (3v, 0)
+    np.testing.assert_allclose(texture.uv, np.stack([downwards[:, 0], 1 - downwards[:, 1]], 1), atol=1e-6)
+
+
+NUMBERS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
+
+
+@pytest.mark.parametrize(
+    ("samplers", "reach", "wanted"),
+    [
+        (["repeat"], 3, "repeat"),
+        (["clamp"], 3, "clamp"),
+        (["mirror"], 1, "mirror"),
+        (["mirror", "clamp"], 1, "clamp"),
+        ([None, "clamp"], 1, "clamp"),
+        ([None], 1, "repeat"),
+        (["mirror", "clamp"], 3, None),
+    ],
+)
+def test_what_lies_beyond_a_texture_is_told(
+    tmp_path: Path, samplers: list[str | None], reach: int, wanted: str | None
+) -> None:
+    """One rule for a scene; what stays inside needs none."""
+    content, arrays = part()
+    content["textures"], content["samplers"], content["materials"], content["meshes"] = [], [], [], []
+    content["nodes"] = [{"mesh": number, "translation": [number, 0, 0]} for number in range(len(samplers))]
+    content["scenes"] = [{"nodes": [*range(len(samplers))]}]
+    for number, name in enumerate(samplers):
+        attributes = {"POSITION": 0, "TEXCOORD_0": 1}
+        content["meshes"].append(
+            {"primitives": [{"attributes": attributes, "indices": 2, "material": number}]}
+        )
+        content["materials"].append({"pbrMetallicRoughness": {"baseColorTexture": {"index": number}}})
+        content["textures"].append(
+            {"source": 0, **({} if name is None else {"sampler": len(content["samplers"])})}
+        )
+        if name is not None:
+            content["samplers"].append({"wrapS": NUMBERS[name], "wrapT": NUMBERS[name], "magFilter": 9728})
+    file = written(tmp_path, content, [PLACES, (reach * UV).astype("<f4"), ORDER, arrays[3]])
+    if wanted is None:
+        with pytest.raises(
+            DataError, match=r"one\.glb: its textures go on .*\(clamp, mirror\); wanted one way"
+        ):
+            read(file)
+        return
+    texture = read(file).scene.texture
+    assert texture is not None and texture.wrap == wanted
+    assert texture.smooth == (None in samplers and len(samplers) == 1)
+    assert len(texture.images) == len(samplers) and texture.shown is not None
+    assert texture.shown.tolist() == [number for number in range(len(samplers)) for _ in range(2)]
+
+
+def test_the_same_mesh_as_obj_and_glb_is_the_same_scene(tmp_path: Path) -> None:
+    """As trimesh writes both: corners, places in the texture, light."""
+    mesh = trimesh.creation.box((1, 2, 3))
+    mesh.unmerge_vertices()
+    uv = np.random.default_rng(2).uniform(0, 1, (len(mesh.vertices), 2))
+    mesh.visual = trimesh.visual.TextureVisuals(uv, image=Image.fromarray(FOUR))
+    mesh.export(tmp_path / "one.glb")
+    mesh.export(tmp_path / "one.obj")
+    shapes = []
+    for name in ("one.glb", "one.obj"):
+        scene = read(tmp_path / name).scene
+        assert scene.texture is not None and scene.colors is not None
+        np.testing.assert_allclose(scene.texture.images[0], light(FOUR), atol=1e-6)
+        corners = [scene.vertices[scene.faces], scene.texture.uv[scene.texture.faces]]
+        shapes.append(torch.cat([*(values.flatten(1).double() for values in corners)], 1))
+    np.testing.assert_allclose(shapes[0].sort(0).values, shapes[1].sort(0).values, atol=1e-5)
+
+
+def test_an_obj_has_the_colours_of_its_materials(tmp_path: Path) -> None:
+    """Cut by material, relative indices, a place in the texture per corner; a missing file is noted, and no more."""
+    (tmp_path / "one.obj").write_bytes(OBJ)
+    without = read(tmp_path / "one.obj")
+    assert without.scene.texture is None and len(without.notes) == 1 and "one.mtl" in without.notes[0]
+    (tmp_path / "one.mtl").write_bytes(MTL.replace(b"-clamp on ", b""))
+    assert "one.png" in read(tmp_path / "one.obj").notes[0]
+    (tmp_path / "one.png").write_bytes(png(FOUR))
+    found = read(tmp_path / "one.obj")
+    scene = found.scene
+    assert not found.notes and scene.texture is not None and scene.colors is not None
+    stored = light(np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]))
+    for face, factor in ((0, [1, 0, 0]), (1, [0, 0, 1])):
+        for corner in range(3):
+            place = scene.vertices[scene.faces[face, corner]][:2].int().tolist()
+            vertex = [[0, 0], [1, 0], [1, 1], [0, 1]].index(place)
+            np.testing.assert_allclose(
+                scene.colors[scene.faces[face, corner]], stored[vertex] * factor, atol=1e-6
+            )
+            np.testing.assert_allclose(
+                texel(scene, face, corner), light(FOUR[1 - place[1], place[0]]), atol=1e-6
+            )
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_ply_colours_are_light_and_its_texture_is_found(tmp_path: Path, binary: bool) -> None:
+    colors = np.array([[255, 128, 0, 255], [12, 55, 99, 255], [1, 2, 3, 255], [200, 100, 50, 255]], np.uint8)
+    mesh = trimesh.Trimesh(PLACES, ORDER.reshape(2, 3), vertex_colors=colors, process=False)
+    mesh.export(tmp_path / "one.ply", encoding="binary" if binary else "ascii")
+    found = read(tmp_path / "one.ply")
+    assert found.scene.colors is not None and not found.plain.any() and found.up == "y"
+    np.testing.assert_allclose(found.scene.colors, light(colors[:, :3]), atol=1e-6)
+    head = "ply\nformat ascii 1.0\ncomment TextureFile one.png\nelement vertex 4\n"
+    head += "".join(f"property float {name}\n" for name in "xyzst") + "element face 2\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    rows = "".join(f"{x} {y} {z} {x} {y}\n" for x, y, z in PLACES.tolist()) + "3 0 1 2\n3 0 2 3\n"
+    (tmp_path / "two.ply").write_text(head + rows)
+    assert "one.png is not beside it" in read(tmp_path / "two.ply").notes[0]
+    (tmp_path / "one.png").write_bytes(png(FOUR))
+    scene = read(tmp_path / "two.ply").scene
+    np.testing.assert_allclose(texel(scene, 0, 0), light(FOUR[1, 0]), atol=1e-6)
+    np.testing.assert_allclose(texel(scene, 1, 2), light(FOUR[0, 0]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["../one.png", "/etc/hostname", "http://localhost/x.png", "sub/../../one.png", "link"]
+)
+def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "inner"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "one.png").write_bytes(png(FOUR))
+    (folder / "link").symlink_to(tmp_path / "one.png")
+    content, arrays = part()
+    content["images"] = [{"uri": name}]
+    made = [written(folder, content, arrays)]
+    (folder / "one.obj").write_bytes(OBJ)
+    (folder / "one.mtl").write_bytes(b"newmtl red\nmap_Kd " + name.encode())
+    head = f"ply\nformat ascii 1.0\ncomment TextureFile {name}\nelement vertex 3\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyzst") + "element face 1\n"
+    head += (
+        "property list uchar int vertex_indices\nend_header\n" + "0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
+    )
+    (folder / "one.ply").write_text(head)
+    for file in (*made, folder / "one.obj", folder / "one.ply"):
+        with pytest.raises(DataError, match=r"inner.*it names .*; wanted a file in its own folder"):
+            read(file)
+    (folder / "sub" / "one.png").write_bytes(png(FOUR))
+    content["images"] = [{"uri": "sub/one.png"}]
+    assert read(written(folder, content, arrays)).scene.texture is not None
+
+
+def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content, arrays = part()
+    file = written(tmp_path, content, arrays)
+    monkeypatch.setattr(parts, "MOST_TEXELS", 3)
+    with pytest.raises(
+        DataError, match=r"one\.glb: the texture 0 has 2 x 2 pixels; wanted .* Make it smaller"
+    ):
+        read(file)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda whole: whole.update(extensionsRequired=["KHR_draco_mesh_compression"]), "it needs KHR_draco"),
+        (lambda whole: whole["asset"].update(version="1.0"), "it is of version '1.0'; wanted 2.0"),
+        (lambda whole: whole["meshes"][0]["primitives"][0].update(mode=0), "it has no faces, only points"),
+        (lambda whole: whole["nodes"][0].update(children=[0]), "its node 0 stands in two places"),
+        (
+            lambda whole: whole["nodes"][0].update(mesh=7),
+            "it names number 7 of its meshes, of which it has 1",
+        ),
+        (lambda whole: whole["nodes"][0].update(translation=[1e400, 0, 0]), "a coordinate is not finite"),
+        (lambda whole: whole["accessors"][0].update(count=10**9), "it repeats itself, or is damaged"),
+        (lambda whole: whole["accessors"][0].update(count=3), "names vertex 3, but there are only 0 to 2"),
+        (lambda whole: whole["accessors"][0].pop("count"), "'count' is missing"),
+        (lambda whole: whole["bufferViews"][0].update(byteLength=10**9), "it is cut short"),
+        (lambda whole: whole["textures"][0].update(source=-1), "it names number -1 of its images"),
+    ],
+)
+def test_a_bad_gltf_gets_its_sentence(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], sentence: str
+) -> None:
+    for name in ("one.glb", "one.gltf"):
+        file = written(tmp_path, *part(), name=name, change=change)
+        with pytest.raises(DataError) as caught:
+            read(file)
+        assert str(caught.value).startswith(f"{file}: ") and sentence in str(caught.value)
+
+
+def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
+    """Cut anywhere, a .glb is never taken for a whole one. `benchmarks/fuzz.py` damages files in other ways."""
+    whole = glb(*quad())
+    file = tmp_path / "one.glb"
+    for end in range(0, len(whole), 29):
+        file.write_bytes(whole[:end])
+        with pytest.raises(DataError, match=r"one\.glb: "):
+            read(file)
+
+
+def test_what_cannot_be_a_scene_gets_its_sentence(tmp_path: Path) -> None:
+    (tmp_path / "chair.glb").mkdir()
+    (tmp_path / "points.ply").write_bytes(trimesh.PointCloud(PLACES).export(file_type="ply"))
+    for name, sentence in (
+        ("chiar.glb", "no such file; wanted a scene. Mend the path. Did you mean 'chair.glb'?"),
+        ("chair.glb", "is a folder; wanted a file whose name ends in .glb, .gltf"),
+        (
+            "chair.gbl",
+            "wanted a file whose name ends in .glb, .gltf, .obj, .off, .ply, .stl. Did you mean '.glb'?",
+        ),
+        ("points.ply", "it has no faces, only points or lines; wanted a surface"),
+    ):
+        with pytest.raises(DataError) as caught:
+            read(tmp_path / name)
+        assert sentence in str(caught.value) and str(tmp_path / name) in str(caught.value)
+
+
+@pytest.mark.skipif(not REAL, reason="REAL_DATA_ROOT is not set")
+def test_real_files_are_read_as_trimesh_reads_them() -> None:
+    assert REAL
+    man = Path(REAL, "bodies", "CesiumMan.glb")
+    scene, reference = read(man).scene, trimesh.load(man, force="mesh", process=False)
+    ours, theirs = scene.vertices[scene.faces].numpy(), reference.vertices[reference.faces]
+    np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    assert scene.texture is not None
+    wanted = reference.visual.uv[reference.faces]
+    np.testing.assert_allclose(scene.texture.uv[scene.texture.faces], wanted, atol=1e-6)
+    for file in sorted(Path(REAL, "meshes").iterdir()):
+        if file.suffix.lower() not in UPWARDS:
+            continue
+        try:
+            scene = read(file).scene
+        except DataError as error:
+            assert str(file) in str(error)
+            continue
+        reference = trimesh.load(file, force="mesh", process=False)
+        ours, theirs = scene.vertices[scene.faces].mean(1), reference.vertices[reference.faces].mean(1)
+        np.testing.assert_allclose(ours.sort(0).values, np.sort(theirs, 0), atol=1e-5)
