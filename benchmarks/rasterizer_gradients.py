@@ -22,7 +22,7 @@ from benchmarks.rasterizer import scene as figure_scene
 from framework.configuration.schema import build, resolve
 from framework.renderer import Renderer
 from framework.reports.tradeoff_picture import error_against_run_time
-from plugins.renderer.rasterizer.test_gradient import VIEWS, blob, parameters, scene
+from plugins.renderer.rasterizer.test_gradient import KINDS, VIEWS, blob, parameters, scene
 
 HERE = Path(__file__)
 SIGMAS = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -35,51 +35,58 @@ METHODS = {
 }
 STEP = 2e-3  # of the differences, in units of the parameters
 BODY = blob()
-KINDS = tuple(parameters())
+PARTS = (False, True)
+"""The body with colours, and with a texture."""
 
 
 def renderer(**config: object) -> Renderer:
     return build("renderer", resolve("renderer", {"name": "rasterizer", **config}))
 
 
-def loss(drawing: Renderer, by: dict[str, Tensor], azimuth: float, target: Tensor) -> Tensor:
-    return (drawing(scene(by, azimuth, BODY))["color"].double() - target).square().sum()
+def loss(
+    drawing: Renderer, by: dict[str, Tensor], azimuth: float, target: Tensor, textured: bool = False
+) -> Tensor:
+    return (drawing(scene(by, azimuth, BODY, textured))["color"].double() - target).square().sum()
 
 
-def targets(finest: Renderer) -> list[Tensor]:
-    """The picture of another pose, in each view."""
+def targets(finest: Renderer) -> list[list[Tensor]]:
+    """Pictures of another pose, in each view, with colours and with a texture."""
     found = []
     for view, azimuth in enumerate(VIEWS):
         torch.manual_seed(view)
         off = {name: 0.05 * torch.randn_like(value.detach()) for name, value in parameters().items()}
-        found.append(finest(scene(off, azimuth, BODY))["color"].double())
+        found.append([finest(scene(off, azimuth, BODY, textured))["color"].double() for textured in PARTS])
     return found
 
 
-def differences(finest: Renderer, aims: list[Tensor]) -> dict[str, np.ndarray]:
+def differences(finest: Renderer, aims: list[list[Tensor]]) -> dict[str, np.ndarray]:
     """Central differences of the finest picture's squared error, in every parameter of every view."""
-    found: dict[str, list[float]] = {name: [] for name in KINDS}
-    for azimuth, target in zip(VIEWS, aims, strict=True):
-        for name, value in parameters().items():
-            for index in range(len(value)):
+    found: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for azimuth, aim in zip(VIEWS, aims, strict=True):
+        for kind, (name, textured) in KINDS.items():
+            for index in range(len(parameters()[name])):
                 ends = []
                 for sign in (1, -1):
                     there = {key: part.detach() for key, part in parameters().items()}
                     there[name][index] += sign * STEP
-                    ends.append(loss(finest, there, azimuth, target).item())
-                found[name].append((ends[0] - ends[1]) / (2 * STEP))
-    return {name: np.array(values) for name, values in found.items()}
+                    ends.append(loss(finest, there, azimuth, aim[textured], textured).item())
+                found[kind].append((ends[0] - ends[1]) / (2 * STEP))
+    return {kind: np.array(values) for kind, values in found.items()}
 
 
-def slopes(drawing: Renderer, aims: list[Tensor]) -> dict[str, np.ndarray]:
-    found: dict[str, list[float]] = {name: [] for name in KINDS}
-    for azimuth, target in zip(VIEWS, aims, strict=True):
-        by = parameters()
-        loss(drawing, by, azimuth, target).backward()
-        for name, value in by.items():
-            assert value.grad is not None
-            found[name].extend(value.grad.tolist())
-    return {name: np.array(values) for name, values in found.items()}
+def slopes(drawing: Renderer, aims: list[list[Tensor]]) -> dict[str, np.ndarray]:
+    """Of the kinds that the renderer draws: blended pictures have no textures."""
+    parts = PARTS if "texture" in drawing.differentiable else (False,)
+    found: dict[str, list[float]] = {}
+    for azimuth, aim in zip(VIEWS, aims, strict=True):
+        for textured in parts:
+            by = parameters()
+            loss(drawing, by, azimuth, aim[textured], textured).backward()
+            for kind, (name, laid) in KINDS.items():
+                slope = by[name].grad
+                if laid == textured and slope is not None:
+                    found.setdefault(kind, []).extend(slope.tolist())
+    return {kind: np.array(values) for kind, values in found.items()}
 
 
 def fit_step(drawing: Renderer) -> Callable[[], None]:
@@ -110,14 +117,14 @@ def measured() -> list[dict[str, Any]]:
             drawing = renderer(**config, **{knob: value})
             found = slopes(drawing, aims)
             row: dict[str, Any] = {"method": method, "knob": knob, "value": value}
-            for name in KINDS:
+            for name in found:
                 one, other = found[name], wanted[name]
                 row[f"cosine_{name}"] = one @ other / (np.linalg.norm(one) * np.linalg.norm(other))
                 row[f"length_{name}"] = np.linalg.norm(one) / np.linalg.norm(other)
             off = found["vertices"] - wanted["vertices"]
             row["error"] = np.linalg.norm(off) / np.linalg.norm(wanted["vertices"])
             row["angle"] = np.degrees(np.arccos(float(row["cosine_vertices"])))
-            row["milliseconds"] = milliseconds(blob_step(drawing, aims[0]), 10)
+            row["milliseconds"] = milliseconds(blob_step(drawing, aims[0][0]), 10)
             row["figure_milliseconds"] = milliseconds(fit_step(drawing), 10)
             rows.append(row)
             sys.stdout.write(
@@ -131,7 +138,12 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"| {' | '.join(head)} |", "|---|---|" + "---:|" * (len(head) - 2)]
     for row in rows:
         cells = [str(row["method"]), f"{row['knob']} {row['value']:g}"]
-        cells += [f"{row[f'cosine_{name}']:.3f}, {row[f'length_{name}']:.2f}" for name in KINDS]
+        cells += [
+            f"{row[f'cosine_{kind}']:.3f}, {row[f'length_{kind}']:.2f}"
+            if f"cosine_{kind}" in row
+            else "not drawn"
+            for kind in KINDS
+        ]
         cells += [f"{row['milliseconds']:.1f}", f"{row['figure_milliseconds']:.1f}"]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
@@ -146,7 +158,8 @@ def main() -> None:
         "",
         "Cosine with, and length over, central differences of a picture with 16 × 16 samples a pixel: the squared "
         "error against another pose, over 4 views, in 8 deformations of the vertices, 3 changes of colours, and the "
-        "camera's rotation, translation and focal length. A synthetic body with 3,280 vertices that hides parts of "
+        "camera's rotation, translation and focal length; and, of the body with a smooth texture instead, in 3 changes "
+        "of it and in the deformations. A synthetic body with 3,280 vertices that hides parts of "
         "itself, 72 × 88 pixels. `nmr` is Kato et al.'s approximation (CVPR 2018), `soft` Liu et al.'s blurred picture "
         "(ICCV 2019), whose own slope is exact: the table says how far it is from that of the sharp picture.",
         "",

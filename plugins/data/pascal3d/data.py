@@ -74,7 +74,7 @@ class Drawing:
 
     images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400
     generator_seed: Annotated[int, Field(ge=0)] = 0
-    renderer: Renderer = "zbuffer"  # pyright: ignore[reportAssignmentType]  # built by the framework
+    renderer: Renderer = "rasterizer"  # pyright: ignore[reportAssignmentType]  # built by the framework
 
 
 class Pascal3D(Data):

@@ -26,7 +26,7 @@ from plugins.data.pascal3d.viewpoints import LEVELS, QUANTILES, viewpoint
 
 @pytest.fixture(scope="session")
 def renderer() -> Renderer:
-    return schema.build("renderer", schema.resolve("renderer", "zbuffer"))
+    return schema.build("renderer", schema.resolve("renderer", "rasterizer"))
 
 
 # ---- shapes and families ---------------------------------------------------------------------------------

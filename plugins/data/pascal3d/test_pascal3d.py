@@ -27,7 +27,7 @@ from plugins.data.pascal3d.scene import shoot
 
 @pytest.fixture(scope="session")
 def renderer() -> Renderer:
-    return schema.build("renderer", schema.resolve("renderer", "zbuffer"))
+    return schema.build("renderer", schema.resolve("renderer", "rasterizer"))
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from framework.geometry.camera import Camera, look_from
-from framework.renderer import Scene
+from framework.renderer import Scene, Texture
 from plugins.renderer.rasterizer.drawing import Gradient
 from plugins.renderer.rasterizer.renderer import Rasterizer
 
@@ -73,13 +73,27 @@ DEFORMATIONS = {
 VIEWS = (0.5, 2.0, 3.6, 5.2)
 
 
+KINDS = {
+    "vertices": ("vertices", False),
+    "colors": ("colors", False),
+    "rotation": ("rotation", False),
+    "translation": ("translation", False),
+    "focal": ("focal", False),
+    "texture": ("texture", True),
+    "vertices, textured": ("vertices", True),
+}
+"""What is differentiated in, and whether the body has a texture instead of colours."""
+
+
 def parameters() -> dict[str, torch.Tensor]:
-    """What is differentiated in, all 0 at the scene itself."""
-    sizes = {"vertices": 8, "colors": 3, "rotation": 3, "translation": 3, "focal": 1}
+    """All 0 at the scene itself."""
+    sizes = {"vertices": 8, "colors": 3, "rotation": 3, "translation": 3, "focal": 1, "texture": 3}
     return {name: torch.zeros(size, dtype=torch_float, requires_grad=True) for name, size in sizes.items()}
 
 
-def scene(by: dict[str, torch.Tensor], azimuth: float, body: tuple[torch.Tensor, ...]) -> Scene:
+def scene(
+    by: dict[str, torch.Tensor], azimuth: float, body: tuple[torch.Tensor, ...], textured: bool = False
+) -> Scene:
     vertices, faces, colors = body
     moved = vertices + 0.3 * sum(
         amount * move(vertices).double()
@@ -92,14 +106,20 @@ def scene(by: dict[str, torch.Tensor], azimuth: float, body: tuple[torch.Tensor,
         translation=seen.translation + by["translation"],
         focal=seen.focal * (1 + by["focal"]),
     )
-    tinted = colors + torch.sin(3 * vertices) * by["colors"]
-    return Scene(moved, faces, tinted, seen)
+    if not textured:
+        return Scene(moved, faces, colors + torch.sin(3 * vertices) * by["colors"], seen)
+    row, column = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    stripes = [(row / 5 + column / (7 + channel) + channel).sin() for channel in range(3)]
+    image = 0.5 + 0.4 * torch.stack(stripes, -1).double()
+    image = image + torch.sin(3 * image) * by["texture"]
+    uv = 0.5 + 0.35 * vertices[:, :2] + 0.2 * vertices[:, 2:]
+    return Scene(moved, faces, None, seen, Texture((image,), uv, faces))
 
 
 def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
     """Squared error against another pose, over four views, in every kind of parameter: 8 deformations, colours, the
-    camera's rotation, translation and focal length. Cosine and length over all parameters of a kind; with one sample a
-    pixel, whose error is another, the cosine alone."""
+    camera's rotation, translation and focal length, a texture. Cosine and length over all parameters of a kind; with
+    one sample a pixel, whose error is another, the cosine alone."""
     body = blob()
     hard = Rasterizer(supersampling=16)
     tried = {
@@ -113,36 +133,38 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
         torch.manual_seed(view)
         off = {name: 0.05 * torch.randn_like(value.detach()) for name, value in parameters().items()}
         with torch.no_grad():
-            target = hard(scene(off, azimuth, body))["color"]
+            targets = [hard(scene(off, azimuth, body, textured))["color"] for textured in (False, True)]
 
-        def loss(renderer, by, azimuth=azimuth, target=target):
-            picture = renderer(scene(by, azimuth, body))["color"]
-            return (picture.double() - target).square().sum()
+        def loss(renderer, by, textured, azimuth=azimuth, targets=targets):
+            picture = renderer(scene(by, azimuth, body, textured))["color"]
+            return (picture.double() - targets[textured]).square().sum()
 
         for how, renderer in tried.items():
-            by = parameters()
-            loss(renderer, by).backward()
-            for name, value in by.items():
-                found.setdefault((how, name), []).extend(value.grad.tolist())
+            for textured in (False, True):
+                by = parameters()
+                loss(renderer, by, textured).backward()
+                for kind, (name, laid) in KINDS.items():
+                    if laid == textured:
+                        found.setdefault((how, kind), []).extend(by[name].grad.tolist())
         step = 2e-3
-        for name, value in parameters().items():
-            for index in range(len(value)):
+        for kind, (name, textured) in KINDS.items():
+            for index in range(len(parameters()[name])):
                 ends = []
                 for sign in (1, -1):
                     there = {key: part.detach().clone() for key, part in parameters().items()}
                     there[name][index] += sign * step
                     with torch.no_grad():
-                        ends.append(loss(hard, there).item())
-                wanted.setdefault(name, []).append((ends[0] - ends[1]) / (2 * step))
+                        ends.append(loss(hard, there, textured).item())
+                wanted.setdefault(kind, []).append((ends[0] - ends[1]) / (2 * step))
 
-    def cosine(how: str, name: str) -> float:
-        one, other = np.array(found[how, name]), np.array(wanted[name])
+    def cosine(how: str, kind: str) -> float:
+        one, other = np.array(found[how, kind]), np.array(wanted[kind])
         return one @ other / np.linalg.norm(one) / np.linalg.norm(other)
 
-    for name, other in wanted.items():
-        assert cosine("16 samples", name) > 0.99, name
-        assert abs(np.linalg.norm(found["16 samples", name]) / np.linalg.norm(other) - 1) < 0.05, name
-        assert cosine("1 sample", name) > 0.99, name
+    for kind, other in wanted.items():
+        assert cosine("16 samples", kind) > 0.99, kind
+        assert abs(np.linalg.norm(found["16 samples", kind]) / np.linalg.norm(other) - 1) < 0.05, kind
+        assert cosine("1 sample", kind) > 0.99, kind
     assert cosine("interior", "vertices") < 0.9  # what edges hand over is needed
 
 
