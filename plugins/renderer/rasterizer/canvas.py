@@ -17,6 +17,7 @@ MOST = 8
 """Of meshes and of canvases that wait for their next use."""
 
 Box = tuple[int, int, int, int]
+Tiles = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @raster.compiled
@@ -77,7 +78,11 @@ class Canvas:
     def __init__(self) -> None:
         self.seen, self.screen = np.empty((0, 3)), np.empty((0, 3))
         self.depth, self.face = np.empty((0, 0), np.float32), np.empty((0, 0), np.int32)
-        self.tiles: tuple[np.ndarray, np.ndarray] = np.empty((0, 0), np.float32), np.empty((0, 0), np.int64)
+        self.tiles: Tiles = (
+            np.empty((0, 0), np.float32),
+            np.empty((0, 0), np.int32),
+            np.empty((0, 0), np.int32),
+        )
         self.counts = np.zeros(0, np.int64)
         self.box: Box = (0, 0, 0, 0)
         self.hidden = 0
@@ -122,14 +127,24 @@ class Canvas:
             self.depth = np.full(size, np.inf, np.float32)
             self.face = np.full(size, -1, np.int32)
             tiles = -(-height // raster.TILE), -(-width // raster.TILE)
-            self.tiles = np.full(tiles, np.inf, np.float32), np.zeros(tiles, np.int64)
+            self.tiles = np.empty(tiles, np.float32), np.empty(tiles, np.int32), np.empty(tiles, np.int32)
         else:
             top, bottom, left, right = self.box
             self.depth[top:bottom, left:right] = np.inf
             self.face[top:bottom, left:right] = -1
-            self.tiles[0].fill(np.inf)
-            self.tiles[1].fill(0)
         self._drawn, self.box = None, (0, height, 0, width)  # whatever happens before `shows`
+
+    def empty_tiles(self) -> Tiles:
+        """Of clear arrays."""
+        farthest, empty, changed = self.tiles
+        farthest.fill(np.inf)
+        changed.fill(0)
+        sides = [
+            np.minimum(raster.TILE, side - raster.TILE * np.arange(count))
+            for side, count in zip(self.depth.shape, empty.shape, strict=True)
+        ]
+        np.multiply.outer(*sides, out=empty, casting="same_kind")
+        return self.tiles
 
     def shows(self, corners: Corners, cull: bool, box: Box, counts: np.ndarray) -> None:
         self._drawn, self.box, self.counts = (corners, cull), box, counts

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from framework.renderer import Report
 from plugins.renderer.rasterizer import nmr, raster, shading, soft
 from plugins.renderer.rasterizer.boundary import boundary
-from plugins.renderer.rasterizer.canvas import Box, Canvas, Corners, Lease
+from plugins.renderer.rasterizer.canvas import Box, Canvas, Corners, Lease, Tiles
 from plugins.renderer.rasterizer.clipping import clipped
 from plugins.renderer.rasterizer.interior import interior, of_the_world
 from plugins.renderer.rasterizer.textures import Laid
@@ -129,7 +129,7 @@ def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
             box = rasterised(given, view, canvas, None, None, numbers["mask"], None, counts)
         elif exact:
             canvas.cleared(view.size)
-            tiles = canvas.tiles if "hidden" in savings else None
+            tiles = canvas.empty_tiles() if "hidden" in savings else None
             box = rasterised(given, view, canvas, canvas.depth, canvas.face, None, tiles, counts)
             canvas.shows(view.faces, view.cull, box, counts)
         if "box" not in savings:
@@ -167,7 +167,7 @@ def rasterised(
     depth: np.ndarray | None,
     face: np.ndarray | None,
     mask: np.ndarray | None,
-    tiles: tuple[np.ndarray, np.ndarray] | None,
+    tiles: Tiles | None,
     counts: np.ndarray,
 ) -> Box:
     """Draw all faces, those that the near plane cuts as well, and count what became of them."""
@@ -176,15 +176,15 @@ def rasterised(
     if canvas.hidden:  # what the near plane cuts is near, and hides what comes later
         corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
         if len(parts):
-            arrays = (depth, face, mask, tiles, counts)
+            arrays = (depth, face, mask, *(tiles or (None, None, None)), counts)
             box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays)
             cut = int(counts[raster.DRAWN])
             counts.fill(0)
     if tiles is not None and depth is not None:
-        all_of_it = (canvas.screen, faces, view.cull, *view.size, depth, face, tiles, counts)
+        all_of_it = (canvas.screen, faces, view.cull, *view.size, depth, face, *tiles, counts)
         rest = raster.front_to_back(*all_of_it)
     else:
-        arrays = (depth, face, mask, None, counts)
+        arrays = (depth, face, mask, None, None, None, counts)
         rest = raster.rasterise(canvas.screen, faces, 0, None, view.cull, *view.size, *arrays)
     counts[raster.DRAWN] += cut
     counts[raster.BEHIND] -= cut

@@ -26,8 +26,8 @@ EXACT = 2.0**25
 LARGEST = 1e100  # 1/256 pixel; a product of two coordinates and an inverse depth stays finite in float64
 NEAREST = 1e-100  # metres; likewise
 FARTHEST = 3e38  # metres; a depth that float32 holds
-TILE = 16  # pixels
-RUN = 256  # faces
+TILE = 8  # pixels
+RUN = 128  # faces
 DRAWN, BEHIND, FLAT, BACK, OUTSIDE, HIDDEN = range(6)
 """What became of a face."""
 REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HIDDEN: "hidden"}
@@ -137,7 +137,9 @@ def before(x, y, other_x, other_y):
 
 @compiled
 @no_type_check
-def rasterise(screen, faces, first, numbers, cull, height, width, depth, face, mask, tiles, counts):
+def rasterise(
+    screen, faces, first, numbers, cull, height, width, depth, face, mask, farthest, empty, changed, counts
+):
     """Draw the faces into `depth` and `face`, or into `mask` alone; the others are None. Returns the box.
 
     Each pixel shows the nearest, among equal float32 depths that of the lowest number. The arrays may hold what was
@@ -147,8 +149,8 @@ def rasterise(screen, faces, first, numbers, cull, height, width, depth, face, m
         first, numbers: faces are numbered from `first` on where `numbers` is None; else by it, those with the same
             number being parts of one.
         cull: leave out faces seen from behind.
-        tiles: None, or (farthest, changed) of `TILE` × `TILE` pixels each: no depth in it is beyond `farthest`, and
-            so many pixels were written since that was looked up.
+        farthest, empty, changed: None, or of tiles of `TILE` × `TILE` pixels: no depth in one is beyond `farthest`,
+            so many pixels show the background, and so many were written since `farthest` was looked up.
         counts: what became of the faces is added, by `DRAWN` and so on.
     """
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
@@ -190,7 +192,7 @@ def rasterise(screen, faces, first, numbers, cull, height, width, depth, face, m
             continue
         least, most = min(near0, near1, near2), max(near0, near1, near2)
         pixels = (first_row, last_row, first_column, last_column)
-        if tiles is not None and is_hidden(tiles, pixels, np.float32(1.0 / most)):
+        if farthest is not None and is_hidden(farthest, pixels, np.float32(1.0 / most)):
             hidden += 1
             continue
         if numbers is None:
@@ -243,15 +245,18 @@ def rasterise(screen, faces, first, numbers, cull, height, width, depth, face, m
                     if distance < there or (distance == there and number < face[row, column]):
                         depth[row, column] = distance
                         face[row, column] = number
-                        written += 1
+                        if empty is not None:
+                            written += 1
+                            if there == np.inf:
+                                empty[row // TILE, column // TILE] -= 1
                 edge0 += column0
                 edge1 += column1
                 edge2 += column2
             start0 += row0
             start1 += row1
             start2 += row2
-        if tiles is not None:
-            look_up(tiles, pixels, written, depth)
+        if farthest is not None and written > 0:
+            look_up(farthest, empty, changed, pixels, written, depth)
     for place, count in ((DRAWN, drawn), (BEHIND, behind), (FLAT, flat), (BACK, back)):
         counts[place] += count
     counts[OUTSIDE] += outside
@@ -261,9 +266,8 @@ def rasterise(screen, faces, first, numbers, cull, height, width, depth, face, m
 
 @compiled
 @no_type_check
-def is_hidden(tiles, pixels, nearest):
+def is_hidden(farthest, pixels, nearest):
     """Whether everything in a box of pixels was drawn nearer than `nearest`, as far as the tiles know."""
-    farthest, _ = tiles
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
         for column in range(first_column // TILE, last_column // TILE + 1):
@@ -274,35 +278,58 @@ def is_hidden(tiles, pixels, nearest):
 
 @compiled
 @no_type_check
-def look_up(tiles, pixels, written, depth):
-    """Note that pixels of a box were written, and look up how far a tile reaches when as many were as it has."""
-    farthest, changed = tiles
+def look_up(farthest, empty, changed, pixels, written, depth):
+    """Note that so many pixels of a box were written, and look up how far its full tiles reach, the first time and
+    whenever as many were written again as one has."""
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
         for column in range(first_column // TILE, last_column // TILE + 1):
             changed[row, column] += written
-            if changed[row, column] >= TILE * TILE:
-                changed[row, column] = 0
-                most = np.float32(0)
-                for y in range(row * TILE, min((row + 1) * TILE, depth.shape[0])):
-                    for x in range(column * TILE, min((column + 1) * TILE, depth.shape[1])):
-                        most = max(most, depth[y, x])
-                farthest[row, column] = most
+            if empty[row, column] > 0:
+                continue
+            if farthest[row, column] < np.inf and changed[row, column] < TILE * TILE:
+                continue
+            changed[row, column] = 0
+            most = np.float32(0)
+            for y in range(row * TILE, min((row + 1) * TILE, depth.shape[0])):
+                for x in range(column * TILE, min((column + 1) * TILE, depth.shape[1])):
+                    most = max(most, depth[y, x])
+            farthest[row, column] = most
 
 
 @compiled
 @no_type_check
-def front_to_back(screen, faces, cull, height, width, depth, face, tiles, counts):
-    """As `rasterise`, runs of `RUN` faces nearest first. Returns the box."""
+def front_to_back(screen, faces, cull, height, width, depth, face, farthest, empty, changed, counts):
+    """As `rasterise`, runs of `RUN` faces nearest first; a run that is hidden as a whole is counted as hidden. Returns
+    the box."""
     runs = (faces.shape[0] + RUN - 1) // RUN
-    nearest = np.zeros(runs)
+    last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
+    nearest, bounds = np.zeros(runs), np.empty((runs, 4), np.int64)
     for run in range(runs):
+        left = top = np.inf
+        right = bottom = -np.inf
+        whole = True
         for index in range(run * RUN, min((run + 1) * RUN, faces.shape[0])):
-            nearest[run] = max(nearest[run], screen[faces[index, 0], 2])
+            for corner in range(3):
+                vertex = faces[index, corner]
+                x, y, near = screen[vertex, 0], screen[vertex, 1], screen[vertex, 2]
+                whole &= near > 0
+                nearest[run] = max(nearest[run], near)
+                left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        # of what is not wholly before the near plane, or out of view, nothing is known: no pixels
+        if not whole or right < 0 or bottom < 0 or left > last_x or top > last_y:
+            left, right, top, bottom = 0.0, -SUBPIXELS, 0.0, -SUBPIXELS
+        bounds[run, 0], bounds[run, 1] = np.int64(max(top, 0.0)) >> 8, np.int64(min(bottom, last_y)) >> 8
+        bounds[run, 2], bounds[run, 3] = np.int64(max(left, 0.0)) >> 8, np.int64(min(right, last_x)) >> 8
     top, bottom, left, right = height, 0, width, 0
     for run in np.argsort(-nearest):
         some = faces[run * RUN : (run + 1) * RUN]
-        box = rasterise(screen, some, run * RUN, None, cull, height, width, depth, face, None, tiles, counts)
+        pixels = (bounds[run, 0], bounds[run, 1], bounds[run, 2], bounds[run, 3])
+        if bounds[run, 1] >= 0 and is_hidden(farthest, pixels, np.float32(1.0 / nearest[run])):
+            counts[HIDDEN] += some.shape[0]
+            continue
+        tiles = (farthest, empty, changed)
+        box = rasterise(screen, some, run * RUN, None, cull, height, width, depth, face, None, *tiles, counts)
         top, bottom = min(top, box[0]), max(bottom, box[1])
         left, right = min(left, box[2]), max(right, box[3])
     return top, bottom, left, right
