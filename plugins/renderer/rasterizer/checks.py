@@ -105,6 +105,8 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
     check_channels(channels)
     vertices = numbers("vertices", scene.vertices)
     faces = indices("faces", scene.faces, len(vertices), "vertices", shelf)
+    check_device("camera.rotation", scene.camera.rotation)
+    check_device("camera.translation", scene.camera.translation)
     lens = check_camera(scene.camera)
     camera = scene.camera
     learned = [vertices, camera.rotation, camera.translation, camera.focal, camera.principal]
@@ -136,6 +138,54 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
     return Ready(scene, vertices, colors, texture, faces, corners, lens, near, learning)
 
 
+def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient) -> Tensor:
+    """A scene for `reference.picture`, whose tensors lie on one device; its lens there.
+
+    Raises:
+        ValueError: says what came and what was wanted.
+    """
+    check_channels(channels)
+    camera, texture = scene.camera, scene.texture
+    parts: dict[str, Tensor | None] = {
+        "vertices": scene.vertices,
+        "faces": scene.faces,
+        "colors": scene.colors,
+        "camera.rotation": camera.rotation,
+        "camera.translation": camera.translation,
+    }
+    if texture is not None:
+        parts |= {"uv": texture.uv, "texture.faces": texture.faces, "texture.shown": texture.shown}
+        parts |= {f"image {number} of a texture": image for number, image in enumerate(texture.images)}
+    device = scene.vertices.device
+    for name, part in parts.items():
+        if part is not None and part.device != device:
+            raise ValueError(
+                f"{name} came on {part.device} and vertices on {device}; wanted one device for both."
+            )
+    check_camera(camera)
+    count = len(scene.vertices)
+    if scene.faces.numel() and not (int(scene.faces.min()) >= 0 and int(scene.faces.max()) < count):
+        raise ValueError(
+            f"faces name the vertices {int(scene.faces.min())} to {int(scene.faces.max())}; wanted 0 to {count - 1}."
+        )
+    if "color" in channels and scene.colors is None and texture is None:
+        raise ValueError('"color" was asked of a scene without colours; give colors or a texture.')
+    lens = [
+        torch.as_tensor(part, dtype=torch.float64, device=device) for part in (camera.focal, camera.principal)
+    ]
+    learned = [*parts.values(), *lens]
+    if (
+        gradient != "interior"
+        and torch.is_grad_enabled()
+        and any(part is not None and part.requires_grad for part in learned)
+    ):
+        raise ValueError(
+            f"gradient={gradient} was asked for on {device}, where only what faces show within has a gradient; choose "
+            "gradient=interior, or give tensors on the CPU."
+        )
+    return torch.cat(lens)
+
+
 def check_channels(channels: Collection[str]) -> None:
     if isinstance(channels, str):
         raise ValueError(
@@ -151,7 +201,9 @@ def check_channels(channels: Collection[str]) -> None:
 
 def check_device(name: str, tensor: Tensor) -> None:
     if tensor.device.type != "cpu":
-        raise ValueError(f"{name} came on {tensor.device}; rasterizer draws on the CPU: give {name}.cpu().")
+        raise ValueError(
+            f"{name} came on {tensor.device}; rasterizer draws on the CPU, or a whole scene on cuda: give {name}.cpu()."
+        )
 
 
 def check_shape(name: str, tensor: Tensor, columns: int | None) -> None:
@@ -233,8 +285,9 @@ def check_camera(camera: Camera) -> np.ndarray:
     for name, side in (("height", camera.height), ("width", camera.width)):
         if not 1 <= side <= 2**16:
             raise ValueError(f"camera.{name} = {side}; wanted 1 to {2**16} pixels.")
-    check_device("camera.rotation", camera.rotation)
-    check_device("camera.translation", camera.translation)
+    for name, part in (("rotation", camera.rotation), ("translation", camera.translation)):
+        if part.device.type == "meta":
+            check_device(f"camera.{name}", part)
     rotation, translation = camera.rotation.shape, camera.translation.shape
     if rotation != (3, 3) or translation != (3,):
         raise ValueError(

@@ -176,13 +176,14 @@ def rasterised(
     if canvas.hidden:  # what the near plane cuts is near, and hides what comes later
         corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
         if len(parts):
-            arrays = (depth, face, mask, *(tiles or (None, None, None)), counts)
-            box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays)
+            arrays = (depth, face, mask) + (tiles or (None, None, None))
+            box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays, counts)
             cut = int(counts[raster.DRAWN])
             counts.fill(0)
     if tiles is not None and depth is not None:
-        all_of_it = (canvas.screen, faces, view.cull, *view.size, depth, face, *tiles, counts)
-        rest = raster.front_to_back(*all_of_it)
+        farthest, empty, changed = tiles
+        drawn_in = (depth, face, farthest, empty, changed)
+        rest = raster.front_to_back(canvas.screen, faces, view.cull, *view.size, *drawn_in, counts)
     else:
         arrays = (depth, face, mask, None, None, None, counts)
         rest = raster.rasterise(canvas.screen, faces, 0, None, view.cull, *view.size, *arrays)

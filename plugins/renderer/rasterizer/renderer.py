@@ -10,9 +10,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from framework.renderer import Renderer, Report, Scene
+from plugins.renderer.rasterizer import reference
 from plugins.renderer.rasterizer.canvas import Canvas, Shelf
-from plugins.renderer.rasterizer.checks import CHANNELS, Ready, ready
+from plugins.renderer.rasterizer.checks import CHANNELS, Ready, check_on_device, ready
 from plugins.renderer.rasterizer.drawing import Gradient, Picture, Saving, View, draw
+from plugins.renderer.rasterizer.raster import NEAREST
 
 ALL: tuple[Saving, ...] = ("view", "box", "unchanged")
 
@@ -23,7 +25,8 @@ class Rasterizer(Renderer):
 
     Corners are rounded to 1/256 pixel and whole numbers decide which pixels a triangle covers: triangles that
     share an edge leave no pixel between them out and share none. What has no area after rounding is left out; what
-    the near plane cuts is clipped. Depth and colour are perspective-correct. Tensors live on the CPU.
+    the near plane cuts is clipped. Depth and colour are perspective-correct. Tensors live on the CPU; a scene on a GPU
+    is drawn there in plain torch, without faces that the near plane cuts and with gradient "interior" alone.
 
     "color" has a gradient in vertices, colours, textures' images and uv, and the camera's rotation, translation, focal
     lengths and principal point; "depth" too, but for the edges of what is seen.
@@ -118,16 +121,33 @@ class Rasterizer(Renderer):
         return [drawn for drawn, _ in found]
 
     def _picture(self, scene: Scene, channels: Collection[str]) -> tuple[dict[str, Tensor], Report | None]:
+        if scene.vertices.device.type == "cuda":
+            return self.on_device(scene, channels), None
         checked = ready(scene, channels, self._shelf, self.gradient)
-        if not channels:
-            return {}, None
-        if self.supersampling == 1 or "color" not in channels:
-            found, report = self._drawn(scene, checked, tuple(dict.fromkeys(channels)), 1)
-            return found, report
-        rest = tuple(name for name in dict.fromkeys(channels) if name != "color")
-        once = self._drawn(scene, checked, rest, 1)[0] if rest else {}
-        found, report = self._drawn(scene, checked, ("color",), self.supersampling)
-        return {name: found[name] if name == "color" else once[name] for name in channels}, report
+        found: dict[str, Tensor] = {}
+        report = None
+        for names, times in samples(channels, self.supersampling):
+            drawn, report = self._drawn(scene, checked, names, times)
+            found |= drawn
+        return {name: found[name] for name in channels}, report
+
+    def on_device(self, scene: Scene, channels: Collection[str]) -> dict[str, Tensor]:
+        """The same by `reference`, wherever the scene's tensors lie."""
+        lens, camera = check_on_device(scene, channels, self.gradient), scene.camera
+        if self.gradient == "soft":
+            raise ValueError(
+                "gradient=soft draws on the CPU; give tensors there, or choose another gradient."
+            )
+        found: dict[str, Tensor] = {}
+        for names, times in samples(channels, self.supersampling):
+            shift = torch.tensor([0.0, 0.0, 0.5, 0.5], dtype=torch.float64, device=lens.device)
+            pose = (camera.rotation, camera.translation, (lens + shift) * times - shift)
+            size = (camera.height * times, camera.width * times)
+            near = max(float(camera.near), NEAREST)
+            surface = (scene.vertices, scene.faces, scene.colors, scene.texture)
+            drawn = reference.picture(*surface, pose, near, size, names, self.cull)
+            found |= pooled(drawn, times)
+        return {name: found[name] for name in channels}
 
     def _drawn(
         self, scene: Scene, checked: Ready, channels: tuple[str, ...], times: int
@@ -156,6 +176,19 @@ class Rasterizer(Renderer):
         else:
             drawn = draw(given, view, self._pool, learning=False)
             found, report = drawn.channels, drawn.report
-        if times > 1:
-            found["color"] = avg_pool2d(found["color"].movedim(-1, 0), times).movedim(0, -1)
-        return found, report
+        return pooled(found, times), report
+
+
+def samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[str, ...], int]]:
+    """Channels that are drawn together, each once, with so many samples a pixel along each axis: colours at last."""
+    names = tuple(dict.fromkeys(channels))
+    rest = tuple(name for name in names if name != "color")
+    if supersampling == 1 or rest == names:
+        return [(names, 1)] if names else []
+    return [*([(rest, 1)] if rest else []), (("color",), supersampling)]
+
+
+def pooled(drawn: dict[str, Tensor], times: int) -> dict[str, Tensor]:
+    if times == 1:
+        return drawn
+    return {name: avg_pool2d(picture.movedim(-1, 0), times).movedim(0, -1) for name, picture in drawn.items()}

@@ -1,0 +1,101 @@
+"""The compiled kernels against the same in plain torch, which is what draws on a GPU."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.renderer import Scene
+from plugins.renderer.rasterizer import reference
+from plugins.renderer.rasterizer.renderer import Rasterizer
+from plugins.renderer.rasterizer.test_gradient import blob
+from plugins.renderer.rasterizer.test_savings import EVERY, crowd, seen
+
+EXACT = ("face", "depth", "mask", "normal")
+"""To the last bit; the others at corners that are not rounded to 1/256 pixel."""
+
+
+@settings(deadline=None, max_examples=25, derandomize=True)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([1, 3]))
+def test_pictures_are_those_of_plain_torch(seed: int, cull: bool, supersampling: int) -> None:
+    """Nothing is cut by the near plane, which plain torch leaves out."""
+    random = np.random.default_rng(seed)
+    scene = crowd(seen(float(random.uniform(5, 9)), (40, 50)), random)
+    _, depth = scene.camera.projected(scene.vertices)
+    scene = replace(scene, camera=replace(scene.camera, near=min(1e-3, float(depth[depth > 0].min()))))
+    whole = (depth[scene.faces] > 0).all(1)
+    cover = scene.texture
+    if cover is not None and cover.shown is not None:
+        cover = replace(cover, faces=cover.faces[whole], shown=cover.shown[whole])
+    scene = replace(scene, faces=scene.faces[whole], texture=cover)
+    renderer = Rasterizer(cull=cull, supersampling=supersampling)
+    one, other = renderer(scene, EVERY), renderer.on_device(scene, EVERY)
+    for name in EXACT:
+        assert torch.equal(one[name], other[name]), name
+    for name, limit in (("color", 5e-3), ("barycentric", 0.02), ("uv", 5e-3)):
+        assert one[name].dtype == other[name].dtype
+        assert (one[name] - other[name]).abs().quantile(0.999) < limit, name
+
+
+def test_a_few_faces_at_a_time_are_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = crowd(seen(), np.random.default_rng(3))
+    whole = Rasterizer().on_device(scene, EVERY)
+    monkeypatch.setattr(reference, "PAIRS", 500)
+    parts = Rasterizer().on_device(scene, EVERY)
+    assert all(torch.equal(whole[name], parts[name]) for name in EVERY)
+
+
+def test_slopes_within_faces_are_those_of_plain_torch() -> None:
+    vertices, faces, colors = blob(12)
+    scene = Scene(vertices, faces, colors, seen())
+    renderer = Rasterizer(gradient="interior")
+    found = []
+    for draw in (renderer, renderer.on_device):
+        learned = [part.clone().requires_grad_() for part in (vertices, colors)]
+        picture = draw(replace(scene, vertices=learned[0], colors=learned[1]), ("color",))["color"]
+        found.append(torch.autograd.grad(picture.square().sum(), learned))
+    for one, other in zip(*found, strict=True):
+        assert (one - other).norm() < 0.01 * other.norm()
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_empty_scenes_are_background(name: str) -> None:
+    vertices, faces, colors = blob(4)
+    for scene in (
+        Scene(vertices, faces[:0], colors, seen()),
+        Scene(vertices[:0], faces[:0], colors[:0], seen()),
+        Scene(vertices + 100, faces, colors, seen()),
+    ):
+        renderer = Rasterizer()
+        assert torch.equal(renderer.on_device(scene, (name,))[name], renderer(scene, (name,))[name])
+
+
+def test_what_plain_torch_cannot_do_is_refused() -> None:
+    vertices, faces, colors = blob(4)
+    scene = Scene(vertices, faces, colors, seen())
+    with pytest.raises(ValueError, match="choose gradient=interior, or give tensors on the CPU"):
+        Rasterizer().on_device(replace(scene, vertices=vertices.clone().requires_grad_()), ("color",))
+    with pytest.raises(ValueError, match="gradient=soft draws on the CPU"):
+        Rasterizer(gradient="soft").on_device(scene, ("color",))
+    with pytest.raises(ValueError, match="wanted 0 to"):
+        Rasterizer().on_device(replace(scene, faces=faces + 1000), ("mask",))
+    with pytest.raises(ValueError, match="came on meta and vertices on cpu"):
+        Rasterizer().on_device(replace(scene, colors=colors.to("meta")), ("mask",))
+    with pytest.raises(ValueError, match="without colours"):
+        Rasterizer().on_device(replace(scene, colors=None), ("color",))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU, which is never required")
+def test_a_scene_on_a_gpu_is_drawn_there() -> None:
+    scene = crowd(seen(), np.random.default_rng(1), 1)
+    camera = replace(
+        scene.camera, rotation=scene.camera.rotation.cuda(), translation=scene.camera.translation.cuda()
+    )
+    assert scene.colors is not None
+    moved = Scene(scene.vertices.cuda(), scene.faces.cuda(), scene.colors.cuda(), camera)
+    drawn = Rasterizer()(moved, ("color", "face"))
+    assert drawn["color"].is_cuda
+    assert (drawn["face"].cpu() != Rasterizer()(scene, ("face",))["face"]).float().mean() < 1e-3
