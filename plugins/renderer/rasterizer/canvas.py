@@ -23,14 +23,20 @@ Tiles = tuple[np.ndarray, np.ndarray, np.ndarray]
 @raster.compiled
 @no_type_check
 def alike(one, other):
-    """Whether two flat arrays of one length hold the same bits."""
+    """Whether two flat arrays of whole numbers, of one length, are equal."""
     for start in range(0, one.shape[0], BLOCK):
-        differ = one[start] != other[start]
-        for place in range(start, min(start + BLOCK, one.shape[0])):
-            differ |= one[place] != other[place]
-        if differ:
+        part, other_part = one[start : start + BLOCK], other[start : start + BLOCK]
+        differing = np.int64(0)
+        for place in range(part.shape[0]):
+            differing |= part[place] ^ other_part[place]
+        if differing != 0:
             return False
     return True
+
+
+def bits(array: np.ndarray) -> np.ndarray:
+    """Of floating point numbers, flat."""
+    return array.reshape(-1).view(f"i{array.itemsize}")
 
 
 class Corners:
@@ -95,7 +101,7 @@ class Canvas:
         """Whether `seen` and `screen` hold these vertices from this pose; if not they are taken to from now on."""
         kept = self._vertices
         if kept.shape == vertices.shape and kept.dtype == vertices.dtype and len(self._pose) == len(pose):
-            if bool((self._pose == pose).all()) and alike(vertices.reshape(-1), kept.reshape(-1)):
+            if bool((self._pose == pose).all()) and alike(bits(vertices), bits(kept)):
                 return True
         else:
             self._vertices = np.empty_like(vertices)
