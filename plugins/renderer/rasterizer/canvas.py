@@ -56,16 +56,17 @@ class Corners:
 
 
 class Shelf:
-    """Meshes that were drawn lately, the latest first."""
+    """Meshes that were drawn lately, the latest first; threads may share it, since lists are only replaced."""
 
     def __init__(self) -> None:
         self._kept: list[Corners] = []
 
     def find(self, given: np.ndarray, largest: int) -> Corners:
         """Of indices up to `largest`, an index above which, or below 0, is a ValueError with both ends of them."""
-        for place, kept in enumerate(self._kept):
-            if kept.holds(given) and kept.largest <= largest:
-                self._kept.insert(0, self._kept.pop(place))
+        for kept in self._kept:
+            if kept.largest <= largest and kept.holds(given):
+                if kept is not self._kept[0]:
+                    self._kept = [kept, *(other for other in self._kept if other is not kept)][:MOST]
                 return kept
         found = int(raster.largest_index(given.reshape(-1).view(f"u{given.itemsize}")))
         if given.size and found > largest:
@@ -161,7 +162,10 @@ class Lease:
 
     def __init__(self, pool: list[Canvas]) -> None:
         self._pool = pool
-        self.canvas = pool.pop() if pool else Canvas()
+        try:
+            self.canvas = pool.pop()
+        except IndexError:  # none waits
+            self.canvas = Canvas()
 
     def __del__(self) -> None:
         if len(self._pool) < MOST:
