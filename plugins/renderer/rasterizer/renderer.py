@@ -20,8 +20,7 @@ ALL: tuple[Saving, ...] = ("view", "box", "unchanged")
 
 
 class Rasterizer(Renderer):
-    """Triangle meshes with colours per vertex and textures, drawn without holes, differentiable in all that a scene is
-    made of.
+    """Meshes with colours and textures, drawn without holes, differentiable in all that a scene is made of.
 
     Corners are rounded to 1/256 pixel and whole numbers decide which pixels a triangle covers: triangles that
     share an edge leave no pixel between them out and share none. What has no area after rounding is left out; what
