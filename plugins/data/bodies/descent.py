@@ -45,6 +45,7 @@ STAGES = (
     Stage(4, 1.0, 0.3),
     Stage(2, 1.0, 0.03),
     Stage(2, 0.7, 0.003),
+    Stage(1, 1.5, 1e-4),
     Stage(1, 0.8, 0.0),
 )
 AGAIN_FROM = 2
@@ -57,7 +58,7 @@ LONGEST = (0.2, 0.08)
 """Longest step of a rotation (radians) and a translation (metres); of other numbers it is their spread."""
 SHORTER, TRIES = 0.4, 6
 """By how much a step that raises the loss is shortened, and how often."""
-CONVERGED, IN_A_ROW = 2e-3, 3
+CONVERGED, IN_A_ROW = 5e-4, 3
 """A stage ends with this many steps in a row that lower the loss by less than this share."""
 
 

@@ -91,7 +91,7 @@ class FitPoseHead(DensityHead, Fitted):
 
     Args:
         renderer: draws what is compared with the picture; differentiable.
-        steps: most steps of a stage; there are six.
+        steps: most steps of a stage; there are seven.
         restarts: how often another pose is tried while pictures differ by more than `enough`.
         enough: root mean square difference of colours.
         height, width, body: those of the data.
@@ -118,7 +118,7 @@ class FitPoseHead(DensityHead, Fitted):
         *,
         renderer: Renderer,
         steps: Annotated[int, Field(ge=1, le=1000)] = 30,
-        restarts: Annotated[int, Field(ge=0, le=100)] = 2,
+        restarts: Annotated[int, Field(ge=0, le=100)] = 1,
         enough: Annotated[float, Field(gt=0, le=1)] = 0.003,
         height: Side = 128,
         width: Side = 96,

@@ -130,7 +130,7 @@ _KEYS = (
 
 
 def place_errors(
-    found: Float[Tensor, "*batch number"], wanted: Float[Tensor, "*batch number"]
+    found: Float[Tensor, "*batch number"], wanted: Float[Tensor, "*#batch number"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Degrees between two rotations and centimetres between two translations, float64."""
     found, wanted = found.double(), wanted.double()
