@@ -177,8 +177,8 @@ def report() -> None:
     text = [
         "# fit_pose: a body's pose by descent through the rasteriser",
         "",
-        "Synthetic pictures of the default body (13,718 vertices), 128 × 96 pixels, drawn with 8 × 8 samples a pixel: a "
-        "person of random shape in a random pose, turned by exactly 30° about a random axis and moved by 20 cm in a "
+        "Synthetic pictures of the default body (13,718 vertices), 128 × 96 pixels, drawn with 8 × 8 samples a pixel: "
+        "a person of random shape in a random pose, turned by exactly 30° about a random axis and moved by 20 cm in a "
         "random direction from where every descent starts. 30 numbers are fitted: rotation, translation, 20 movements "
         "of joints, 4 of shape. `density_head=fit_pose`, the same settings for every gradient; at most one restart.",
         "",
@@ -189,8 +189,8 @@ def report() -> None:
         "",
         f"![Start, target and ends of start {typical}; errors against steps and seconds](fit_pose.png)",
         "",
-        f"Above: start {typical}, the middle one of `boundary`. Below: medians, and between quartiles, of the errors; a "
-        "second try shows as a jump.",
+        f"Above: start {typical}, the middle one of `boundary`. Below: medians, and between quartiles, of the errors; "
+        "a second try shows as a jump.",
         "",
         f"{machine('torch', 'numba', 'numpy')} Command: `python benchmarks/fit_pose.py`.",
         "",

@@ -113,9 +113,7 @@ class PoseError(Metric, Pictured):
         if not self.shown:
             return errors(self._seen(), title, synthetic=synthetic)
         order = sorted(self.shown, key=lambda one: max(one.degrees / NEAR[0], one.centimetres / NEAR[1]))
-        names = dict(
-            zip(("best", "middle", "worst"), (order[0], order[len(order) // 2], order[-1]), strict=True)
-        )
+        names = {"best": order[0], "middle": order[len(order) // 2], "worst": order[-1]}
         return descents(names, title, synthetic=synthetic)
 
     def _seen(self) -> Float[Tensor, "sample 2"]:
@@ -133,7 +131,7 @@ def place_errors(
     found: Float[Tensor, "*batch number"], wanted: Float[Tensor, "*#batch number"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Degrees between two rotations and centimetres between two translations, float64."""
-    found, wanted = found.double(), wanted.double()
+    found, wanted = found.double(), wanted.double().expand_as(found)
     one, other = (
         turns_less_identity(numbers[..., :3]) + torch.eye(3, dtype=torch.float64, device=numbers.device)
         for numbers in (found, wanted)

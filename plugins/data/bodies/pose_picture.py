@@ -1,23 +1,19 @@
 """Pictures of descents: start, target and end, and errors against steps and time."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from framework.figures.style import COLOURS, GREY, titled_figure
 from framework.geometry.light import eight_bit
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from plugins.data.bodies.pose_error import Shown
+from plugins.data.bodies.pose_error import Shown
 
 
-def descents(samples: Mapping[str, "Shown"], title: str, *, synthetic: bool) -> "Figure":
+def descents(samples: Mapping[str, Shown], title: str, *, synthetic: bool) -> Figure:
     """A row for each sample: start, target, end, what is left between them, and the errors against steps."""
     figure = titled_figure((11, 3.2 * len(samples)), title, synthetic)
     axes = figure.subplots(len(samples), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 2.2))
@@ -48,7 +44,7 @@ def error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
     axis.grid(color=GREY, alpha=0.2)
 
 
-def errors(found: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> "Figure":
+def errors(found: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
     """Both errors of every sample, of predictions that tell nothing of how they were found."""
     figure = titled_figure((5, 4.2), title, synthetic)
     axis = figure.subplots()
