@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -290,7 +291,13 @@ def painted(body: Body) -> Float[np.ndarray, "vertex 4"]:
     return np.concatenate([found.clip(0.02, 0.98), np.ones((len(found), 1))], 1).astype(np.float32)
 
 
-@cache
 def figure_of(file: str | None) -> Figure:
-    """The figure of a body; read once, since data and whatever fits it want the same. Nobody writes to it."""
+    """The figure of a body; read once, since data and whatever fits it want the same, and again where the file changed.
+    Nobody writes to it."""
+    known = None if file is None else Path(file).expanduser()
+    return _read(file, known.stat().st_mtime_ns if known is not None and known.is_file() else None)
+
+
+@cache
+def _read(file: str | None, changed: int | None) -> Figure:
     return Figure(file)

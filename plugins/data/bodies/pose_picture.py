@@ -15,7 +15,7 @@ from plugins.data.bodies.pose_error import Shown
 
 def descents(samples: Mapping[str, Shown], title: str, *, synthetic: bool) -> Figure:
     """A row for each sample: start, target, end, what is left between them, and the errors against steps."""
-    figure = titled_figure((11, 3.2 * len(samples)), title, synthetic)
+    figure = titled_figure((11.0, 3.2 * len(samples)), title, synthetic)
     axes = figure.subplots(len(samples), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 2.2))
     for row, (name, sample) in zip(axes, samples.items(), strict=True):
         gap = (sample.end - sample.target).abs()
@@ -46,7 +46,7 @@ def error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
 
 def errors(found: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
     """Both errors of every sample, of predictions that tell nothing of how they were found."""
-    figure = titled_figure((5, 4.2), title, synthetic)
+    figure = titled_figure((5.0, 4.2), title, synthetic)
     axis = figure.subplots()
     degrees, centimetres = found.clamp(min=1e-3).T
     axis.loglog(degrees, centimetres, "o", color=COLOURS[0], alpha=0.6)

@@ -5,6 +5,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
+from torch.distributions import Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
@@ -288,3 +289,12 @@ def test_stages_let_go_of_the_usual_pose():
     pulls = [stage.pull for stage in STAGES]
     assert pulls == sorted(pulls, reverse=True)
     assert all(8 % stage.part == 0 for stage in STAGES)
+
+
+def test_the_metric_draws_densities_that_do_not_say_how_they_were_found(data):
+    metric = build("metric", resolve("metric", {"name": "pose_error"}), target=data.target)
+    batch = data.splits().test.__getitems__(range(3))
+    there = Independent(Normal(batch["target"], torch.full_like(batch["target"], 1e-6)), 1)
+    metric.update(Prediction(there, batch))
+    assert metric.compute()["found"] == 1
+    assert len(metric.figure("found", synthetic=True).axes) == 1
