@@ -9,7 +9,7 @@ import torch
 from framework.configuration.registry import GROUPS, installed, load
 from framework.configuration.schema import build, parts, resolve
 from framework.data import Data
-from framework.density_head import DensityHead
+from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
 from framework.errors import ConfigError, quoted
 from framework.model import FrozenFrontEnd, Model, Predictor
@@ -30,7 +30,8 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
         ConfigError: a part of the pipeline is missing, or a plugin's name, key or value is wrong.
     """
     for group in ("data", "density_head", "encoder"):
-        if not config.get(group):
+        # a head that is fitted at once may read inputs as they are
+        if not config.get(group) and not (group == "encoder" and _fitted_at_once(config["density_head"])):
             raise ConfigError(
                 f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
                 f"or one of the installed: {group}={'|'.join(installed(group))}."
@@ -55,6 +56,10 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     if target is not None:
         build_metrics(resolved, target)
     return resolved
+
+
+def _fitted_at_once(head: Any) -> bool:
+    return issubclass(load("density_head", resolve("density_head", head)["name"]), Fitted)
 
 
 def require_outliers(resolved: Resolved) -> None:

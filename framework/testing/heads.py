@@ -83,9 +83,9 @@ class HeadSubject:
 
 
 def ready(head: DensityHead, target: Target) -> DensityHead:
-    """The head itself; one that is fitted at once has seen a few drawn features and targets."""
+    """The head itself; one that is fitted at once has seen a few drawn features, as many as it wants, and targets."""
     if isinstance(head, Fitted):
-        features = torch.randn(200, 4, generator=torch.Generator().manual_seed(SEED))
+        features = torch.randn(200, head.size or 4, generator=torch.Generator().manual_seed(SEED))
         head.fit(features, values(target, (200,)), SEED)
     return head
 

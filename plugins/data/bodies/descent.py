@@ -1,0 +1,270 @@
+"""Fits a figure to a picture by gradient descent through a differentiable renderer, from coarse to fine.
+
+The loss is the squared difference of two pictures, colours and silhouette, drawn at a fraction of the size and blurred
+(both make far-away edges feel one another), plus a weak pull to the usual pose. Its gradient is the renderer's. Steps
+are quasi-Newton (BFGS with Powell's damping; Nocedal & Wright 2006, procedure 18.2), started from the curvature that
+the optical flow of the drawn picture gives: a pixel changes by its slope along rows and columns times the motion of the
+surface there (Lucas & Kanade 1981), of which the body model knows the slopes in closed form.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from framework.geometry.camera import Camera
+from framework.renderer import Renderer
+from plugins.data.bodies.figure import Figure
+
+
+class Stage(NamedTuple):
+    """One picture of the pyramid.
+
+    Attributes:
+        part: its size is 1/part of the whole picture's.
+        blur: standard deviation, its own pixels.
+        pull: to the usual pose, by squared standard deviations; the loss sums over pixels of the whole picture.
+    """
+
+    part: int
+    blur: float
+    pull: float
+
+
+STAGES = (
+    Stage(4, 2.0, 10.0),
+    Stage(4, 2.0, 1.0),
+    Stage(4, 1.0, 0.3),
+    Stage(2, 1.0, 0.03),
+    Stage(2, 0.7, 0.003),
+    Stage(1, 1.5, 1e-4),
+    Stage(1, 0.8, 0.0),
+)
+AGAIN_FROM = 2
+"""The stage at which a second try from another pose starts."""
+AFRESH = 6
+"""Steps after which the curvature is made anew from the optical flow."""
+DAMPING, LEAST = 0.01, 1e-3
+"""Added to the curvature: this share of its diagonal, and this much."""
+LONGEST = (0.2, 0.08)
+"""Longest step of a rotation (radians) and a translation (metres); of other numbers it is their spread."""
+SHORTER, TRIES = 0.4, 6
+"""By how much a step that raises the loss is shortened, and how often."""
+CONVERGED, IN_A_ROW = 5e-4, 3
+"""A stage ends with this many steps in a row that lower the loss by less than this share."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a descent ended and how it went.
+
+    Attributes:
+        numbers: of the figure.
+        difference: root mean square of the last stage's pictures' difference.
+        path: of each step taken, in order: loss, processor time since the start (seconds), numbers.
+    """
+
+    numbers: Float[Tensor, "number"]
+    difference: float
+    path: Float[Tensor, "step columns"]
+
+
+class Descent:
+    """Fits numbers of a figure to pictures.
+
+    Args:
+        figure: what is seen.
+        renderer: draws it, differentiably.
+        camera: from where.
+        steps: most steps of a stage.
+        restarts: how often the descent is tried from other poses while the pictures differ by more than `enough`.
+        enough: root mean square difference of colours.
+    """
+
+    def __init__(
+        self, figure: Figure, renderer: Renderer, camera: Camera, *, steps: int, restarts: int, enough: float
+    ) -> None:
+        self.figure, self.renderer, self.camera = figure, renderer, camera
+        self.steps, self.restarts, self.enough = steps, restarts, enough
+        self.stiffness = torch.cat([figure.spread.new_zeros(6), figure.spread[6:] ** -2])
+        self.longest = torch.cat(
+            [*(figure.spread.new_full((3,), most) for most in LONGEST), figure.spread[6:]]
+        )
+
+    def __call__(self, picture: Float[Tensor, "height width 4"]) -> Fit:
+        """The best of all tries; a picture's fit depends on nothing but the picture."""
+        began = time.process_time()
+        random = torch.Generator().manual_seed(0)
+        best = self._once(picture, torch.zeros_like(self.stiffness), STAGES, began)
+        path = [best.path]
+        for _ in range(self.restarts):
+            if best.difference <= self.enough:
+                break
+            start = best.numbers.clone()
+            start[6:] = self.figure.spread[6:] * torch.randn(
+                len(start) - 6, generator=random, dtype=start.dtype
+            )
+            other = self._once(picture, self._limited(start), STAGES[AGAIN_FROM:], began)
+            path.append(other.path)
+            best = min(best, other, key=lambda fit: fit.difference)
+        return Fit(best.numbers, best.difference, torch.cat(path))
+
+    def _once(self, picture: Tensor, start: Tensor, stages: Sequence[Stage], began: float) -> Fit:
+        numbers, path = start, []
+        loss = 0.0
+        for stage in stages:
+            camera = smaller(self.camera, stage.part)
+            aim = blurred(reduced(picture, stage.part), stage.blur)
+
+            def look(
+                at: Tensor, stage: Stage = stage, camera: Camera = camera, aim: Tensor = aim
+            ) -> tuple[float, Tensor]:
+                return self._loss(at, stage, camera, aim)
+
+            loss, slope = look(numbers)
+            curvature, age, small = torch.empty(0), AFRESH, 0
+            for _ in range(self.steps):
+                if age == AFRESH:
+                    curvature, age = self._curvature(numbers, stage), 0
+                direction = -torch.linalg.solve(curvature, slope)
+                length = min(1.0, 1 / float((direction.abs() / self.longest).max()))
+                lower = False
+                for _ in range(TRIES):
+                    there = self._limited(numbers + length * direction)
+                    found, along = look(there)
+                    curvature = updated(curvature, there - numbers, along - slope)
+                    if lower := found < loss:
+                        break
+                    length *= SHORTER
+                if not lower and age == 0:
+                    break
+                age = age + 1 if lower else AFRESH
+                if not lower:
+                    continue
+                small = small + 1 if loss - found < CONVERGED * loss else 0
+                numbers, loss, slope = there, found, along
+                path.append(torch.cat([numbers.new_tensor([loss, time.process_time() - began]), numbers]))
+                if small == IN_A_ROW:
+                    break
+        unpulled = loss - stages[-1].pull * float((numbers.square() * self.stiffness).sum())
+        steps = torch.stack(path) if path else numbers.new_zeros(0, 2 + len(numbers))
+        return Fit(numbers, (max(unpulled, 0.0) / picture.numel()) ** 0.5, steps)
+
+    def _loss(
+        self, numbers: Tensor, stage: Stage, camera: Camera, aim: Tensor
+    ) -> tuple[float, Float[Tensor, "number"]]:
+        """The loss of a stage and its gradient."""
+        with torch.enable_grad():
+            given = numbers.detach().requires_grad_()
+            drawn = self.renderer(self.figure.scene(given, camera))["color"]
+            loss = (blurred(drawn, stage.blur) - aim).square().sum().double() * stage.part**2
+            loss = loss + stage.pull * (given.square() * self.stiffness).sum()
+            (slope,) = torch.autograd.grad(loss, given)
+        return float(loss.detach()), slope
+
+    def _limited(self, numbers: Tensor) -> Tensor:
+        least, most = self.figure.limits.unbind(1)
+        return torch.minimum(torch.maximum(numbers, least), most)
+
+    def _curvature(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "number number"]:
+        """Of the loss, damped: twice the sum of outer products of the slopes of its blurred pixels (Gauss-Newton)."""
+        slopes = self._flow(numbers, stage)
+        found = 2 * stage.part**2 * (slopes.T @ slopes).double() + (2 * stage.pull * self.stiffness).diag()
+        return found + (DAMPING * found.diag() + LEAST).diag()
+
+    @torch.no_grad()
+    def _flow(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "pixel number"]:
+        """Of every colour of a stage's pixels the slope in every number, by the optical flow of the whole picture."""
+        camera, figure = self.camera, self.figure
+        drawn = self.renderer(figure.scene(numbers, camera), ("color", "face"))
+        color, face = drawn["color"], drawn["face"].numpy()
+        height, width = camera.height // stage.part, camera.width // stage.part
+        if (face < 0).all():
+            return color.new_zeros(height * width * 4, len(numbers))
+        across, down = torch.zeros_like(color), torch.zeros_like(color)
+        across[:, 1:-1] = (color[:, 2:] - color[:, :-2]) / 2
+        down[1:-1] = (color[2:] - color[:-2]) / 2
+        # what changes in a pixel beside the body is the nearest part of the body
+        nearest = distance_transform_edt(face < 0, return_distances=False, return_indices=True)
+        assert isinstance(nearest, np.ndarray)
+        shown = torch.from_numpy(face[tuple(nearest)])
+        row, column = ((across != 0) | (down != 0)).any(-1).nonzero(as_tuple=True)
+        vertex, which = figure.faces[shown[row, column].long(), 0].long().unique(return_inverse=True)
+        motion = self._motion(numbers, vertex)[which]
+        flow = torch.stack([across[row, column], down[row, column]], -1) @ motion  # (pixel, 4, number)
+        place = (row // stage.part) * width + column // stage.part
+        small = color.new_zeros(height * width, flow[0].numel())
+        small.index_add_(0, place, flow.flatten(1) / stage.part**2)
+        return blurred(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
+
+    def _motion(self, numbers: Tensor, vertex: Tensor) -> Float[Tensor, "vertex 2 number"]:
+        """Slopes of the pixels at which some vertices are seen."""
+        camera = self.camera
+        rotation = camera.rotation
+        seen = self.figure.placed(numbers, vertex) @ rotation.T + camera.translation
+        along = torch.einsum("ab,vbp->vap", rotation, self.figure.slopes(numbers, vertex))
+        focal = torch.as_tensor(camera.focal)[:, None]
+        part = (seen[:, :2] / seen[:, 2:])[..., None]
+        return focal * (along[:, :2] - part * along[:, 2:]) / seen[:, 2:, None]
+
+
+def updated(
+    curvature: Float[Tensor, "number number"], step: Float[Tensor, "number"], change: Float[Tensor, "number"]
+) -> Float[Tensor, "number number"]:
+    """A curvature with what a step taught of it: `change` is that of the slope; stays positive definite."""
+    expected = curvature @ step
+    square = float(step @ expected)
+    if not square > 0:
+        return curvature
+    seen = float(step @ change)
+    if seen < 0.2 * square:
+        share = 0.8 * square / (square - seen)
+        change = share * change + (1 - share) * expected
+    return (
+        curvature - torch.outer(expected, expected) / square + torch.outer(change, change) / (step @ change)
+    )
+
+
+def smaller(camera: Camera, part: int) -> Camera:
+    """The same view with 1/part of the pixels along each axis, each the mean of part × part."""
+    (x, y), (column, row) = camera.focal, camera.principal
+    return replace(
+        camera,
+        focal=(float(x) / part, float(y) / part),
+        principal=((float(column) + 0.5) / part - 0.5, (float(row) + 0.5) / part - 0.5),
+        height=camera.height // part,
+        width=camera.width // part,
+    )
+
+
+def reduced(
+    picture: Float[Tensor, "height width channels"], part: int
+) -> Float[Tensor, "_height _width channels"]:
+    """Means of part × part pixels."""
+    return avg_pool2d(picture.movedim(-1, 0), part).movedim(0, -1)
+
+
+def blurred(
+    picture: Float[Tensor, "height width channels"], deviation: float
+) -> Float[Tensor, "height width channels"]:
+    """Convolved with a Gaussian of this standard deviation, pixels, cut at three of them; black beyond the picture."""
+    height, width, _ = picture.shape
+    rows = (gaussian(height, deviation) @ picture.flatten(1)).view_as(picture)
+    return gaussian(width, deviation) @ rows
+
+
+@cache
+def gaussian(length: int, deviation: float) -> Float[Tensor, "length length"]:
+    """The convolution of so many pixels as a matrix, which is faster for few pixels than a convolution."""
+    apart = torch.arange(length)[:, None] - torch.arange(length)
+    weights = (-0.5 * (apart / deviation).square()).exp().where(apart.abs() <= round(3 * deviation), 0.0)
+    reach = torch.arange(-round(3 * deviation), round(3 * deviation) + 1)
+    return weights / (-0.5 * (reach / deviation).square()).exp().sum()

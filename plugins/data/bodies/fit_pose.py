@@ -1,0 +1,217 @@
+"""A density head that fits a body to the picture itself; the contract is framework.density_head's."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Annotated, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal
+
+from framework.density_head import DensityHead, Fitted
+from framework.distributions.protocol import images, median
+from framework.errors import ConfigError
+from framework.geometry.camera import Camera
+from framework.heads.parameters import require_finite
+from framework.renderer import Renderer
+from framework.target import Target
+from plugins.data.bodies.descent import Descent, Fit
+from plugins.data.bodies.figure import Figure, figure_of
+from plugins.data.bodies.pose_images import Side
+
+FLOOR = 1e-5
+"""Least standard deviation of a number."""
+SLACK = 1e-3
+"""By how much a picture's numbers may be outside of [0, 1]."""
+NEEDED = frozenset(("vertices",))
+"""In what a renderer must be differentiable."""
+
+
+class PoseDensity(Independent):
+    """Normal densities of a figure's numbers, independent of one another, about where each descent ended.
+
+    Args:
+        mean, scale: (*batch, number).
+        fits: how each descent went, in the order of the flattened batch; None where there was nothing to fit.
+        figure, renderer, camera: what the numbers mean, and how it looks.
+    """
+
+    def __init__(
+        self,
+        mean: Tensor,
+        scale: Tensor,
+        fits: list[Fit | None],
+        figure: Figure,
+        renderer: Renderer,
+        camera: Camera,
+    ) -> None:
+        super().__init__(Normal(mean, scale, validate_args=False), 1, validate_args=False)
+        self.fits, self.figure, self.renderer, self.camera = fits, figure, renderer, camera
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.base_dist.log_prob(value).sum(-1)
+
+    def entropy(self) -> Tensor:
+        return self.base_dist.entropy().sum(-1)
+
+    @torch.no_grad()
+    def images(self, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
+        """The bodies at the mode, as `protocol.images` says."""
+        shape = self.batch_shape
+        scenes = [
+            self.figure.scene(numbers, self.camera) for numbers in self.mode.reshape(-1, self.event_shape[0])
+        ]
+        scenes = [
+            replace(scene, colors=None if scene.colors is None else scene.colors[:, :3]) for scene in scenes
+        ]
+        drawn = self.renderer.batch(scenes, channels)
+        return {
+            name: torch.stack([one[name] for one in drawn]).unflatten(0, shape) if shape else drawn[0][name]
+            for name in channels
+        }
+
+
+@images.register
+def _(density: PoseDensity, channels: Collection[str]) -> dict[str, Tensor]:
+    return density.images(channels)
+
+
+@median.register
+def _(density: PoseDensity, samples: int) -> Tensor:
+    # each is symmetric about its mean
+    return density.mean
+
+
+class FitPoseHead(DensityHead, Fitted):
+    """Descends from the nominal pose to the picture through a differentiable renderer (plugins.data.bodies.descent).
+
+    Reads pictures of `data=pose_from_image` as they are, without an encoder. The density is normal about the descent's
+    end; `calibrate` measures how wide, from its errors on the validation set, apart for descents whose picture differs
+    from the given one by more than `enough` and for those that agree. Before that, and of what is no picture of a body
+    (numbers outside of [0, 1], no silhouette), the density is that of the training set: about
+    0, as wide as its targets.
+    The density's gradient in the picture is said to be 0.
+
+    Attributes:
+        steps: most steps of a stage (a knob).
+
+    Args:
+        renderer: draws what is compared with the picture; differentiable.
+        steps: most steps of a stage; there are seven.
+        restarts: how often another pose is tried while pictures differ by more than `enough`.
+        enough: root mean square difference of colours.
+        height, width, body: those of the data.
+
+    Raises:
+        ConfigError: a renderer without gradients, or a target that is no such body's.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30)}
+    bibtex = """@article{lucas1981iterative,
+  author = {Lucas, Bruce D. and Kanade, Takeo},
+  title = {An iterative image registration technique with an application to stereo vision},
+  journal = {International Joint Conference on Artificial Intelligence},
+  pages = {674--679},
+  year = {1981}
+}"""
+
+    prior: Tensor
+    spread: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        renderer: Renderer,
+        steps: Annotated[int, Field(ge=1, le=1000)] = 30,
+        restarts: Annotated[int, Field(ge=0, le=100)] = 1,
+        enough: Annotated[float, Field(gt=0, le=1)] = 0.003,
+        height: Side = 128,
+        width: Side = 96,
+        body: str | None = None,
+    ) -> None:
+        super().__init__()
+        target.require("real", by="density_head fit_pose")
+        if missing := NEEDED - renderer.differentiable or {"color", "face"} - renderer.channels:
+            raise ConfigError(
+                f"density_head.renderer = {type(renderer).__name__} has no gradient in, or does not draw, "
+                f"{' and '.join(sorted(missing))}; wanted one to descend by. Choose another renderer."
+            )
+        self.figure = figure_of(body)
+        if target.names != self.figure.names:
+            raise ConfigError(
+                f"density_head fit_pose fits {self.figure.source}, whose numbers are {', '.join(self.figure.names)}; "
+                f"the data's are {target.told}. Choose data=pose_from_image, with the same body for both."
+            )
+        self.camera = self.figure.camera(height, width)
+        self.renderer = renderer
+        self.steps, self.restarts, self.enough = steps, restarts, enough
+        self.size = 4 * height * width
+        numbers = len(target.names)
+        spread = torch.tensor(target.scale or (1.0,) * numbers, dtype=torch.float64)
+        self.register_buffer("prior", spread)
+        self.register_buffer("spread", spread.expand(2, -1).clone())
+
+    def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        self.prior.copy_(target.double().square().mean(0).sqrt().clamp(min=FLOOR))
+        self.spread.copy_(self.prior.expand(2, -1))
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        raw = require_finite(raw, self.size)
+        fits = self._fits(raw)
+        # a descent's end is piecewise constant in what a picture's rounding shows: no gradient is claimed
+        zero = (raw * 0).sum(-1, keepdim=True)
+        mean = self._rows([self.prior * 0 if fit is None else fit.numbers for fit in fits], raw) + zero
+        scale = self._rows([self._width(fit) for fit in fits], raw)
+        return PoseDensity(mean, scale, fits, self.figure, self.renderer, self.camera)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        fits = self._fits(require_finite(raw, self.size))
+        for agrees in (True, False):
+            errors = [
+                fit.numbers - wanted
+                for fit, wanted in zip(fits, target.double().cpu(), strict=True)
+                if fit is not None and self._agrees(fit) == agrees
+            ]
+            if errors:
+                square = torch.stack(errors).square().mean(0)
+                self.spread[int(agrees)] = square.sqrt().clamp(min=FLOOR).to(self.spread)
+
+    def _fits(self, raw: Tensor) -> list[Fit | None]:
+        """Of each picture of a flattened batch; None of what is none."""
+        descent = Descent(
+            self.figure,
+            self.renderer,
+            self.camera,
+            steps=self.steps,
+            restarts=self.restarts,
+            enough=self.enough,
+        )
+        pictures = raw.detach().reshape(-1, 4, self.camera.height, self.camera.width)
+        return [
+            descent(picture.clamp(0, 1).to("cpu", torch.float32).movedim(0, -1).contiguous())
+            if is_picture(picture)
+            else None
+            for picture in pictures
+        ]
+
+    def _agrees(self, fit: Fit) -> bool:
+        return fit.difference <= self.enough
+
+    def _width(self, fit: Fit | None) -> Float[Tensor, "number"]:
+        return self.prior if fit is None else self.spread[int(self._agrees(fit))]
+
+    def _rows(self, rows: list[Tensor], raw: Tensor) -> Float[Tensor, "*batch number"]:
+        found = torch.stack(rows) if rows else self.prior.new_zeros(0, len(self.prior))
+        return found.to(raw).reshape(*raw.shape[:-1], len(self.prior))
+
+
+def is_picture(picture: Float[Tensor, "4 height width"]) -> bool:
+    """Whether it may be the picture of a body: numbers in [0, 1] but for rounding, and a silhouette."""
+    return bool((picture >= -SLACK).all() and (picture <= 1 + SLACK).all() and (picture[3] > 0.5).any())
