@@ -243,8 +243,10 @@ def test_the_density_knows_how_far_off_it_is(data):
     wanted = norm.logpdf(target.double(), density.mean.double(), density.stddev.double()).sum(1)
     np.testing.assert_allclose(density.log_prob(target), wanted, rtol=1e-4)
     np.testing.assert_allclose(density.entropy(), norm.entropy(0, density.stddev.double()).sum(1), rtol=1e-4)
-    images = density.images(("color", "mask"))
-    assert images["color"].shape == (6, 48, 40, 4) and images["mask"].shape == (6, 48, 40)
+    seen = Prediction(density, batch, reads=("color", "mask"))
+    assert seen.image("color").shape == seen.true_image("color").shape == (6, 48, 40, 3)
+    assert seen.image("mask").shape == seen.true_image("mask").shape
+    assert (seen.image("color") - seen.true_image("color"))[agrees].abs().mean() < 0.01
 
 
 def test_the_metric_sees_what_arrived(data):
