@@ -128,8 +128,9 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
             lean = (screen[other, axis] / SUBPIXELS - here) / (end - start)
             opposite = here + lean * (screen[third, 1 - axis] / SUBPIXELS - start)
             outwards = 1 if opposite > screen[third, axis] / SUBPIXELS else -1
-            first_line = np.int64(np.ceil(max(min(start, end), 0.0)))
-            last_line = np.int64(np.floor(min(max(start, end), lines - 1.0)))
+            # within the lines before the casts, which hold no end that is 1e30 lines away
+            first_line = np.int64(np.ceil(min(max(min(start, end), 0.0), lines)))
+            last_line = np.int64(np.floor(max(min(max(start, end), lines - 1.0), -1.0)))
             for line in range(first_line, last_line + 1):
                 crossing = here + lean * (line - start)
                 inner = np.floor(crossing) if outwards > 0 else np.ceil(crossing)
