@@ -55,8 +55,8 @@ def report() -> str:
             "# rasterizer: each pixel of a surface is covered once",
             "",
             f"A tessellated plane of 8 × 8 m under {CAMERAS:,} random cameras: any azimuth, elevation and tilt, 0.05 "
-            "to 10,000 m away, focal lengths of 0.001 to 1,000,000 pixels, principal points in and out of the image, 1 to "
-            "64 pixels a side, with what the near plane cuts; a third of them square on, with edges through pixel "
+            "to 10,000 m away, focal lengths of 0.001 to 1,000,000 pixels, principal points in and out of the image, 1 "
+            "to 64 pixels a side, with what the near plane cuts; a third of them square on, with edges through pixel "
             "centres. Faces are drawn one by one and counted; where the plane lies is computed by rays, and pixels "
             "within 1/128 pixel of its border are left out.",
             "",
