@@ -115,8 +115,8 @@ def learned(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dic
         "vertices": scene.vertices,
         "rotation": seen.rotation,
         "translation": seen.translation,
-        "focal": torch.as_tensor(seen.focal),
-        "principal": torch.as_tensor(seen.principal),
+        "focal": torch.as_tensor(seen.focal, dtype=torch.float64),
+        "principal": torch.as_tensor(seen.principal, dtype=torch.float64),
     }
     if scene.colors is not None:
         parts["colors"] = scene.colors
@@ -158,7 +158,8 @@ def test_no_gradient_is_NaN_or_infinite(name: str, gradient: Gradient) -> None:
 
 
 def wild(seed: int) -> Scene:
-    """Coordinates of any size that float32 holds, most of them in front of a camera with any lens; few are alike."""
+    """Coordinates of any size that float32 holds, most of them in front of a camera with any lens; few are alike, or,
+    on a grid with edges through the eye and through pixel centres, most."""
     random = np.random.default_rng(seed)
     count, size = int(random.integers(3, 12)), random.choice([1e-25, 1e-3, 1.0, 1e3, 1e25])
     spread = random.choice([0.0, 1.0, 5.0, 36.0])
@@ -168,6 +169,10 @@ def wild(seed: int) -> Scene:
     vertices[before, 2] = np.abs(vertices[before, 2])
     if random.random() < 0.5:  # as far aside as away
         vertices[:, :2] *= np.abs(vertices[:, 2:]) / sizes[:, :2]
+    if random.random() < 0.3:
+        vertices = np.concatenate(
+            [random.integers(-4, 5, (count, 2)) / 4, random.choice([-1, 0, 0.25, 1, 1, 2], (count, 1))], 1
+        )
     faces = random.integers(0, count, (random.integers(1, 12), 3))
     near, focal = random.choice([1e-37, 1e-20, 1e-3, 1.0]), random.choice([1e-3, 0.3, 8.0, 1e3, 1e6])
     camera = ahead(*(int(side) for side in random.integers(1, 13, 2)), float(near), float(focal))
