@@ -2,7 +2,7 @@
 
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from types import ModuleType
 
@@ -14,6 +14,8 @@ from torch import Tensor
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import Camera, look_from
 from framework.renderer import Renderer, Scene, Texture, joined
+from framework.testing.extremes import extremes
+from framework.testing.finding import examined
 from framework.testing.scenes import sphere
 from tests.conftest import STRANGER
 
@@ -186,3 +188,41 @@ def test_pictures_are_those_of_rays_but_for_edges(stranger: ModuleType) -> None:
 def test_of_slivers_too_only_edges_differ(name: str, stranger: ModuleType) -> None:
     number, unexplained = compared(SLIVERS[name](), stranger.RayCaster())
     assert not unexplained and number < 0.01 * math.prod(SIZE)
+
+
+class Faulty(Renderer):
+    """The rasteriser, with what it is given and what it draws passed through two functions."""
+
+    bibtex = ""
+    channels = frozenset(("color", "depth"))
+    differentiable = frozenset(("vertices", "colors"))
+
+    def __init__(self, before: Callable[[Tensor], Tensor], after: Callable[[Tensor], Tensor]) -> None:
+        self.before, self.after = before, after
+        self.inner = build("renderer", resolve("renderer", {"name": "rasterizer"}))
+
+    def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
+        drawn = self.inner(replace(scene, vertices=self.before(scene.vertices)), channels)
+        return {name: self.after(picture) if name == "color" else picture for name, picture in drawn.items()}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        (lambda vertices: vertices, lambda color: color, None),
+        (lambda vertices: vertices.float(), lambda color: color, "millimetres at"),
+        (
+            lambda vertices: vertices.where(vertices.abs() < 1e20, math.nan),
+            lambda color: color,
+            "1e30 m away",
+        ),
+        (lambda vertices: vertices, lambda color: color.square().sqrt(), "slope of"),
+        (lambda vertices: vertices, lambda color: color / color.sum(), "color of"),
+    ],
+)
+def test_the_contract_finds_what_extreme_scenes_break(
+    before: Callable[[Tensor], Tensor], after: Callable[[Tensor], Tensor], told: str | None
+) -> None:
+    finding = examined("extreme scenes", 0.0, lambda worst: extremes(Faulty(before, after), worst))
+    assert finding.holds == (told is None), finding
+    assert told is None or told in finding.worst
