@@ -94,10 +94,12 @@ def cast(corners: Tensor, ray: Tensor, near: float) -> Hits:
     face = torch.full(ray.shape[:2], -1)
     good = (corners.isfinite().all(-1).all(-1) & (corners[..., 2] >= near).any(-1)).nonzero()[:, 0]
     for top in range(0, len(face), TILE):
+        band = good[possible(corners[good], ray[top : top + TILE].reshape(-1, 3))]
+        names = torch.cat([band, band.new_tensor([-1])])
         for left in range(0, face.shape[1], TILE):
             tile = slice(top, top + TILE), slice(left, left + TILE)
-            found = first(corners[good], ray[tile].reshape(-1, 3), near)
-            face[tile] = torch.cat([good, good.new_tensor([-1])])[found].reshape(face[tile].shape)
+            found = first(corners[band], ray[tile].reshape(-1, 3), near)
+            face[tile] = names[found].reshape(face[tile].shape)
     face, ray = face.reshape(-1), ray.reshape(-1, 3)
     shown = corners[face.clamp(min=0)] if len(corners) else corners.new_zeros(len(ray), 3, 3)
     a, b, c = shown.unbind(1)
