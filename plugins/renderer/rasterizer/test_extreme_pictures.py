@@ -244,3 +244,26 @@ def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient)
     empty = Scene(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), torch.zeros(0, 3), ahead(1, 1))
     assert (Rasterizer(gradient=gradient)(empty)["color"] == 0).all()
     assert (Rasterizer(gradient=gradient)(joined([empty, empty]), ("face",))["face"] == -1).all()
+
+
+@pytest.mark.parametrize("gradient", KINDS)
+def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> None:
+    """To the bit, where depths are as many times as long; with `boundary`, from lenses on that see surfaces apart which
+    are a pixel's width apart, in this scene 512 pixels."""
+    first: dict[str, torch.Tensor] = {}
+    for power in range(9 if gradient == "boundary" else -10, 21):
+        focal = 2.0**power
+        corners = np.concatenate([8 * crossing()[:, :2] * crossing()[:, 2:], focal * crossing()[:, 2:]], 1)
+        camera = ahead(20, 24, near=focal * 2.0**-10, focal=focal)
+        scene, parts = learned(meshed(corners, camera), torch.float64, gradient != "soft")
+        color = Rasterizer(gradient=gradient)(scene)["color"]
+        weight = torch.linspace(-1, 2, color.numel()).reshape(color.shape)
+        names = [name for name in parts if name != "rotation"]  # it mixes axes of different units
+        found = torch.autograd.grad((color * weight).sum(), [parts[name] for name in names])
+        slopes = dict(zip(names, found, strict=True))
+        slopes["focal"] = slopes["focal"] * focal
+        for name in ("vertices", "translation"):
+            slopes[name] = slopes[name] * torch.tensor([1, 1, focal])
+        first = first or slopes
+        assert all(torch.equal(slopes[name], first[name]) for name in names)
+        assert slopes["vertices"].abs().max() > 0.01
