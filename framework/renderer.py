@@ -64,7 +64,7 @@ class Report:
         faces: of the scene.
         drawn: faces whose pixels were visited.
         left_out: the other faces by the first reason that held: "outside" (no pixel centre of the image in the box
-            around it), "cut" (behind the near plane), "back" (seen from behind), "flat" (no area, or not finite),
+            around it), "behind" (the near plane), "back" (seen from behind), "flat" (no area, or not finite),
             "hidden" (behind what was drawn before); a reason that held for none is absent.
         visited: pixels of the box around what was drawn; the others were not looked at again.
         reused: what was kept from the last picture, since it had not changed: "places" of vertices on the screen, say.

@@ -51,6 +51,21 @@ def test_a_wrapper_that_mixes_densities_passes_and_one_that_averages_parameters_
     assert "averaged_committee: one member is the member" in done.out
 
 
+def test_a_strangers_renderer_passes_by_name(framework: Framework) -> None:
+    done = framework("mode=check", "renderer=ray_caster", "threads=1")
+    assert done.code == 0, done.out
+    findings = (done.folder / "check.csv").read_text(encoding="utf-8")
+    for name in (
+        "no holes",
+        "sphere: depth",
+        "what the near plane cuts",
+        "uv",
+        "textures are drawn or refused",
+    ):
+        assert name in findings
+    assert "FAILS" not in done.out
+
+
 def test_a_strangers_data_set_passes_without_rows_as_far_as_one_can_say(framework: Framework) -> None:
     done = framework("mode=check", "data=dial")
     assert done.code == 0, done.out

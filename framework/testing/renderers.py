@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene
+from framework.testing.extremes import extremes
 from framework.testing.finding import Finding, Worst, examined
 from framework.testing.painted import barycentric, gradient, normal, texture, uv
 from framework.testing.rows import RendererRow
@@ -32,6 +33,7 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "one pixel, one row": (0.0, _small),
         "where the camera says": (0.0, _places),
         "what the near plane cuts": (2e-3, _cut),
+        "extreme scenes": (0.0, extremes),
     }
     renderer = build()
     for channel, check in (("normal", normal), ("barycentric", barycentric), ("uv", uv)):

@@ -1,49 +1,20 @@
 """Compiles the functions beside it for this processor, once: machine code is kept below the framework's cache."""
 
-import os
 from collections.abc import Callable
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, no_type_check
 
-from numba import config, njit, types
+from numba import njit, types
 from numba.core.extending import intrinsic
 
-from framework.errors import DataError
-from framework.storage.cache import folder
+from framework.storage.kernels import compiler, kept_in
 
 PARTS = "compiled", "lanes", "pack", "search", "processor"
 """Files whose functions call each other."""
 
 
-def kept_in() -> str | None:
-    """A folder of this source's own, since numba looks for changes in a function's file but not in what it calls.
-
-    Below NUMBA_CACHE_DIR, else the framework's cache; None where that cannot be written: then every process compiles.
-    """
-    sources = (Path(__file__).with_name(f"{part}.py") for part in PARTS)
-    digest = sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
-    try:
-        given = vars(config)["CACHE_DIR"]
-        root = Path(given) if given else folder("numba")
-        kept = root / f"nearest-{digest}"
-        kept.mkdir(parents=True, exist_ok=True)
-    except (DataError, OSError):
-        return None
-    return str(kept) if os.access(kept, os.W_OK) else None
-
-
-KEPT_IN = kept_in()
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """Without bounds checks or the GIL; real numbers as IEEE 754 has them: no fastmath."""
-    before = vars(config)["CACHE_DIR"]
-    vars(config).update(CACHE_DIR=KEPT_IN or before)  # type: ignore[reportAttributeAccessIssue]  # read here and now
-    try:
-        return njit(nogil=True, error_model="numpy", cache=KEPT_IN is not None)(function)
-    finally:
-        vars(config).update(CACHE_DIR=before)  # type: ignore[reportAttributeAccessIssue]
+KEPT_IN = kept_in("nearest", (Path(__file__).with_name(f"{part}.py") for part in PARTS))
+compiled = compiler(KEPT_IN)
 
 
 def inlined(function: Callable[..., Any]) -> Any:

@@ -20,6 +20,9 @@ from plugins.renderer.rasterizer.textures import Laid
 Gradient = Literal["boundary", "interior", "nmr", "soft"]
 Saving = Literal["view", "box", "hidden", "unchanged"]
 NUMBERS = {"normal": 3, "barycentric": 3, "uv": 2}
+STEEPEST = 1e37
+"""Of slopes, which float32 holds, and a few of them in sum; what is steeper, where faces almost touch the eye, is this.
+"""
 
 
 @dataclass(frozen=True)
@@ -259,10 +262,14 @@ class Picture(torch.autograd.Function):
         found = backward(ctx.given, ctx.view, ctx.drawn, ctx.color, slopes, asked[:6], any(asked[10:]))
         *first, of_texels = found
         parts = [
-            torch.from_numpy(part).to(kind) if wanted and part is not None else None
+            slopes_as(part, kind) if wanted and part is not None else None
             for part, kind, wanted in zip(first, ctx.types, asked, strict=False)
         ]
         return *parts, None, None, None, None, *of_images(of_texels, ctx.images)
+
+
+def slopes_as(found: np.ndarray, kind: torch.dtype) -> Tensor:
+    return torch.from_numpy(found).clamp_(-STEEPEST, STEEPEST).to(kind)
 
 
 def of_images(
@@ -275,7 +282,7 @@ def of_images(
         if of_texels is None:
             found.append(None)
         else:
-            found.append(torch.from_numpy(of_texels[start : start + count]).reshape(shape).to(kind))
+            found.append(slopes_as(of_texels[start : start + count], kind).reshape(shape))
         start += count
     return found
 

@@ -19,16 +19,15 @@ pixels, or a column where the arrays come transposed, and a place is a pixel's n
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
+from framework.storage.kernels import compiler
 from plugins.renderer.rasterizer.boundary import along
-from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled
+from plugins.renderer.rasterizer.raster import KEPT_IN, SUBPIXELS, compiled
 
 LEAST_DISTANCE = 1e-4  # added to distances; half images, of the side that an edge moves along
 
-reordered = njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}
-)  # sums in any order, so that a processor adds several at once
+# sums in any order, so that a processor adds several at once
+reordered = compiler(KEPT_IN, fastmath={"reassoc", "contract", "nsz"})
 
 
 def sweeps(
@@ -128,8 +127,9 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
             lean = (screen[other, axis] / SUBPIXELS - here) / (end - start)
             opposite = here + lean * (screen[third, 1 - axis] / SUBPIXELS - start)
             outwards = 1 if opposite > screen[third, axis] / SUBPIXELS else -1
-            first_line = np.int64(np.ceil(max(min(start, end), 0.0)))
-            last_line = np.int64(np.floor(min(max(start, end), lines - 1.0)))
+            # within the lines before the casts, which hold no end that is 1e30 lines away
+            first_line = np.int64(np.ceil(min(max(min(start, end), 0.0), lines)))
+            last_line = np.int64(np.floor(max(min(max(start, end), lines - 1.0), -1.0)))
             for line in range(first_line, last_line + 1):
                 crossing = here + lean * (line - start)
                 inner = np.floor(crossing) if outwards > 0 else np.ceil(crossing)

@@ -15,10 +15,12 @@ An argument that is None is compiled away. `no_type_check` keeps the type checks
 kernel before it is compiled.
 """
 
+from pathlib import Path
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from framework.storage.kernels import compiler, kept_in
 
 SUBPIXELS = 256.0
 EXACT = 2.0**25
@@ -33,7 +35,10 @@ DRAWN, BEHIND, FLAT, BACK, OUTSIDE, HIDDEN = range(6)
 REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HIDDEN: "hidden"}
 
 # Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+KERNELS = "boundary", "canvas", "clipping", "interior", "nmr", "raster", "shading", "soft", "textures"
+"""Files whose functions call each other."""
+KEPT_IN = kept_in("rasterizer", (Path(__file__).with_name(f"{name}.py") for name in KERNELS))
+compiled = compiler(KEPT_IN)
 
 
 @compiled

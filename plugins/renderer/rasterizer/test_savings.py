@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from framework.geometry.camera import Camera, look_from
 from framework.renderer import Scene, Texture, joined
-from plugins.renderer.rasterizer.drawing import Saving
+from plugins.renderer.rasterizer.drawing import Gradient, Saving
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_gradient import blob
 
@@ -262,6 +262,21 @@ def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
     gc.collect()
     assert len(renderer._pool) <= 2
     assert not [thing for thing in gc.get_objects() if type(thing).__name__ == "PictureBackward"]
+
+
+@pytest.mark.parametrize("gradient", get_args(Gradient))
+def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mib(gradient: Gradient) -> None:
+    """Of NumPy's memory, outputs too; benchmarks/rasterizer_memory.md has what a process grows by."""
+    vertices, faces, colors = blob(117)
+    assert len(vertices) > 27_554
+    learned, painted = vertices.float().requires_grad_(), colors.float().requires_grad_()
+    scene = Scene(learned, faces, painted, seen(size=(410, 308)))
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    Rasterizer(gradient=gradient)(scene)["color"].sum().backward()
+    peak = tracemalloc.get_traced_memory()[1] - before
+    tracemalloc.stop()
+    assert peak < 64 * 2**20
 
 
 def test_a_renderer_can_be_copied_and_sent_to_another_process() -> None:

@@ -1,0 +1,189 @@
+"""Every pixel of a tessellated plane is covered once, counted face by face with the kernel itself."""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+import torch
+from numba import njit
+from scipy.spatial import Delaunay
+
+from framework.geometry.camera import Camera, look_from
+from plugins.renderer.rasterizer import raster
+from plugins.renderer.rasterizer.clipping import clipped
+
+MARGIN = 2 / 256  # pixels; a corner is rounded by up to 1/512 along either axis
+FAR = 4.0  # metres, half a side of the plane
+
+
+@njit(error_model="numpy")  # not kept on disk, where nothing would see that a kernel it calls has changed
+@no_type_check
+def added(screen, faces, height, width, alone, number):
+    """Add to `number`, (height, width), how many faces cover each pixel, each drawn alone; `alone` is of False."""
+    counts = np.zeros(6, np.int64)
+    for index in range(faces.shape[0]):
+        face = faces[index : index + 1]
+        box = raster.rasterise(screen, face, 0, None, False, height, width, None, None, alone, None, counts)
+        for row in range(box[0], box[1]):
+            for column in range(box[2], box[3]):
+                number[row, column] += alone[row, column]
+                alone[row, column] = False
+
+
+def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """How many faces cover each pixel, each drawn alone, and which pixels all of them cover, drawn together; by the
+    kernels that `Rasterizer` calls. Of a face that the near plane cuts each part counts as a face."""
+    rotation, translation = camera.rotation.double().numpy(), camera.translation.double().numpy()
+    lens = np.array(camera.focal), np.array(camera.principal)
+    size = camera.height, camera.width
+    seen, screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 3))
+    number, alone, mask = np.zeros(size, np.int64), np.zeros(size, np.bool_), np.zeros(size, np.bool_)
+    counts = np.zeros(6, np.int64)
+    raster.project(vertices, rotation, translation, *lens, camera.near, seen, screen)
+    corners, parts, numbers = clipped(seen, faces, *lens, camera.near)
+    for places, indices, names in ((screen, faces, None), (corners, parts, numbers)):
+        raster.rasterise(places, indices, 0, names, False, *size, None, None, mask, None, counts)
+        added(places, indices, *size, alone, number)
+    return number, mask
+
+
+def on_the_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """By rays in the world: whether that of each pixel hits the square |x|, |y| <= FAR of the plane z = 0 beyond the
+    near plane; and how far from where this ends its centre lies, pixels."""
+    back_to_world = np.linalg.inv(camera.rotation.double().numpy())
+    eye = -back_to_world @ camera.translation.double().numpy()
+    rows, columns = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
+    right, down = (
+        (columns - camera.principal[0]) / camera.focal[0],
+        (rows - camera.principal[1]) / camera.focal[1],
+    )
+    ray = np.stack([right, down, np.ones(rows.shape)], -1) @ back_to_world.T
+    steps = back_to_world[:, :2] / camera.focal  # of the ray, by a pixel to the right and by one downwards
+    # The plane's depth under the ray is d = -eye_z / ray_z, the place eye + d ray; what must be positive of these is
+    # linear in the pixel when multiplied by |eye_z| / d, and over its slope a distance in pixels.
+    away = abs(eye[2])
+    inverse, inverse_step = -np.sign(eye[2]) * ray[..., 2], -np.sign(eye[2]) * steps[2]
+    limits = [(inverse, inverse_step), (away - camera.near * inverse, -camera.near * inverse_step)]
+    for axis in range(2):
+        for sign in (1, -1):
+            off = FAR + sign * eye[axis]
+            limits.append(
+                (off * inverse + sign * away * ray[..., axis], off * inverse_step + sign * away * steps[axis])
+            )
+    inside = np.all([value >= 0 for value, _ in limits], 0)
+    distance = np.min([np.abs(value) / max(np.hypot(*slope), 1e-300) for value, slope in limits], 0)
+    return inside, distance
+
+
+def loose(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The square cut along a Delaunay triangulation of random points, bent nowhere; corners in any order."""
+    inner, along = random.uniform(-FAR, FAR, (40, 2)), random.uniform(-FAR, FAR, (4, 5))
+    ends = np.full((4, 5), FAR) * np.array([[1], [-1], [1], [-1]])
+    sides = np.concatenate([np.stack([ends[:2], along[:2]], -1), np.stack([along[2:], ends[2:]], -1)])
+    corners = FAR * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    points = np.concatenate([inner, sides.reshape(-1, 2), corners])
+    return np.pad(points, ((0, 0), (0, 1))), Delaunay(points).simplices
+
+
+def regular() -> tuple[np.ndarray, np.ndarray]:
+    """The square cut into 8 × 8 squares, and those along either diagonal in turn."""
+    row, column = np.meshgrid(np.arange(8), np.arange(8), indexing="ij")
+    a, b, c, d = (9 * (row + down) + column + right for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    odd = (row + column) % 2 == 1
+    one = np.where(odd[..., None], np.stack([a, b, c], -1), np.stack([a, b, d], -1))
+    other = np.where(odd[..., None], np.stack([b, d, c], -1), np.stack([a, d, c], -1))
+    points = np.stack(np.meshgrid(*[np.linspace(-FAR, FAR, 9)] * 2, indexing="xy"), -1).reshape(-1, 2)
+    return np.pad(points, ((0, 0), (0, 1))), np.concatenate([one.reshape(-1, 3), other.reshape(-1, 3)])
+
+
+def somewhere(random: np.random.Generator) -> Camera:
+    """Above or below the plane, near or far, with any lens, the principal point anywhere around the image."""
+    height, width = (int(side) for side in random.integers(1, 65, 2))
+    distance = float(10.0 ** random.uniform(math.log10(0.05), 4))
+    pose = random.uniform([-7, -1.57, -7], [7, 1.57, 7])
+    if random.random() < 0.2:  # along the plane
+        pose[1] = random.choice([-1, 1]) * 10.0 ** random.uniform(-6, -1)
+    camera = look_from(*pose.tolist(), distance, 1.0, (height, width))
+    focal = 10.0 ** random.uniform(-3, 6)
+    if random.random() < 0.7:  # so that the plane is about as large as the image
+        focal = 10.0 ** random.uniform(-1, 1.5) * height * distance / FAR
+    focal = np.clip(focal * random.uniform(0.7, 1.4, 2), 1e-3, 1e6).tolist()
+    principal = [width, height] * random.normal(0.5, random.choice([0, 0.5, 5]), 2)
+    shift = torch.tensor([*random.normal(0, random.choice([0, 0.5, 3]), 2), 0.0])
+    return replace(
+        camera,
+        translation=(camera.translation + shift).float(),
+        focal=(focal[0], focal[1]),
+        principal=(float(principal[0]), float(principal[1])),
+        near=float(random.choice([1e-3, 1e-6, distance])),
+    )
+
+
+def square_on(random: np.random.Generator) -> Camera:
+    """Where all numbers are exact, and the edges of the regular plane run through pixel centres."""
+    height, width = (int(side) for side in random.integers(1, 65, 2))
+    depth, pixels = 2.0 ** random.integers(-4, 14), 2.0 ** random.integers(0, 6)  # metres; pixels a metre
+    turn = np.linalg.matrix_power([[0, -1, 0], [1, 0, 0], [0, 0, 1]], int(random.integers(4))) @ np.diag(
+        [1, -1, -1]
+    )
+    shift = [*(random.integers(-8, 9, 2) / 4), depth]
+    principal = [float(place) for place in random.integers(0, [width, height])]
+    focal = float(depth * pixels)
+    return Camera(
+        torch.tensor(turn).double(),
+        torch.tensor(shift, dtype=torch.float64),
+        (focal, focal),
+        (principal[0], principal[1]),
+        height,
+        width,
+    )
+
+
+class Seen(NamedTuple):
+    """Pixels of a view.
+
+    Attributes:
+        inside: that must show the plane.
+        holes, doubled: of these, that no face covers, and that more than one covers.
+        strays: off the plane, that faces cover.
+        other: in which the whole picture disagrees with its faces.
+    """
+
+    inside: int
+    holes: int
+    doubled: int
+    strays: int
+    other: int
+
+
+def looked_at(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> Seen:
+    number, mask = covered(vertices, faces, camera)
+    inside, distance = on_the_plane(camera)
+    clear = distance > MARGIN
+    must, never = inside & clear, ~inside & clear
+    wrong = must, must & (number == 0), must & (number > 1), never & (number > 0), mask != (number > 0)
+    return Seen(*(int(pixels.sum()) for pixels in wrong))
+
+
+def views(number: int, seed: int = 0) -> Iterator[tuple[str, Seen]]:
+    """So many cameras, a third of them square on, and the plane that each sees."""
+    random = np.random.default_rng(seed)
+    planes = {"regular": regular()} | {f"loose {index}": loose(random) for index in range(5)}
+    names = list(planes)
+    for index in range(number):
+        name = names[0] if index % 2 else names[1 + index // 2 % 5]
+        camera = square_on(random) if index % 6 < 2 else somewhere(random)
+        yield name, looked_at(*planes[name], camera)
+
+
+def total(found: Iterable[tuple[str, Seen]]) -> Seen:
+    return Seen(*np.sum([seen for _, seen in found], 0).tolist())
+
+
+def test_every_pixel_of_a_tessellated_plane_is_covered_once_whatever_the_camera() -> None:
+    """From 2,000 cameras; benchmarks/rasterizer_coverage.py has 10,000."""
+    seen = total(views(2000))
+    assert seen.inside > 600_000
+    assert (seen.holes, seen.doubled, seen.strays, seen.other) == (0, 0, 0, 0)

@@ -1,0 +1,269 @@
+"""Pictures and reports of extreme scenes: right, or a sentence."""
+
+import math
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.renderer import Scene, joined
+from plugins.renderer.rasterizer.drawing import Gradient, Saving
+from plugins.renderer.rasterizer.renderer import Rasterizer
+from plugins.renderer.rasterizer.test_extreme import (
+    EVERY,
+    KINDS,
+    SCENES,
+    ahead,
+    bad_slopes,
+    crossing,
+    learned,
+    meshed,
+    wild,
+)
+
+SAVINGS = get_args(Saving)
+
+
+@settings(deadline=None, max_examples=150, derandomize=True)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.booleans(),
+    st.sets(st.sampled_from(SAVINGS)),
+    st.sets(st.sampled_from(EVERY), min_size=1),
+)
+def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_scene(
+    seed: int, cull: bool, savings: set[Saving], channels: set[str]
+) -> None:
+    """A second picture, which takes over what has not changed, reports the same."""
+    scene = wild(seed)
+    renderer = Rasterizer(cull=cull, savings=tuple(savings))
+    plain = Rasterizer(cull=cull, savings=())(scene, channels)
+    for _ in range(2):
+        found, report = renderer(scene, channels), renderer.report
+        assert report is not None
+        assert report.faces == len(scene.faces) == report.drawn + sum(report.left_out.values())
+        assert report.drawn >= 0 and all(count > 0 for count in report.left_out.values())
+        assert all(torch.equal(found[name], plain[name]) for name in channels)
+        if "face" in channels:
+            shown = found["face"].unique()
+            assert len(shown[shown >= 0]) <= report.drawn
+
+
+def with_number(scene: Scene, where: str, number: float) -> Scene:
+    """With a number that is not finite in one input: that of vertex 0 where it has one for each."""
+    camera, texture = scene.camera, scene.texture
+    assert scene.colors is not None and texture is not None
+    first = torch.zeros(len(scene.vertices), dtype=torch.bool)
+    first[0] = True
+    if where == "vertices":
+        return replace(scene, vertices=scene.vertices.where(~first[:, None], number))
+    if where == "colors":
+        return replace(scene, colors=scene.colors.where(~first[:, None], number))
+    if where == "uv":
+        return replace(scene, texture=replace(texture, uv=texture.uv.where(~first[:, None], number)))
+    if where == "texels":
+        image = texture.images[0].clone()
+        image[0, 0] = number
+        return replace(scene, texture=replace(texture, images=(image,)))
+    if where in ("rotation", "translation"):
+        return replace(
+            scene, camera=replace(camera, **{where: torch.full_like(getattr(camera, where), number)})
+        )
+    return replace(scene, camera=replace(camera, **{where: number if where == "near" else (number, 1.0)}))
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "where", ["vertices", "colors", "uv", "texels", "rotation", "translation", "focal", "principal", "near"]
+)
+def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
+    where: str, number: float
+) -> None:
+    first = [[-0.4, -0.3, 1.0], [0.3, -0.35, 1], [0, 0.3, 1]]
+    scene = meshed([*first, *crossing()[:27] + np.array([0, 0, 0.5])], ahead(24, 32, focal=20.0))
+    bad = with_number(scene, where, number)
+    if where not in ("vertices", "colors", "texels"):
+        with pytest.raises(ValueError, match="not finite"):
+            Rasterizer()(bad, EVERY)
+        return
+    plain, found = Rasterizer()(scene, EVERY), Rasterizer()(bad, EVERY)
+    untouched = plain["face"] != 0
+    assert untouched.any() and (~untouched).any()
+    if where == "vertices":
+        rest = Rasterizer()(
+            replace(scene, faces=torch.cat([torch.zeros_like(scene.faces[:1]), scene.faces[1:]])), EVERY
+        )
+        assert all(torch.equal(rest[name], found[name]) for name in EVERY)
+        assert all(found[name].isfinite().all() for name in ("color", "normal", "barycentric", "uv"))
+        return
+    assert all(torch.equal(found[name], plain[name]) for name in EVERY if name != "color")
+    if where == "colors":
+        assert torch.equal(found["color"][untouched], plain["color"][untouched])
+    else:
+        same = (found["color"] == plain["color"]).all(-1)
+        assert same[~plain["mask"]].all() and 0.3 < same.float().mean() < 1
+    # out of view it is nobody's
+    away = replace(bad, camera=replace(bad.camera, translation=torch.tensor([0.0, 0, -50])))
+    assert not Rasterizer()(away)["color"].any()
+
+
+def test_a_face_seen_edge_on_shows_nothing_and_one_nearly_so_no_hole() -> None:
+    vertices = [[0, -1, 1.0], [0, 1, 1], [0, 0, 3], [-1, 0, 1], [1, 0, 1], [0, 0, 4]]
+    assert not Rasterizer()(meshed(vertices, ahead()), ("mask",))["mask"].any()
+    for lift in 10.0 ** np.arange(-12, 0):
+        roof = meshed([[-9, -9, 3.0], [9, -9, 3], [9, lift, 3], [-9, lift, 3], [9, 9, 3], [-9, 9, 3], [0, lift, 1]],
+                      ahead(), [[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5], [3, 6, 2], [2, 6, 3]])  # fmt: skip
+        found = Rasterizer()(roof, ("mask", "face"))
+        assert found["mask"].all()
+
+
+def test_planes_that_pass_through_one_another_show_the_nearer() -> None:
+    camera = ahead(40, 50, focal=32.0)
+    corners = [
+        [-9, -9, 5.0],
+        [9, -9, 5],
+        [9, 9, 1],
+        [-9, 9, 1],
+        [-9, -9, 1],
+        [9, -9, 1],
+        [9, 9, 5],
+        [-9, 9, 5],
+    ]
+    scene = meshed(corners, camera, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    found = Rasterizer()(scene, ("depth", "face"))
+    down = (torch.arange(40).double() - camera.principal[1]) / 32.0
+    depths = torch.stack([3 / (1 + 2 / 9 * down), 3 / (1 - 2 / 9 * down)])
+    assert torch.allclose(found["depth"].double(), depths.amin(0)[:, None].expand(40, 50), rtol=1e-3)
+    assert torch.equal(found["face"] // 2, depths.argmin(0)[:, None].expand(40, 50).int())
+
+
+@pytest.mark.parametrize("depth", [0.0, -1e-300, 1e-300, 1e-3, -1.0])
+def test_a_vertex_on_the_plane_of_the_camera_hides_no_part_of_its_face(depth: float) -> None:
+    """A floor that begins beside the eye: as deep as the ray says, however far it begins behind."""
+    camera = ahead(30, 40, focal=16.0)
+    scene = meshed(
+        [[-50, 1, depth], [50, 1, depth], [50, 1, 50], [-50, 1, 50]], camera, [[0, 1, 2], [0, 2, 3]]
+    )
+    found = Rasterizer()(scene, ("depth",))["depth"].double()
+    down = (torch.arange(30).double() - camera.principal[1]) / 16.0
+    true = (1 / down).where((down > 0) & (1 / down < 50), math.inf)[:, None].expand(30, 40)
+    assert torch.allclose(found, true, rtol=1e-3)
+
+
+def test_of_a_million_faces_in_one_pixel_the_nearest_is_seen() -> None:
+    random = np.random.default_rng(0)
+    depth = random.permutation(np.linspace(1, 2, 1_000_000))
+    shape = np.array([[-0.02, -0.02], [0.02, -0.02], [0, 0.03]])  # a third of a pixel
+    corners = np.concatenate(
+        [shape * depth[:, None, None], np.broadcast_to(depth[:, None, None], (len(depth), 3, 1))], 2
+    )
+    scene = meshed(corners, ahead())
+    for savings in (("box",), SAVINGS):
+        renderer = Rasterizer(savings=savings)
+        found = renderer(scene, ("face", "depth"))
+        assert found["face"][4, 5] == depth.argmin() and found["depth"][4, 5] == 1
+        assert (found["face"] >= 0).sum() == 1 and renderer.report is not None
+        assert renderer.report.drawn + renderer.report.left_out.get("hidden", 0) == len(depth)
+
+
+@pytest.mark.parametrize("gradient", KINDS)
+def test_gradients_of_a_hundred_thousand_faces_in_one_pixel_are_finite(gradient: Gradient) -> None:
+    shape = np.array([[-0.04, -0.04, 0], [0.04, -0.04, 0], [0, 0.06, 0]])
+    corners = shape + np.array([0, 0, 1]) * np.linspace(2, 1, 100_000)[:, None, None]
+    assert not bad_slopes(meshed(corners, ahead(1, 1)), Rasterizer(gradient=gradient), torch.float32)
+
+
+def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens_is() -> None:
+    """Focal lengths from 0.001 to 1,000,000 pixels, with all depths as many times as long."""
+    pixels = crossing()
+    pictures = []
+    for power in range(-10, 21):
+        focal = 2.0**power
+        camera = ahead(20, 24, near=focal * 2.0**-10, focal=focal)
+        corners = np.concatenate([8 * pixels[:, :2] * pixels[:, 2:], focal * pixels[:, 2:]], 1)
+        found = Rasterizer()(meshed(corners, camera), ("face", "mask", "color", "depth"))
+        found["depth"] /= focal
+        pictures.append(found)
+    assert pictures[0]["mask"].float().mean() > 0.2
+    for found in pictures[1:]:
+        assert all(torch.equal(found[name], pictures[0][name]) for name in found)
+
+
+def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
+    """With vertices and camera in float64; float32 holds 6 cm there, which is the user's to know."""
+    far = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
+    turn = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )[0]
+    turn = turn * turn.det()
+    shape = crossing() * 1e-3 + np.array([0, 0, 0.05])
+    camera = replace(
+        ahead(40, 50, focal=900.0), rotation=torch.eye(3).double(), translation=torch.zeros(3).double()
+    )
+    near = meshed(shape, camera)
+    there = replace(
+        near,
+        vertices=near.vertices @ turn + far,
+        camera=replace(camera, rotation=turn, translation=-turn @ far),
+    )
+    one, other = (Rasterizer()(scene, EVERY) for scene in (near, there))
+    assert one["mask"].float().mean() > 0.2
+    assert (one["face"] != other["face"]).float().mean() < 2e-3  # corners that lie between two grid points
+    same = (one["face"] == other["face"]) & one["mask"]
+    assert (one["depth"] - other["depth"])[same].abs().max() < 1e-6
+
+
+def test_the_largest_images() -> None:
+    """4096 × 4096, a face over all of it and one in a corner; and one pixel."""
+    camera = ahead(4096, 4096, focal=2048.0)
+    corners = [[-3, -3, 1.0], [9, -3, 1], [-3, 9, 1], [0.9, 0.9, 0.9], [0.9, 0.8, 0.9], [0.8, 0.9, 0.9]]
+    scene = replace(meshed(corners, camera), texture=None)
+    found = Rasterizer()(scene, ("color", "face"))
+    assert (found["face"] >= 0).all() and found["color"].shape == (4096, 4096, 3)
+    assert abs(int(found["face"].sum()) - (0.1 / 0.9 * 2048) ** 2 / 2) < 300  # pixels of the small one
+    assert found["color"].isfinite().all() and found["color"].min() > 0
+
+
+@pytest.mark.parametrize("gradient", KINDS)
+def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient) -> None:
+    for name in ("no faces", "behind", "degenerate", "all in one point"):
+        scene = SCENES[name]()
+        if name == "degenerate":
+            scene = meshed(scene.vertices.numpy(), ahead(), [[0, 0, 1], [1, 1, 1]])
+        given, parts = learned(scene, torch.float32, gradient != "soft")
+        found = Rasterizer(gradient=gradient)(
+            given, EVERY if gradient != "soft" else ("color", "depth", "face", "mask")
+        )
+        assert not found["mask"].any() and (found["face"] == -1).all() and (found["color"] == 0).all()
+        slopes = torch.autograd.grad(found["color"].sum(), list(parts.values()), allow_unused=True)
+        assert all(slope is None or (slope == 0).all() for slope in slopes)
+    empty = Scene(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), torch.zeros(0, 3), ahead(1, 1))
+    assert (Rasterizer(gradient=gradient)(empty)["color"] == 0).all()
+    assert (Rasterizer(gradient=gradient)(joined([empty, empty]), ("face",))["face"] == -1).all()
+
+
+@pytest.mark.parametrize("gradient", KINDS)
+def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> None:
+    """To the bit, where depths are as many times as long; with `boundary`, from lenses on that see surfaces apart which
+    are a pixel's width apart, in this scene 512 pixels."""
+    first: dict[str, torch.Tensor] = {}
+    for power in range(9 if gradient == "boundary" else -10, 21):
+        focal = 2.0**power
+        corners = np.concatenate([8 * crossing()[:, :2] * crossing()[:, 2:], focal * crossing()[:, 2:]], 1)
+        camera = ahead(20, 24, near=focal * 2.0**-10, focal=focal)
+        scene, parts = learned(meshed(corners, camera), torch.float64, gradient != "soft")
+        color = Rasterizer(gradient=gradient)(scene)["color"]
+        weight = torch.linspace(-1, 2, color.numel()).reshape(color.shape)
+        names = [name for name in parts if name != "rotation"]  # it mixes axes of different units
+        found = torch.autograd.grad((color * weight).sum(), [parts[name] for name in names])
+        slopes = dict(zip(names, found, strict=True))
+        slopes["focal"] = slopes["focal"] * focal
+        for name in ("vertices", "translation"):
+            slopes[name] = slopes[name] * torch.tensor([1, 1, focal])
+        first = first or slopes
+        assert all(torch.equal(slopes[name], first[name]) for name in names)
+        assert slopes["vertices"].abs().max() > 0.01
