@@ -114,17 +114,22 @@ class Prediction:
         return {}
 
     def true_image(self, channel: str) -> Tensor:
-        """The truth, shaped like `image`: the batch's field of that name.
+        """The truth, shaped like `image`."""
+        return true_image(self.batch, channel)
 
-        Raises:
-            DataError: there is no such field.
-        """
-        if channel not in self.batch:
-            raise DataError(
-                f"The true {channel!r} of every image was asked for, but batches have only {', '.join(self.batch)}. "
-                "Choose data that give it, or leave out the metric that reads it."
-            )
-        return self.batch[channel]
+
+def true_image(batch: Batch, channel: str) -> Tensor:
+    """The batch's field of that name.
+
+    Raises:
+        DataError: there is no such field.
+    """
+    if channel not in batch:
+        raise DataError(
+            f"The true {channel!r} of every image was asked for, but batches have only {', '.join(batch)}. "
+            "Choose data that give it, or leave out the metric that reads it."
+        )
+    return batch[channel]
 
 
 def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:

@@ -33,7 +33,7 @@ from framework.evaluation.splits import BLOCK, on_device
 from framework.metric import Metric
 from framework.model import Predictor, fitted_models
 from framework.objective import Objective
-from framework.prediction import Prediction
+from framework.prediction import Prediction, true_image
 from framework.runs.description import Description
 from framework.runs.loading import PREFIX, load_with_description, reader
 from framework.runs.run import Run
@@ -196,15 +196,24 @@ def tested(session: Session) -> Session:
 
 @torch.no_grad()
 def rehearse(session: Session) -> None:
-    """Give every metric two predictions of the untrained model, so that one which cannot read them says so now.
+    """Give every metric two predictions of the untrained model, so that one which cannot read them says so now; of a
+    model that predicts nothing before it is fitted, look whether the true images are there.
 
     Raises:
         UserError: what the metric says.
     """
-    if fitted_models(session.predictor):
-        return  # predicts nothing before it is fitted
+    fitted, reads = (
+        bool(fitted_models(session.predictor)),
+        {name for each in session.metrics for name in each.reads},
+    )
+    if fitted and not reads:
+        return
     validation = session.data.splits().validation
     some = fetched(validation, range(min(2, len(validation))))  # type: ignore[arg-type]
+    if fitted:
+        for channel in sorted(reads):
+            true_image(some, channel)
+        return
     seed_step(session.settings.seed, 0, "rehearsal")
     training = session.predictor.training
     density = session.predictor.eval()(some["input"])

@@ -25,7 +25,9 @@ def added(screen, faces, height, width, alone, number):
     counts = np.zeros(6, np.int64)
     for index in range(faces.shape[0]):
         face = faces[index : index + 1]
-        box = raster.rasterise(screen, face, 0, None, False, height, width, None, None, alone, None, counts)
+        box = raster.rasterise(
+            screen, face, 0, None, False, height, width, None, None, alone, None, None, None, counts
+        )
         for row in range(box[0], box[1]):
             for column in range(box[2], box[3]):
                 number[row, column] += alone[row, column]
@@ -44,7 +46,7 @@ def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np
     raster.project(vertices, rotation, translation, *lens, camera.near, seen, screen)
     corners, parts, numbers = clipped(seen, faces, *lens, camera.near)
     for places, indices, names in ((screen, faces, None), (corners, parts, numbers)):
-        raster.rasterise(places, indices, 0, names, False, *size, None, None, mask, None, counts)
+        raster.rasterise(places, indices, 0, names, False, *size, None, None, mask, None, None, None, counts)
         added(places, indices, *size, alone, number)
     return number, mask
 
