@@ -15,6 +15,8 @@ from plugins.renderer.rasterizer.boundary import neighbours
 BLOCK = 1024
 MOST = 8
 """Of meshes and of canvases that wait for their next use."""
+MOST_BYTES = 2**28
+"""Of all canvases that wait."""
 
 Box = tuple[int, int, int, int]
 Tiles = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -98,6 +100,11 @@ class Canvas:
         self._pose = np.empty(0)
         self._drawn: tuple[Corners, bool] | None = None
 
+    @property
+    def bytes(self) -> int:
+        arrays = (self.seen, self.screen, self.depth, self.face, self._vertices, *self._scratch)
+        return sum(array.nbytes for array in arrays)
+
     def placed(self, vertices: np.ndarray, pose: np.ndarray) -> bool:
         """Whether `seen` and `screen` hold these vertices from this pose; if not they are taken to from now on."""
         kept = self._vertices
@@ -168,5 +175,6 @@ class Lease:
             self.canvas = Canvas()
 
     def __del__(self) -> None:
-        if len(self._pool) < MOST:
+        waiting = [*self._pool, self.canvas]
+        if len(waiting) <= MOST and sum(canvas.bytes for canvas in waiting) <= MOST_BYTES:
             self._pool.append(self.canvas)

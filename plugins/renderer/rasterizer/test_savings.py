@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from framework.geometry.camera import Camera, look_from
 from framework.renderer import Scene, Texture, joined
+from plugins.renderer.rasterizer import canvas
 from plugins.renderer.rasterizer.drawing import Gradient, Saving
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_gradient import blob
@@ -277,6 +278,22 @@ def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mi
     peak = tracemalloc.get_traced_memory()[1] - before
     tracemalloc.stop()
     assert peak < 64 * 2**20
+
+
+def test_what_waits_for_the_next_picture_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces, colors = blob(8)
+    scene = Scene(vertices, faces, colors, seen(size=(200, 200)))
+    renderer = Rasterizer()
+    pictures = [
+        renderer(replace(scene, vertices=vertices.clone().requires_grad_()))["color"] for _ in range(12)
+    ]
+    assert len(renderer._pool) == 0
+    monkeypatch.setattr(canvas, "MOST_BYTES", 10**6)
+    del pictures
+    assert 1 <= len(renderer._pool) < 12 and sum(kept.bytes for kept in renderer._pool) <= 10**6
+    renderer(replace(scene, camera=seen(size=(2000, 2000))))
+    assert sum(kept.bytes for kept in renderer._pool) <= 10**6
+    assert alike(renderer(scene, EVERY), Rasterizer()(scene, EVERY))
 
 
 def test_a_renderer_can_be_copied_and_sent_to_another_process() -> None:
