@@ -5,6 +5,7 @@ together by a plain loop, or is an explicit refusal. What is sampled is found ou
 """
 
 import math
+import re
 from collections.abc import Iterator
 from importlib import import_module
 
@@ -216,6 +217,18 @@ def ids(rows) -> Iterator[str]:
     return (f"{name}: {row.name}" for name, row in rows)
 
 
+def shown_or_refused(part: Distribution, density: Distribution) -> None:
+    """Images of each item of the batch, of a density that draws some; else a sentence that says how to."""
+    draws = images.dispatch(type(part)) is not images.dispatch(Distribution)
+    try:
+        found = images(density, {"mask", "color"})
+    except UserError as error:
+        assert re.search(r"draws no color, mask.*protocol\.images\.register", str(error))
+        return
+    assert draws and found.keys() == {"mask", "color"}
+    assert all(one.shape[: len(density.batch_shape)] == density.batch_shape for one in found.values())
+
+
 @pytest.mark.parametrize("name, row", ROWS, ids=ids(ROWS))
 def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow) -> None:
     with torch.no_grad():
@@ -227,8 +240,7 @@ def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow
             if "power" not in kind:  # which is of the density, not of what is inside
                 draws(kind, made, density)
             closed_forms(kind, made, density, value)
-            with pytest.raises(UserError, match=r"draws no color, mask.*protocol\.images\.register"):
-                images(density, {"mask", "color"})
+            shown_or_refused(made.parts[0], density)
             bounds(made, density, value)
             never_silently_exact(density, theirs[kind], value)
             if row.target.kind != "class":

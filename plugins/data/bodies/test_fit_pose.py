@@ -23,6 +23,7 @@ from plugins.data.bodies.descent import (
     updated,
 )
 from plugins.data.bodies.figure import PLACE, figure_of
+from plugins.data.bodies.fit_pose import PoseDensity
 from plugins.data.bodies.pose_error import place_errors
 from plugins.data.bodies.rows import DOLL
 
@@ -246,7 +247,14 @@ def test_the_density_knows_how_far_off_it_is(data):
     seen = Prediction(density, batch, reads=("color", "mask"))
     assert seen.image("color").shape == seen.true_image("color").shape == (6, 48, 40, 3)
     assert seen.image("mask").shape == seen.true_image("mask").shape
-    assert (seen.image("color") - seen.true_image("color"))[agrees].abs().mean() < 0.01
+    assert torch.isfinite(seen.image("color")).all()
+    drawn_by = (fitting.figure, density.renderer, density.camera)
+    there = PoseDensity(target, density.stddev, [None] * 6, *drawn_by)
+    shown = Prediction(there, batch, reads=("color", "mask"))
+    assert (shown.image("color") - shown.true_image("color")).abs().mean() < 0.01
+    other = head(data.target, steps=3, restarts=0)
+    other.load_state_dict(fitting.state_dict())
+    assert torch.equal(other(raw).log_prob(target), density.log_prob(target))
 
 
 def test_the_metric_sees_what_arrived(data):
