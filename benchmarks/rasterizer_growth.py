@@ -78,5 +78,6 @@ def report(picture: Path) -> list[str]:
         axis.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("milliseconds, one core")
     axes[0].legend(frameon=False)
+    figure.suptitle("Time of a picture of a ball (synthetic)", fontsize="medium")
     figure.savefig(picture, dpi=150)
     return [*lines, "", f"![Milliseconds against faces and pixels]({picture.name})"]
