@@ -124,7 +124,7 @@ class FitPoseHead(DensityHead, Fitted):
         self,
         target: Target,
         *,
-        renderer: Renderer,
+        renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
         steps: Annotated[int, Field(ge=1, le=1000)] = 30,
         restarts: Annotated[int, Field(ge=0, le=100)] = 1,
         enough: Annotated[float, Field(gt=0, le=1)] = 0.003,

@@ -91,7 +91,7 @@ class PoseFromImage(Data):
     def __init__(
         self,
         *,
-        renderer: Renderer,
+        renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
         counts: Counts,
         apart: Apart,
         height: Side = 128,
