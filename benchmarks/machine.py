@@ -6,8 +6,11 @@ import platform
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from statistics import median
 
 
 def machine(*packages: str) -> str:
@@ -39,3 +42,17 @@ def first_calls(script: str, **elsewhere: str) -> tuple[float, float]:
             for _ in range(2)
         )  # fmt: skip
     return float(cold), float(warm)
+
+
+def milliseconds(
+    call: Callable[[], object], repeats: int = 300, clock: Callable[[], float] = time.thread_time
+) -> float:
+    """Median processor time, after ten calls to warm up: of the calling thread, or what else the clock counts."""
+    for _ in range(10):
+        call()
+    times = []
+    for _ in range(repeats):
+        start = clock()
+        call()
+        times.append(clock() - start)
+    return 1e3 * median(times)

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.machine import machine
-from benchmarks.rasterizer import DISTANCE, HEIGHT, WIDTH, figure, milliseconds
+from benchmarks.machine import machine, milliseconds
+from benchmarks.rasterizer import DISTANCE, HEIGHT, WIDTH, figure
 from benchmarks.rasterizer import scene as figure_scene
 from framework.configuration.schema import build, resolve
 from framework.renderer import Renderer

@@ -3,16 +3,17 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import median
 
 import numpy as np
-import torch
 
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
 from framework.renderer import Scene
+from framework.testing.scenes import sphere
 
 FACES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 PIXELS = (100, 200, 400, 800, 1_600, 4_000)
@@ -21,16 +22,9 @@ PIXELS = (100, 200, 400, 800, 1_600, 4_000)
 
 def ball(faces: int, side: int) -> Scene:
     """A closed sphere that fills most of a square picture."""
-    rings = max(int(math.sqrt(faces / 4)), 3)
-    theta = torch.linspace(0, math.pi, rings + 1, dtype=torch.float64)
-    phi = torch.arange(2 * rings, dtype=torch.float64) * (math.pi / rings)
-    x, y = torch.outer(theta.sin(), phi.cos()), torch.outer(theta.sin(), phi.sin())
-    vertices = torch.stack([x, y, theta.cos()[:, None].expand_as(x)], -1).reshape(-1, 3).float()
-    row, column = torch.meshgrid(torch.arange(rings), torch.arange(2 * rings), indexing="ij")
-    a, b = row * 2 * rings + column, row * 2 * rings + (column + 1) % (2 * rings)
-    rows = [torch.stack([a, a + 2 * rings, b], -1), torch.stack([b, a + 2 * rings, b + 2 * rings], -1)]
-    camera = look_from(0.3, 0.2, 0.1, 4.0, 0.55, (side, side))
-    return Scene(vertices, torch.cat(rows).reshape(-1, 3), (vertices + 1) / 2, camera)
+    return replace(
+        sphere(int(math.sqrt(faces / 4))), camera=look_from(0.3, 0.2, 0.1, 4.0, 0.55, (side, side))
+    )
 
 
 def milliseconds(call: Callable[[], object]) -> float:

@@ -7,10 +7,10 @@ EGL (Debian: libegl1, libgl1-mesa-dri).
 import os
 import time
 from collections.abc import Callable
-from statistics import median
 
 import numpy as np
 
+from benchmarks.machine import milliseconds
 from framework.renderer import Scene
 
 ELSEWHERE = {
@@ -25,18 +25,6 @@ ELSEWHERE = {
 """Milliseconds at 6,890 / 27,554 vertices, measured on another machine."""
 
 Draw = Callable[[], np.ndarray]
-
-
-def milliseconds(call: Callable[[], object], repeats: int = 100) -> float:
-    """Median processor time of all threads, after ten calls to warm up."""
-    for _ in range(10):
-        call()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return 1e3 * median(times)
 
 
 def moderngl_egl(scene: Scene) -> tuple[str, Draw]:
@@ -159,7 +147,7 @@ def rows(scenes: list[Scene]) -> list[str]:
         try:
             for scene in scenes:
                 name, draw = peer(scene)
-                cells.append(f"{milliseconds(draw):.2f}")
+                cells.append(f"{milliseconds(draw, 100, time.process_time):.2f}")
         except Exception as error:  # a peer that is not here, or does not run here, is said
             cells = [f"not here ({type(error).__name__})"]
         found.append(f"| {name} | {' / '.join(cells)} |")

@@ -85,10 +85,17 @@ def joined(scenes: Sequence[Scene]) -> Scene:
     A subject without colours has white ones where another has some.
 
     Raises:
-        ValueError: no scene came, or textures differ in `wrap` or `smooth`.
+        ValueError: no scene came, colours differ in channels, or textures in `wrap` or `smooth`.
     """
     if not scenes:
         raise ValueError("no scene came; wanted one or more to join.")
+    paints = [scene.colors for scene in scenes if scene.colors is not None]
+    paints += [image for scene in scenes if scene.texture is not None for image in scene.texture.images]
+    if len({paint.shape[-1] for paint in paints}) > 1:
+        raise ValueError(
+            f"colours came with {' and '.join(sorted({str(paint.shape[-1]) for paint in paints}))} channels; wanted as "
+            "many in all scenes."
+        )
     counts = [len(scene.vertices) for scene in scenes]
     first = accumulate(counts[:-1], initial=0)
     faces = [scene.faces + start for scene, start in zip(scenes, first, strict=True)]

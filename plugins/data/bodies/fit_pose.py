@@ -56,26 +56,21 @@ class PoseDensity(Independent):
     def entropy(self) -> Tensor:
         return self.base_dist.entropy().sum(-1)
 
-    @torch.no_grad()
-    def images(self, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
-        """The bodies at the mode, as `protocol.images` says."""
-        shape = self.batch_shape
-        scenes = [
-            self.figure.scene(numbers, self.camera) for numbers in self.mode.reshape(-1, self.event_shape[0])
-        ]
-        scenes = [
-            replace(scene, colors=None if scene.colors is None else scene.colors[:, :3]) for scene in scenes
-        ]
-        drawn = self.renderer.batch(scenes, channels)
-        return {
-            name: torch.stack([one[name] for one in drawn]).unflatten(0, shape) if shape else drawn[0][name]
-            for name in channels
-        }
-
 
 @images.register
+@torch.no_grad()
 def _(density: PoseDensity, channels: Collection[str]) -> dict[str, Tensor]:
-    return density.images(channels)
+    """The bodies at the mode."""
+    shape, figure = density.batch_shape, density.figure
+    scenes = [
+        figure.scene(numbers, density.camera) for numbers in density.mode.reshape(-1, *density.event_shape)
+    ]
+    scenes = [
+        replace(scene, colors=None if scene.colors is None else scene.colors[:, :3]) for scene in scenes
+    ]
+    drawn = density.renderer.batch(scenes, channels)
+    stacked = {name: torch.stack([one[name] for one in drawn]) for name in channels}
+    return {name: all_of_it.reshape(*shape, *all_of_it.shape[1:]) for name, all_of_it in stacked.items()}
 
 
 @median.register

@@ -42,11 +42,12 @@ def bits(array: np.ndarray) -> np.ndarray:
 
 
 class Corners:
-    """Rows of three indices, as kernels read them: (faces, 3) int32, and the largest of them."""
+    """Rows of three indices, as kernels read them: (faces, 3) int32, and the largest of them, where a negative one
+    counts as larger than any array; with one beyond int32 the rows mean nothing."""
 
-    def __init__(self, given: np.ndarray, largest: int) -> None:
+    def __init__(self, given: np.ndarray) -> None:
         self.array = given.astype(np.int32)
-        self.largest = largest
+        self.largest = int(raster.largest_index(given.reshape(-1).view(f"u{given.itemsize}")))
 
     @cached_property
     def beside(self) -> np.ndarray:
@@ -63,17 +64,14 @@ class Shelf:
     def __init__(self) -> None:
         self._kept: list[Corners] = []
 
-    def find(self, given: np.ndarray, largest: int) -> Corners:
-        """Of indices up to `largest`, an index above which, or below 0, is a ValueError with both ends of them."""
+    def find(self, given: np.ndarray) -> Corners:
+        """Of rows of indices, which may name anything."""
         for kept in self._kept:
-            if kept.largest <= largest and kept.holds(given):
+            if kept.holds(given):
                 if kept is not self._kept[0]:
                     self._kept = [kept, *(other for other in self._kept if other is not kept)][:MOST]
                 return kept
-        found = int(raster.largest_index(given.reshape(-1).view(f"u{given.itemsize}")))
-        if given.size and found > largest:
-            raise ValueError(f"{given.min()} to {given.max()}")
-        new = Corners(given, found)
+        new = Corners(given)
         self._kept = [new, *self._kept[: MOST - 1]]
         return new
 
@@ -94,7 +92,7 @@ class Canvas:
         )
         self.counts = np.zeros(0, np.int64)
         self.box: Box = (0, 0, 0, 0)
-        self.hidden = 0
+        self.cut = 0
         self._scratch = np.empty(0, np.int32), np.empty((0, 20)), np.empty(0, np.int32)
         self._vertices = np.empty((0, 3))
         self._pose = np.empty(0)

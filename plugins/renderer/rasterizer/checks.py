@@ -111,11 +111,8 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
     camera = scene.camera
     learned = [vertices, camera.rotation, camera.translation, camera.focal, camera.principal]
     colors = texture = corners = None
+    check_paint(scene, channels)
     if "color" in channels:
-        if scene.colors is None and scene.texture is None:
-            raise ValueError(
-                '"color" was asked of a scene without colours; give colors or a texture, or ask other channels.'
-            )
         if scene.colors is not None:
             colors = numbers("colors", scene.colors)
             if len(colors) != len(vertices):
@@ -165,11 +162,8 @@ def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient)
     check_camera(camera)
     count = len(scene.vertices)
     if scene.faces.numel() and not (int(scene.faces.min()) >= 0 and int(scene.faces.max()) < count):
-        raise ValueError(
-            f"faces name the vertices {int(scene.faces.min())} to {int(scene.faces.max())}; wanted 0 to {count - 1}."
-        )
-    if "color" in channels and scene.colors is None and texture is None:
-        raise ValueError('"color" was asked of a scene without colours; give colors or a texture.')
+        raise ValueError(out_of_range("faces", scene.faces, count, "vertices"))
+    check_paint(scene, channels)
     lens = [
         torch.as_tensor(part, dtype=torch.float64, device=device) for part in (camera.focal, camera.principal)
     ]
@@ -199,6 +193,13 @@ def check_channels(channels: Collection[str]) -> None:
             )
 
 
+def check_paint(scene: Scene, channels: Collection[str]) -> None:
+    if "color" in channels and scene.colors is None and scene.texture is None:
+        raise ValueError(
+            '"color" was asked of a scene without colours; give colors or a texture, or ask other channels.'
+        )
+
+
 def check_device(name: str, tensor: Tensor) -> None:
     if tensor.device.type != "cpu":
         raise ValueError(
@@ -219,12 +220,17 @@ def indices(name: str, given: Tensor, count: int, of: str, shelf: Shelf) -> Corn
     if given.dtype not in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64):
         raise ValueError(f"{name} came as {given.dtype}; wanted whole numbers, e.g. torch.int64.")
     kept = given.dtype in (torch.int32, torch.int64)
-    try:
-        return shelf.find(array(given if kept else given.long()), count - 1)
-    except ValueError as error:
-        raise ValueError(
-            f"{name} name the {of} {error}; wanted 0 to {count - 1}, since the scene has {count} {of}."
-        ) from None
+    found = shelf.find(array(given if kept else given.long()))
+    if given.numel() and found.largest >= count:
+        raise ValueError(out_of_range(name, given, count, of))
+    return found
+
+
+def out_of_range(name: str, given: Tensor, count: int, of: str) -> str:
+    return (
+        f"{name} name the {of} {int(given.min())} to {int(given.max())}; wanted 0 to {count - 1}, since the scene has "
+        f"{count} {of}."
+    )
 
 
 def numbers(name: str, tensor: Tensor, columns: int | None = 3) -> Tensor:

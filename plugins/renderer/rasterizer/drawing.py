@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from framework.renderer import Report
 from plugins.renderer.rasterizer import nmr, raster, shading, soft
 from plugins.renderer.rasterizer.boundary import boundary
-from plugins.renderer.rasterizer.canvas import Box, Canvas, Corners, Lease, Tiles
+from plugins.renderer.rasterizer.canvas import Box, Canvas, Corners, Lease
 from plugins.renderer.rasterizer.clipping import clipped
 from plugins.renderer.rasterizer.interior import interior, of_the_world
 from plugins.renderer.rasterizer.textures import Laid
@@ -50,6 +50,11 @@ class View:
     softness: tuple[float, float]
     savings: frozenset[Saving]
     once: bool = True
+
+    @property
+    def blended(self) -> bool:
+        """Whether the colour is that of `soft`."""
+        return "color" in self.channels and self.gradient == "soft"
 
 
 @dataclass(frozen=True)
@@ -94,57 +99,65 @@ class Drawn:
 def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
     """The channels of a view. `learning`: keep what the gradient needs."""
     lease = Lease(pool)
-    canvas, (height, width) = lease.canvas, view.size
-    faces, savings = view.faces.array, view.savings
+    canvas, (height, width), faces = lease.canvas, view.size, view.faces.array
     numbers = outputs(given, view)
-    blended = "color" in numbers and view.gradient == "soft"
-    margin = soft.reach(view.softness[0], view.size) if blended else 0.0
-    focal, principal = given.lens[:2], given.lens[2:]
-    place = (given.vertices, given.rotation, given.translation, focal, principal)
-    counts, box, blend, reused = (
-        np.zeros(len(raster.REASONS) + 1, np.int64),
-        (height, 0, width, 0),
-        None,
-        set(),
-    )
-    pose = np.concatenate([given.rotation.ravel(), given.translation, given.lens, [view.near]])
-    bounds = (principal + margin, view.near, height + 2 * margin, width + 2 * margin)
-    if len(faces) == 0 or ("view" in savings and raster.out_of_view(*place[:4], *bounds)):
+    counts, box, blend = np.zeros(len(raster.REASONS) + 1, np.int64), (height, 0, width, 0), None
+    reused: set[str] = set()
+    if out_of_view(given, view):
         counts[raster.OUTSIDE] = len(faces)
     else:
-        if "unchanged" not in savings:
-            canvas.forget()
-        if canvas.placed(given.vertices, pose):
+        if placed(given, view, canvas):
             reused.add("places")
-        else:
-            canvas.hidden = raster.project(*place, view.near, canvas.seen, canvas.screen)
-        if blended and given.colors is not None:
+        if view.blended and given.colors is not None:
             seen = (canvas.seen, canvas.screen, faces, given.colors, given.lens)
-            blend = soft.blend(*seen, view.cull, view.size, *view.softness)
+            blend = soft.blend(*seen, view.cull, view.size, *view.softness, counts)
             numbers["color"][:] = blend.color
-        exact = set(numbers) - {"color"} if blended else set(numbers)
+        exact = set(numbers) - {"color"} if view.blended else set(numbers)
         if learning and "depth" in numbers:
             exact.add("face")  # which a depth's slope is led through
-        if canvas.has(view.faces, view.cull, view.size):
+        if exact and canvas.has(view.faces, view.cull, view.size):
             reused.add("faces")
             box, counts = canvas.box, canvas.counts
-        elif exact == {"mask"}:
-            box = rasterised(given, view, canvas, None, None, numbers["mask"], None, counts)
         elif exact:
-            canvas.cleared(view.size)
-            tiles = canvas.empty_tiles() if "hidden" in savings else None
-            box = rasterised(given, view, canvas, canvas.depth, canvas.face, None, tiles, counts)
-            canvas.shows(view.faces, view.cull, box, counts)
-        if "box" not in savings:
+            counts.fill(0)
+            alone = numbers["mask"] if exact == {"mask"} else None
+            box = rasterised(given, view, canvas, alone, counts)
+        if "box" not in view.savings:
             box = (0, height, 0, width)
         if exact and canvas.has(view.faces, view.cull, view.size):
-            fill(given, view, canvas, numbers, box, blended)
+            fill(given, view, canvas, numbers, box)
     left_out = {name: int(counts[place]) for place, name in raster.REASONS.items() if counts[place]}
     visited = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
     told = frozenset(reused)
     report = Report(len(faces), int(counts[raster.DRAWN]), left_out, visited, told, frozenset(numbers))
     channels = {name: torch.from_numpy(array) for name, array in numbers.items()}
     return Drawn(channels, report, lease, box, blend)
+
+
+def out_of_view(given: Given, view: View) -> bool:
+    """Whether there is nothing to draw; False too where nobody wants to know before all is projected."""
+    if len(view.faces.array) == 0:
+        return True
+    if "view" not in view.savings:
+        return False
+    height, width = view.size
+    margin = soft.reach(view.softness[0], view.size) if view.blended else 0.0
+    edges = (view.near, height + 2 * margin, width + 2 * margin)
+    pose = (given.rotation, given.translation, given.lens[:2], given.lens[2:] + margin)
+    return bool(raster.out_of_view(given.vertices, *pose, *edges))
+
+
+def placed(given: Given, view: View, canvas: Canvas) -> bool:
+    """Put the vertices on the canvas; whether they were there already."""
+    if "unchanged" not in view.savings:
+        canvas.forget()
+    pose = np.concatenate([given.rotation.ravel(), given.translation, given.lens, [view.near]])
+    if canvas.placed(given.vertices, pose):
+        return True
+    lens = (given.lens[:2], given.lens[2:])
+    place = (given.vertices, given.rotation, given.translation, *lens, view.near)
+    canvas.cut = raster.project(*place, canvas.seen, canvas.screen)
+    return False
 
 
 def outputs(given: Given, view: View) -> dict[str, np.ndarray]:
@@ -163,41 +176,40 @@ def outputs(given: Given, view: View) -> dict[str, np.ndarray]:
     return made
 
 
-def rasterised(
-    given: Given,
-    view: View,
-    canvas: Canvas,
-    depth: np.ndarray | None,
-    face: np.ndarray | None,
-    mask: np.ndarray | None,
-    tiles: Tiles | None,
-    counts: np.ndarray,
-) -> Box:
-    """Draw all faces, those that the near plane cuts as well, and count what became of them."""
+def rasterised(given: Given, view: View, canvas: Canvas, alone: np.ndarray | None, counts: np.ndarray) -> Box:
+    """Draw all faces on the canvas, or in a mask alone; those that the near plane cuts as well. Count what became of
+    them."""
     faces, box = view.faces.array, (view.size[0], 0, view.size[1], 0)
+    tiles = None
+    if alone is None:
+        canvas.cleared(view.size)
+        tiles = canvas.empty_tiles() if "hidden" in view.savings else None
+    arrays = (canvas.depth, canvas.face, None) if alone is None else (None, None, alone)
     cut = 0
-    if canvas.hidden:  # what the near plane cuts is near, and hides what comes later
+    if canvas.cut:  # what the near plane cuts is near, and hides what comes later
         corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
         if len(parts):
-            arrays = (depth, face, mask) + (tiles or (None, None, None))
-            box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays, counts)
+            known = tiles or (None, None, None)
+            box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays, *known, counts)
             cut = int(counts[raster.DRAWN])
             counts.fill(0)
-    if tiles is not None and depth is not None:
-        farthest, empty, changed = tiles
-        drawn_in = (depth, face, farthest, empty, changed)
+    if tiles is not None:
+        drawn_in = (canvas.depth, canvas.face, *tiles)
         rest = raster.front_to_back(canvas.screen, faces, view.cull, *view.size, *drawn_in, counts)
     else:
-        arrays = (depth, face, mask, None, None, None, counts)
-        rest = raster.rasterise(canvas.screen, faces, 0, None, view.cull, *view.size, *arrays)
+        nothing = (None, None, None)
+        rest = raster.rasterise(
+            canvas.screen, faces, 0, None, view.cull, *view.size, *arrays, *nothing, counts
+        )
     counts[raster.DRAWN] += cut
     counts[raster.BEHIND] -= cut
-    return (min(box[0], rest[0]), max(box[1], rest[1]), min(box[2], rest[2]), max(box[3], rest[3]))
+    box = (min(box[0], rest[0]), max(box[1], rest[1]), min(box[2], rest[2]), max(box[3], rest[3]))
+    if alone is None:
+        canvas.shows(view.faces, view.cull, box, counts)
+    return box
 
 
-def fill(
-    given: Given, view: View, canvas: Canvas, numbers: dict[str, np.ndarray], box: Box, blended: bool
-) -> None:
+def fill(given: Given, view: View, canvas: Canvas, numbers: dict[str, np.ndarray], box: Box) -> None:
     """Fill the channels from the visible faces."""
     top, bottom, left, right = box
     part = (slice(top, bottom), slice(left, right))
@@ -208,7 +220,7 @@ def fill(
         np.greater_equal(canvas.face[part], 0, out=numbers["mask"][part])
     places = (canvas.seen, canvas.screen)
     faces, shown = view.faces.array, (given.lens, canvas.face, box)
-    if "color" in numbers and not blended:
+    if "color" in numbers and not view.blended:
         shading.shade(*places, faces, given.colors, given.laid, *shown, numbers["color"])
     if not {"normal", "barycentric", "uv"}.isdisjoint(numbers):
         asked = [numbers.get(name) for name in ("normal", "barycentric", "uv")]
@@ -243,6 +255,8 @@ class Picture(torch.autograd.Function):
         if view.gradient == "nmr" and "color" in drawn.channels:
             ctx.color = drawn.channels["color"].numpy().copy()
         learned = (vertices, colors, rotation, translation, lens, uv)
+        # torch then refuses a gradient of what was changed in place since
+        ctx.save_for_backward(*[part for part in (*learned, *images) if part is not None])
         ctx.types = [None if part is None else part.dtype for part in learned]
         ctx.images = [(image.shape, image.dtype) for image in images]
         ctx.mark_non_differentiable(
@@ -253,6 +267,7 @@ class Picture(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *along: Tensor | None) -> tuple[Tensor | None, ...]:
+        _ = ctx.saved_tensors
         slopes = {
             name: slope.contiguous().numpy()
             for name, slope in zip(ctx.view.channels, along, strict=True)

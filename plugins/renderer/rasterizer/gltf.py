@@ -3,9 +3,8 @@
 Light that materials reflect, animations and cameras are not read.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ UNDERSTOOD = (
     "KHR_texture_transform",
 )
 """Extensions that a file may require, or the beginnings of their names."""
+MOVES = {"matrix", "rotation", "scale", "translation"}
 POINTS_AND_LINES, TRIANGLES, STRIP, FAN = (0, 1, 2, 3), 4, 5, 6
 
 
@@ -53,17 +53,26 @@ def read(file: Path) -> Subject:
                 "neither compressed geometry nor compressed textures."
             )
         try:
-            parts = list(islice(_parts(document), MOST_PARTS + 1))
+            above = _above(document)
+            if _count(document, above) > MOST_PARTS:
+                raise DataError(
+                    f"{file}: it has more than {MOST_PARTS} parts; join some of them in one mesh."
+                )
+            parts = list(_parts(document, above))
         except KeyError as error:
             raise ValueError(f"{shown(error)} is missing, or none of what may stand there") from error
-        if len(parts) > MOST_PARTS:
-            raise DataError(f"{file}: it has more than {MOST_PARTS} parts; join some of them in one mesh.")
         return subject(parts, "y", document.notes)
 
 
-def _parts(document: Document) -> Iterator[Part]:
+def _count(document: Document, shown_nodes: Iterable[int]) -> int:
+    """How many parts these nodes show: known before any of them is read or placed."""
+    nodes = (document.item("nodes", number) for number in shown_nodes)
+    return sum(len(document.item("meshes", node["mesh"])["primitives"]) for node in nodes if "mesh" in node)
+
+
+def _parts(document: Document, above: dict[int, int | None]) -> Iterator[Part]:
     """Parts where their nodes stand; a mesh that several nodes show is there for each."""
-    places = _places(document)
+    places = _places(document, above)
     known: dict[tuple[int, int], Part] = {}
     needed = 0
     for number, place in places.items():
@@ -87,23 +96,33 @@ def _parts(document: Document) -> Iterator[Part]:
                 yield _placed(part, place)
 
 
-def _places(document: Document) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """From each node's own axes to the scene's, of the nodes that the scene shows."""
+def _above(document: Document) -> dict[int, int | None]:
+    """The nodes that the scene shows, each after the one that it stands in, and that one."""
     scenes = document.content.get("scenes", [])
     if scenes:
         roots = document.item("scenes", document.content.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in document.content.get("nodes", []) for child in node.get("children", [])}
         roots = [number for number in range(len(document.content.get("nodes", []))) if number not in children]
-    found: dict[int, NDArray] = {}
-    waiting = [(number, np.eye(4)) for number in roots]
+    found: dict[int, int | None] = {}
+    waiting: list[tuple[int, int | None]] = [(number, None) for number in roots]
     while waiting:
         number, above = waiting.pop()
         node = document.item("nodes", number)
         if number in found:
             raise ValueError(f"its node {number} stands in two places, or in itself")
-        found[number] = above @ _transform(node)
-        waiting += [(child, found[number]) for child in reversed(node.get("children", []))]
+        found[number] = above
+        waiting += [(child, number) for child in reversed(node.get("children", []))]
+    return found
+
+
+def _places(document: Document, above: dict[int, int | None]) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """From each node's own axes to the scene's."""
+    found: dict[int, NDArray] = {}
+    for number, parent in above.items():
+        place = np.eye(4) if parent is None else found[parent]
+        node = document.item("nodes", number)
+        found[number] = place @ _transform(node) if MOVES & node.keys() else place
     return found
 
 

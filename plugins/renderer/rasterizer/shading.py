@@ -101,7 +101,7 @@ def shade(seen, screen, faces, colors, laid, lens, face, box, color):
             index = face[row, column]
             if index < 0:
                 continue
-            # as `weights_at` and `light` do, in place: their calls would take as long again
+            # as `weights_at` and `light` do, in place: a call for each pixel counts references to every array
             a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
             if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
                 w0, w1, w2 = weights(screen, a, b, c, row, column)

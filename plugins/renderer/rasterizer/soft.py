@@ -22,7 +22,7 @@ from typing import no_type_check
 import numpy as np
 
 from plugins.renderer.rasterizer.boundary import along
-from plugins.renderer.rasterizer.raster import compiled
+from plugins.renderer.rasterizer.raster import BACK, BEHIND, DRAWN, FLAT, OUTSIDE, compiled
 
 BACKGROUND = 1e-3  # ε, as published
 REACH = math.log(1e4 - 1)  # -log(odds) of D = 1e-4
@@ -71,11 +71,12 @@ def blend(
     size: tuple[int, int],
     sigma: float,
     gamma: float,
+    counts: np.ndarray,
 ) -> Blend:
-    """The soft picture of what `raster.project` found."""
+    """The soft picture of what `raster.project` found; `counts` of the faces as in `raster.rasterise`."""
     place, bounds = np.zeros((len(seen), 2)), np.zeros((len(faces), 4), np.int64)
     margin = reach(sigma, size)
-    nearest = prepare(seen, screen, faces, lens, cull, *size, margin, place, bounds)
+    nearest = prepare(seen, screen, faces, lens, cull, *size, margin, place, bounds, counts)
     scales = (4 / (sigma * min(size) ** 2), gamma, margin)
     most, total, clear = np.full(size, BACKGROUND), np.ones(size), np.ones(size)
     mean = np.zeros((*size, colors.shape[1]))
@@ -105,8 +106,8 @@ def slopes(
 
 @compiled
 @no_type_check
-def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bounds):
-    """Fill `place` and `bounds`; returns the nearest vertex of a face in view, or -1."""
+def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bounds, counts):
+    """Fill `place` and `bounds` and count what becomes of the faces; returns the nearest vertex in view, or -1."""
     for vertex in range(seen.shape[0]):
         if screen[vertex, 2] != 0:
             for axis in range(2):
@@ -115,12 +116,17 @@ def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bound
     for index in range(faces.shape[0]):
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
+            counts[BEHIND] += 1
             continue
         ux, uy = place[b, 0] - place[a, 0], place[b, 1] - place[a, 1]
         vx, vy = place[c, 0] - place[a, 0], place[c, 1] - place[a, 1]
         area = ux * vy - vx * uy
         longest = max(ux * ux + uy * uy, vx * vx + vy * vy)
-        if not abs(area) > FLATTEST * longest or (cull and area > 0):
+        if not abs(area) > FLATTEST * longest:
+            counts[FLAT] += 1
+            continue
+        if cull and area > 0:
+            counts[BACK] += 1
             continue
         for axis in range(2):
             last = (width if axis == 0 else height) - 1.0
@@ -131,7 +137,9 @@ def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bound
                 bounds[index, 3 - 2 * axis] = np.int64(np.floor(min(high, last))) + 1
         if bounds[index, 0] >= bounds[index, 1] or bounds[index, 2] >= bounds[index, 3]:
             bounds[index] = 0
+            counts[OUTSIDE] += 1
             continue
+        counts[DRAWN] += 1
         for corner in range(3):
             vertex = faces[index, corner]
             if nearest < 0 or seen[vertex, 2] < seen[nearest, 2]:

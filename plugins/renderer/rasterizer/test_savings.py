@@ -190,6 +190,38 @@ def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
     )  # what the near plane cuts
 
 
+def test_blended_pictures_report_what_became_of_every_face() -> None:
+    vertices, faces, colors = blob(12)
+    scene = Scene(vertices, torch.cat([faces, faces[:5, [0, 0, 1]]]), colors, seen())
+    for cull in (False, True):
+        renderer, hard = Rasterizer(gradient="soft", sigma=1e-8, cull=cull), Rasterizer(cull=cull)
+        renderer(scene)
+        hard(scene)
+        one, other = renderer.report, hard.report
+        assert one is not None and other is not None
+        assert one.drawn + sum(one.left_out.values()) == one.faces == other.faces
+        assert one.left_out.get("back", 0) == pytest.approx(other.left_out.get("back", 0), abs=20)
+        assert one.left_out["flat"] >= 5 and one.drawn > 100
+    renderer(replace(scene, camera=replace(scene.camera, near=4.0)))
+    assert renderer.report is not None and 0 < renderer.report.left_out["behind"] < len(scene.faces)
+
+
+@pytest.mark.parametrize("name", ["vertices", "colors"])
+def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
+    """By torch, as for its own functions; and a second one where the first has freed what it needs."""
+    vertices, faces, colors = blob(6)
+    learned = {"vertices": vertices.clone().requires_grad_(), "colors": colors.clone().requires_grad_()}
+    loss = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], seen()))["color"].sum()
+    with torch.no_grad():
+        learned[name] += 1
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+    again = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], seen()))["color"].sum()
+    again.backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        again.backward()
+
+
 def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
     """Several views before one backward pass, as in fitting to many cameras, give the sum of their gradients."""
     vertices, faces, colors = blob(8)

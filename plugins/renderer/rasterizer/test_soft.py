@@ -74,7 +74,7 @@ def given(seed: int) -> tuple[list[Tensor], Tensor]:
 
 def view(faces: Tensor, cull: bool, sigma: float, gamma: float) -> View:
     return View(
-        Corners(faces.numpy(), int(faces.max())),
+        Corners(faces.numpy()),
         1e-3,
         SIZE,
         cull,

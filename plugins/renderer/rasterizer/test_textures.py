@@ -114,6 +114,17 @@ def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None
         assert scene.texture.shown is not None and set(scene.texture.shown.tolist()) == {-1, 0}
 
 
+def test_subjects_of_other_channels_are_not_joined() -> None:
+    vertices, faces, colors = blob(4)
+    with pytest.raises(ValueError, match="1 and 3 channels; wanted as many"):
+        joined([Scene(vertices, faces, colors[:, :1], camera()), covered()])
+    with pytest.raises(ValueError, match="no scene came"):
+        joined([])
+    other = covered(wrap="clamp")
+    with pytest.raises(ValueError, match="different wrap or smooth"):
+        joined([covered(), other])
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
