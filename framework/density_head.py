@@ -15,17 +15,18 @@ class DensityHead(nn.Module, ABC):
     The framework puts one linear layer, encoder features → `size` raw numbers, in front of every head (the final
     layer "set to match the number of required parameters", thesis §3.6.1). So a head owns the meaning of the raw
     numbers and nothing before them, and any head can be a component of another: a mixture of K components reads
-    K × (component.size + 1) numbers.
+    K × (component.size + 1) numbers. A head that is `direct` reads the features themselves.
 
     A constructor asks for `target: Target` (framework.target) before `*`; its keyword-only parameters are the
     config. It calls `target.require("angle", by="...")` or the like, so that it refuses what it cannot describe.
 
     The density is a `torch.distributions.Distribution` (build it with `validate_args=False`; the head has checked)
-    with `batch_shape == raw.shape[:-1]`; its `event_shape` is `(len(target.names),)` for angles and reals, and `()`
-    for classes. It has `log_prob` (nats), `sample`, `entropy` (nats) and `mode`. Angles are radians and read modulo
-    2π; the `support` of their density is `distributions.circular.circular`. What else a density may be asked stands on
-    one page, framework.distributions.protocol: over several numbers it registers `marginal`, and `estimate` with
-    `exactly` where its log_prob draws nothing; the rest has defaults that claim nothing they do not know.
+    with `batch_shape == raw.shape[:-1]`; its `event_shape` is `target.event_shape`: `(len(target.names),)` for angles
+    and reals, `()` for classes, `(height, width, len(target.names))` for images. It has `log_prob` (nats), `sample`,
+    `entropy` (nats) and `mode`. Angles are radians and read modulo 2π; the `support` of their density is
+    `distributions.circular.circular`. What else a density may be asked stands on one page,
+    framework.distributions.protocol: over several numbers it registers `marginal`, over an image `images`, and where
+    its log_prob draws nothing `estimate` with `exactly`; the rest has defaults that claim nothing they do not know.
 
     Raw numbers may be anything finite, however large; the head maps them to a density whose log_prob is finite
     wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw numbers
@@ -38,6 +39,9 @@ class DensityHead(nn.Module, ABC):
     knobs: ClassVar[Mapping[str, tuple[int, ...]]]
     """Attributes that trade error for run time and may be set at any time after training, with the values worth
     trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
+    direct: ClassVar[bool] = False
+    """Whether the last encoder's features, flattened, are the raw numbers, without a linear layer: images, say, whose
+    every pixel an encoder gives. There must be `size` of them."""
     size: int
     """How many raw numbers the head reads per sample, > 0; set by the constructor."""
 

@@ -1,7 +1,9 @@
 """The model of the density pipeline: encoders, one linear layer, a density head."""
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import final
 
 import torch
@@ -51,13 +53,15 @@ class Predictor(nn.Module, ABC):
 class Model(Predictor):
     """Encoders in a chain, a linear layer to the numbers the head reads, the head.
 
-    A head that is fitted at once (`Fitted`) reads the features themselves, flattened, without the linear layer.
+    A head that is fitted at once (`Fitted`) or `direct` reads the features themselves, flattened, without the linear
+    layer.
 
     Args:
         input_shape: of one sample; needed where there are no encoders.
 
     Raises:
-        ConfigError: the last encoder does not end in a vector, or learns in front of a head that is fitted at once.
+        ConfigError: the last encoder does not end in a vector, or, before a direct head, in as many numbers as that
+            reads; or an encoder learns in front of a head that is fitted at once.
     """
 
     def __init__(
@@ -73,6 +77,13 @@ class Model(Predictor):
                     f"{' and '.join(type(encoder).__name__ for encoder in encoders)} learn. Leave those out."
                 )
             self.projection: nn.Module = nn.Flatten()
+        elif head.direct:
+            if math.prod(shape) != head.size:
+                raise ConfigError(
+                    f"The last encoder gives {_times(shape)} numbers, but {type(head).__name__} reads "
+                    f"{head.size:,} as they are. Choose an encoder that gives as many, or change its channels."
+                )
+            self.projection = nn.Flatten()
         elif len(shape) == 1:
             self.projection = nn.Linear(shape[0], head.size)
             if encoders and encoders[-1].starts_flat:
@@ -83,6 +94,7 @@ class Model(Predictor):
                 "Append an encoder that flattens, such as `mlp`."
             )
         self.head = head
+        self.remembered: list[Tensor] | None = None
 
     def forward(self, inputs: Tensor) -> Distribution:
         return self.head(self.raw(inputs))
@@ -95,7 +107,12 @@ class Model(Predictor):
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
         """What the head reads."""
-        return self.projection(self.encoders(inputs))
+        if self.remembered and self.remembered[0] is inputs:
+            return self.remembered[1]
+        found = self.projection(self.encoders(inputs))
+        if self.remembered is not None:
+            self.remembered = [inputs, found]
+        return found
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
@@ -134,10 +151,31 @@ class FrozenFrontEnd(Predictor):
         self.predictor.calibrate({**batch, "input": self.features(batch["input"])} for batch in batches)
 
 
+@contextmanager
+def one_pass(predictor: Predictor) -> Iterator[None]:
+    """Temporarily computes the raw numbers of one tensor of inputs once, however often loss and densities are asked.
+
+    Of models with a direct head alone: their encoders give images, which an objective compares as the loss does.
+    """
+    models = [module for module in predictor.modules() if isinstance(module, Model) and module.head.direct]
+    for model in models:
+        model.remembered = []
+    try:
+        yield
+    finally:
+        for model in models:
+            model.remembered = None
+
+
 def fitted_models(predictor: Predictor) -> list[Model]:
     """Those with such a head, wherever they are wrapped."""
     found = [module for module in predictor.modules() if isinstance(module, Model)]
     return [model for model in found if isinstance(model.head, Fitted)]
+
+
+def learns(predictor: Predictor) -> bool:
+    """Whether it is trained by gradient: it has parameters, and no head that is fitted at once."""
+    return not fitted_models(predictor) and any(one.requires_grad for one in predictor.parameters())
 
 
 def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
@@ -176,7 +214,11 @@ def describe_mismatch(
 
 
 def _shape(tensor: Shaped[Tensor, "..."]) -> str:
-    return "×".join(map(str, tensor.shape)) or "scalar"
+    return _times(tensor.shape) or "scalar"
+
+
+def _times(shape: Sequence[int]) -> str:
+    return "×".join(map(str, shape))
 
 
 def _some(names: list[str]) -> str:

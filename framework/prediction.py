@@ -133,8 +133,11 @@ def true_image(batch: Batch, channel: str) -> Tensor:
 
 
 def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:
-    """What a table of predictions says, (batch,) each, in the user's names and units; angles in degrees."""
-    if target.kind == "class":
+    """What a table of predictions says, (batch,) each, in the user's names and units; angles in degrees. Of images the
+    entropy alone: they stand beside the table."""
+    if target.kind == "image":
+        found = {}
+    elif target.kind == "class":
         shares = prediction.class_probabilities
         found = {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
     else:

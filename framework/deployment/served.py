@@ -16,6 +16,7 @@ import pandas as pd
 import torch
 
 from framework.data import Batch, Data
+from framework.datasets.png import png
 from framework.distributions.noise import Draw
 from framework.errors import DataError, UserError
 from framework.evaluation.splits import BLOCK, predicted
@@ -46,7 +47,7 @@ class Served:
 
     @torch.no_grad()
     def answer(self, given: Any) -> pd.DataFrame:
-        """A row a sample.
+        """A row a sample; an image is a PNG in base64.
 
         Args:
             given: what `framework.load`'s model takes, but files only as `pathlib.Path`; or the content of files: a
@@ -64,6 +65,12 @@ class Served:
             prediction = prediction.in_frame(self.data.frame(block))
             target = self.description.target
             found = answers(target, prediction)
+            if target.kind == "image":
+                pictures = [base64.b64encode(png(light)).decode() for light in prediction.image("color")]
+                parts.append(
+                    pd.DataFrame({"png": pictures, **{key: one.numpy() for key, one in found.items()}})
+                )
+                continue
             mode = prediction.density.mode
             if target.kind == "class":
                 labels = {"class": [target.names[label] for label in mode.tolist()]}

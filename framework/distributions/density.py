@@ -307,7 +307,9 @@ def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
         return {name: found.squeeze(axis) for name, found in images(density.components, channels).items()}
     if len(density.event_shape) != 3 or set(channels) != {"color"}:
         return images.dispatch(Distribution)(density, channels)
-    return {"color": density.mean}
+    drawn = images(density.components, channels)["color"]
+    weights = density.log_weights.exp()[..., None, None, None]
+    return {"color": (weights * drawn).sum(len(density.batch_shape))}
 
 
 @scales.register

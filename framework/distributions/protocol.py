@@ -315,7 +315,8 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
     """What the density's point prediction looks like: the channels asked for and no others, each (*batch, height,
     width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels` says: "color" is linear light.
 
-    Of a density over images, event_shape (height, width, number), "color" is the mean. Default: it draws none.
+    Of torch's own densities over images, event_shape (height, width, number), "color" is the mean, taken for light;
+    one over the numbers of files (a target of kind "image") registers its own. Default: it draws none.
 
     Raises:
         UserError: nobody has said what the density draws, or it does not draw one of the channels.

@@ -7,7 +7,12 @@ from torch import Tensor
 
 def linear(stored: UInt8[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """Light in [0, 1], float32, of 8-bit numbers."""
-    share = stored.float() / 255
+    return light_of(stored.float() / 255)
+
+
+def light_of(numbers: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Light in [0, 1] of sRGB numbers in [0, 1]; what lies outside is cut off. The inverse of `encoded`."""
+    share = numbers.clamp(0, 1)
     return torch.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 

@@ -1,4 +1,5 @@
-"""mode=predict: a CSV of point predictions and uncertainties for a user's own files, or for the test split."""
+"""mode=predict: a CSV of point predictions and uncertainties for a user's own files, or for the test split; images as
+PNG files beside it."""
 
 import csv
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.datasets.fields import as_batch
+from framework.datasets.png import png
 from framework.distributions.noise import Draw
 from framework.errors import DataError
 from framework.evaluation.splits import BLOCK, predicted
@@ -41,7 +43,9 @@ def run(config: Config) -> None:
     with opened(session.config) as run:
         if bad:
             (run.folder / UNREADABLE).write_text("".join(f"{file}\n" for file in bad), encoding="utf-8")
-        rows = predictions(session.predictor, session.data, session.target, files, session.settings)
+        rows = predictions(
+            session.predictor, session.data, session.target, files, session.settings, run.folder / "images"
+        )
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, list(rows[0]))
@@ -64,9 +68,17 @@ def _files(path: Path) -> list[Path]:
 
 @torch.no_grad()
 def predictions(
-    predictor: Predictor, data: Data, target: Target, files: Sequence[Path], settings: Settings
+    predictor: Predictor,
+    data: Data,
+    target: Target,
+    files: Sequence[Path],
+    settings: Settings,
+    images: Path,
 ) -> list[dict[str, str]]:
-    """One row a sample: its name, the point prediction, and the entropy of the density in nats."""
+    """One row a sample: its name, the point prediction, and the entropy of the density in nats.
+
+    Predicted images are written into the folder `images`; the row names the file.
+    """
     dataset = data.read(files) if files else data.splits().test
     loader = DataLoader(dataset, batch_size=BLOCK, collate_fn=as_batch)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
@@ -78,6 +90,11 @@ def predictions(
             values = {key: _text(column[row]) for key, column in columns.items()}
             if target.kind == "class":
                 values = {"class": target.names[int(prediction.point[row])], **values}
+            elif target.kind == "image":
+                file = images / f"{len(rows):05}.png"
+                images.mkdir(exist_ok=True)
+                file.write_bytes(png(prediction.image("color")[row]))
+                values = {"image": f"{images.name}/{file.name}", **values}
             rows.append({"sample": names[len(rows)], **values})
     return rows
 

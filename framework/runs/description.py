@@ -54,7 +54,12 @@ class Description:
     def __str__(self) -> str:
         parts = [*self.config["encoder"], self.config["density_head"], *self.config["uncertainty"]]
         names = " + ".join(part["name"] for part in parts)
-        unit = {"angle": "angles in radians", "real": "reals in their own unit", "class": "classes"}
+        unit = {
+            "angle": "angles in radians",
+            "real": "reals in their own unit",
+            "class": "classes",
+            "image": "images",
+        }
         return "\n".join(
             [
                 f"{self.method or names}, trained on {self.config['data']['name']}{' (synthetic)' * self.synthetic}",
@@ -106,8 +111,11 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
     kind, names = stored["kind"], tuple(map(str, stored["names"]))
     location, scale = (tuple(map(float, stored.get(key, ()))) for key in ("location", "scale"))
     sizes = {len(location), len(scale)}
+    size = tuple(map(int, stored.get("size", ())))
     if kind not in get_args(Kind) or any(len(name) > LONGEST_NAME for name in names):
         raise ValueError(f"a target of kind {kind!r} with the names {names}")
+    if len(size) != 2 * (kind == "image") or min(size, default=1) < 1:
+        raise ValueError(f"a target of kind {kind!r} and of size {size}")
     if (
         sizes not in ({0}, {len(names)})
         or not all(map(math.isfinite, location + scale))
@@ -116,7 +124,7 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
         raise ValueError(
             "a target's location and scale are no finite numbers of which the scales are above 0"
         )
-    return Target(kind, names, location, scale)
+    return Target(kind, names, location, scale, size)
 
 
 def checked(config: Mapping[str, Any]) -> Resolved:

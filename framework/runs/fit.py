@@ -10,7 +10,7 @@ from torch import distributed as dist
 
 from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
-from framework.model import FrozenFrontEnd, fitted_models
+from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.loading import fill, weights
 from framework.runs.run import Run
 from framework.runs.session import Session
@@ -29,15 +29,16 @@ BEST = "best.ckpt"
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
     """Leaves the kept weights in the predictor; their validation loss (nats) and epoch, from 0.
 
-    The epoch is None where the head was fitted at once. Ranks other than the first return when training has ended.
+    The epoch is None where the head was fitted at once, or nothing learns (a renderer, say). Ranks other than the first
+    return when training has ended.
     """
-    if fitted_models(session.predictor):
+    if not learns(session.predictor):
         return _at_once(session, run), None
     return _by_gradient(session, run)
 
 
 def _at_once(session: Session, run: Run) -> float:
-    fed = _cached(session)
+    fed = _cached(session) if fitted_models(session.predictor) else session.data
     inner = session.predictor
     if fed is not session.data and isinstance(inner, FrozenFrontEnd):
         inner = inner.predictor

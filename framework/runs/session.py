@@ -31,7 +31,7 @@ from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.splits import BLOCK, on_device
 from framework.metric import Metric
-from framework.model import Predictor, fitted_models
+from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
 from framework.runs.description import Description
@@ -159,10 +159,12 @@ def for_training(config: Config) -> Session:
     predictor = build_predictor(
         parts, data.target, data.input_shape, config.settings.seed, columns=data.columns
     )
-    if fitted_models(predictor) and objectives:
+    if objectives and not learns(predictor):
         raise ConfigError(
             f"density_head={parts['density_head']['name']} is fitted at once and has no gradient, which objectives "
             "work by. Leave objective out."
+            if fitted_models(predictor)
+            else "Nothing in this model learns by gradient, which objectives work by. Leave objective out."
         )
     device = torch.device("cpu")
     method = method_of(config, parts)
@@ -278,8 +280,8 @@ def require_fit(data: Data, description: Description) -> None:
         CheckpointError: inputs of another shape, or other targets.
     """
     target = description.target
-    wanted = description.input_shape, target.kind, target.names
-    found = data.input_shape, data.target.kind, data.target.names
+    wanted = description.input_shape, target.kind, target.names, target.size
+    found = data.input_shape, data.target.kind, data.target.names, data.target.size
     if wanted != found:
         raise CheckpointError(
             f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.told}), but the "

@@ -79,23 +79,22 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
 
 
 def _numbers(subject: HeadSubject) -> int:
-    target = subject.row.target
-    return 1 if target.kind == "class" else len(target.names)
+    return math.prod(subject.row.target.event_shape)
 
 
 def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
     """Whether a property can be asked of the row's target."""
     kind, numbers = subject.row.target.kind, _numbers(subject)
     wanted = {
-        "integral": numbers <= 3,
-        "integral by draws": kind != "class" and numbers >= 3 and not draws,
-        "samples follow log_prob": numbers <= 3,
-        "samples follow marginals": kind != "class" and numbers == 2 and not draws,
+        "integral": numbers <= 3 and kind != "image",
+        "integral by draws": kind in ("angle", "real") and numbers >= 3 and not draws,
+        "samples follow log_prob": numbers <= 3 and kind != "image",
+        "samples follow marginals": kind in ("angle", "real") and numbers == 2 and not draws,
         "2π-periodic": kind == "angle",
-        "median": kind != "class" and numbers == 1,
+        "median": kind in ("angle", "real") and numbers == 1,
         "marginals": kind == "angle" and numbers in (2, 3),
         "mean and variance": kind == "real" and numbers <= 2,
-        "cdf": kind != "class" and numbers == 1 and not draws,
+        "cdf": kind in ("angle", "real") and numbers == 1 and not draws,
     }
     return wanted.get(name, True)
 

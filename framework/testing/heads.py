@@ -15,7 +15,8 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.circular import Circular
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import median
+from framework.distributions.protocol import images, median
+from framework.geometry.light import light_of
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined, seed
 from framework.testing.rows import HeadRow
@@ -96,7 +97,7 @@ def values(target: Target, batch: tuple[int, ...]) -> Tensor:
     if target.kind == "class":
         return torch.randint(len(target.names), batch, generator=generator)
     scale = 6.0 if target.kind == "angle" else 1.0
-    return scale * torch.randn(*batch, len(target.names), generator=generator)
+    return scale * torch.randn(*batch, *target.event_shape, generator=generator)
 
 
 def examine_head(subject: HeadSubject) -> Iterator[Finding]:
@@ -130,7 +131,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
 def _shapes(subject: HeadSubject, worst: Worst) -> None:
     """Batches of any shape, also empty; losses with finite gradients in the raw numbers."""
     target = subject.row.target
-    event = () if target.kind == "class" else (len(target.names),)
+    event = target.event_shape
     for batch in BATCH_SHAPES:
         head, raw, value = subject.make(), subject.raws(*batch).requires_grad_(), subject.values(*batch)
         loss = head.train().loss(raw, value)
@@ -158,6 +159,10 @@ def _shapes(subject: HeadSubject, worst: Worst) -> None:
                     shapes["median"] = (median(density, 200).shape, (*batch, *event))
             angles = isinstance(density.support, Circular)
             worst.count(angles != (target.kind == "angle"), f"support: {density.support} of {target.kind}")
+            if target.kind == "image":
+                shapes["color"] = (images(density, {"color"})["color"].shape, (*batch, *event))
+                light = light_of(density.mean)
+                worst.same_bits("color: light of the mean", images(density, {"color"})["color"], light)
             if target.kind == "class":
                 labels = density.enumerate_support(expand=False).flatten().tolist()
                 worst.same("labels", labels, list(range(len(target.names))))

@@ -79,7 +79,7 @@ def rounded(
     least = {"value": math.pi if subject.row.target.kind == "angle" else 0.0}
     for (name, argument), slope in zip(arguments.items(), slopes, strict=True):
         size = argument.detach().abs().clamp(min=least.get(name, 0.0))
-        change = change + (slope.abs() * size).sum(-1)
+        change = change + (slope.abs() * size).flatten(log_prob.dim()).sum(-1)
     if own:  # shared by all rows of the batch
         for row, one in enumerate(log_prob):
             of_one = torch.autograd.grad(one, own, retain_graph=True, allow_unused=True)

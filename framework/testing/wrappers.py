@@ -87,7 +87,7 @@ def batches(row: WrapperRow) -> list[Batch]:
 
 
 def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
-    event = () if row.target.kind == "class" else (len(row.target.names),)
+    event = row.target.event_shape
     wrapper = make()
     with torch.no_grad():
         for count in (0, 1, 5):

@@ -22,6 +22,8 @@ def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
     Raises:
         DataError: a feature is not finite; names the sample.
     """
+    if not fitted_models(predictor):
+        return
     seen = list(batches.of(batches.data.splits().train))
     target = torch.cat([batch["target"] for batch in seen])
     for number, model in enumerate(fitted_models(predictor)):

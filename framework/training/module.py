@@ -15,8 +15,8 @@ from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
 from framework.distributions.noise import seed_step
 from framework.errors import NonFiniteLoss
-from framework.model import FrozenFrontEnd, Predictor
-from framework.objective import Objective
+from framework.model import FrozenFrontEnd, Predictor, one_pass
+from framework.objective import Objective, Rival
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
 from framework.training.ranks import Share, WholeBatch, gathered, share, summed
@@ -74,7 +74,7 @@ class Training(pl.LightningModule):
         rows = self._share(batch)
         # by batches, not by optimiser steps: those stand still while gradients are accumulated
         seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train")
-        with WholeBatch(rows) if rows else nullcontext():
+        with WholeBatch(rows) if rows else nullcontext(), one_pass(self.learner):
             batch = self.augment(batch)
             losses = self.learner.loss(batch["input"], batch["target"])
             loss = losses.mean()
@@ -109,19 +109,56 @@ class Training(pl.LightningModule):
     def configure_optimizers(self) -> dict[str, Any]:
         chosen = self.optimizer_settings
         momentum = {} if chosen.momentum is None else {"momentum": chosen.momentum}
+        groups: list[dict[str, Any]] = [{"params": self._own()}]
+        groups += [
+            {
+                "params": list(one.parameters()),
+                "lr": rival.learning_rate,
+                "betas": rival.betas,
+                "weight_decay": 0.0,
+            }
+            for one, rival in self._rivals()
+        ]
         optimizer = OPTIMIZERS[chosen.name](
-            self.parameters(), lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **momentum
+            groups, lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **momentum
         )
         total = self._planned_steps()
 
-        def factor(step: int) -> float:
-            warm = min(1.0, (step + 1) / (chosen.warmup_steps + 1))
-            if chosen.schedule == "constant":
+        def factor(step: int, schedule: str, warmup_steps: int = 0) -> float:
+            warm = min(1.0, (step + 1) / (warmup_steps + 1))
+            if schedule == "constant":
                 return warm
             return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
 
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        factors = [partial(factor, schedule=chosen.schedule, warmup_steps=chosen.warmup_steps)]
+        factors += [partial(factor, schedule=rival.schedule) for _, rival in self._rivals()]
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factors)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _rivals(self) -> list[tuple[Objective, Rival]]:
+        objectives = [one for one in self.objectives if isinstance(one, Objective)]
+        return [(one, one.rival) for one in objectives if one.rival is not None]
+
+    def _own(self) -> list[nn.Parameter]:
+        """What the predictor's own optimiser moves."""
+        apart = {id(parameter) for one, _ in self._rivals() for parameter in one.parameters()}
+        return [parameter for parameter in self.parameters() if id(parameter) not in apart]
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """As Lightning does, but each rival's gradients by themselves."""
+        if not self._rivals() or not gradient_clip_val:
+            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
+            return
+        for group in optimizer.param_groups:
+            if gradient_clip_algorithm == "value":
+                nn.utils.clip_grad_value_(group["params"], gradient_clip_val)
+            else:
+                nn.utils.clip_grad_norm_(group["params"], gradient_clip_val)
 
     def _planned_steps(self) -> int:
         """Optimiser steps until the end, for the schedule.
@@ -224,8 +261,14 @@ class Report(pl.Callback):
         if (trainer.global_step % self.every_steps == 0 or trainer.is_last_batch) and trainer.is_global_zero:
             assert isinstance(pl_module, Training)
             rate = trainer.optimizers[0].param_groups[0]["lr"]
+            told = {
+                f"train/{name}": float(value)
+                for one in pl_module.objectives
+                if isinstance(one, Objective)
+                for name, value in one.told.items()
+            }
             self.tracker.log_metrics(
-                {"train/loss": pl_module.last_loss, "train/learning_rate": rate},
+                {"train/loss": pl_module.last_loss, "train/learning_rate": rate, **told},
                 trainer.global_step,
                 trainer.current_epoch,
             )

@@ -1,0 +1,17 @@
+"""Images as the content of PNG files."""
+
+from io import BytesIO
+
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from framework.geometry.light import eight_bit
+
+
+def png(light: Float[Tensor, "height width number"]) -> bytes:
+    """The content of an 8-bit file of an image in linear light: colours, or grey where it has not three."""
+    numbers = eight_bit(light.cpu()).numpy()
+    content = BytesIO()
+    Image.fromarray(numbers if numbers.shape[-1] == 3 else numbers[..., 0]).save(content, "PNG")
+    return content.getvalue()

@@ -1,0 +1,52 @@
+"""Rows of the contract: images of few pixels, with log-densities from 50 digits."""
+
+from collections.abc import Iterator
+
+import mpmath
+import torch
+
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.rows import Case, HeadRow
+
+SMALL = Target("image", ("red", "green", "blue"), size=(2, 3))
+GREY = Target("image", ("grey",), size=(1, 1))
+OFFSETS = (0.0, 1e-6, 0.5, -1.0, 30.0)
+
+
+def laplace(head: DensityHead) -> Iterator[Case]:
+    """Σ -|d|/b - log 2b with b = exp(r) within its bounds, 1 where none is predicted."""
+    numbers = 3 if head.size % 9 == 0 or head.size % 6 == 0 else 1
+    pixels = 6 if numbers == 3 else 1
+    predicted = head.size - numbers * pixels
+    for log_scale in (-100.0, -3.0, 0.0, 2.0, 40.0) if predicted else (0.0,):
+        with mpmath.workdps(50):
+            scale = min(max(mpmath.e**log_scale, mpmath.mpf("1e-4")), mpmath.mpf("1e6"))
+            log_prob = [
+                float(numbers * pixels * (-abs(mpmath.mpf(offset)) / scale - mpmath.log(2 * scale)))
+                for offset in torch.tensor(OFFSETS).double().tolist()
+            ]
+        raw = torch.zeros(len(OFFSETS), head.size, dtype=torch.float64)
+        raw[:, numbers * pixels :] = log_scale
+        value = torch.tensor(OFFSETS).double().reshape(-1, 1, 1, 1)
+        value = value.expand(-1, *((2, 3) if pixels == 6 else (1, 1)), numbers)
+        yield Case(f"r = {log_scale:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
+
+
+ROWS = {
+    "laplace_image": (
+        HeadRow("one scale", SMALL, cases=laplace),
+        HeadRow("a scale for each pixel", SMALL, {"scale": "pixel"}, cases=laplace),
+        HeadRow("a scale for each number", SMALL, {"scale": "number"}, cases=laplace),
+        # differences of raw numbers of size 1000 step over the kink of |d| at a draw
+        HeadRow("one grey pixel", GREY, {"scale": "number"}, cases=laplace, limits={"loss gradient": 0.1}),
+        HeadRow(
+            "foreground",
+            SMALL,
+            {"scale": "pixel", "foreground": 5.0},
+            leave_out={
+                "loss is least for its own density": "it weighs pixels by the truth, as no proper score does"
+            },
+        ),
+    )
+}

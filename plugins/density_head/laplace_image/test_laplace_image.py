@@ -1,0 +1,102 @@
+"""The Laplace image head beyond its contract: against torch's Laplace, its loss, its calibration, its image."""
+
+import pytest
+import torch
+from torch.distributions import Independent, Laplace
+
+from framework.distributions.density import Mixture
+from framework.distributions.protocol import images, median, pick
+from framework.distributions.tempering import temper
+from framework.errors import ConfigError, UserError
+from framework.geometry.light import encoded, light_of
+from framework.target import Target
+from plugins.density_head.laplace_image.density import LaplaceImage
+from plugins.density_head.laplace_image.head import LaplaceImageHead
+
+TARGET = Target("image", ("red", "green", "blue"), size=(4, 5))
+
+
+def density(*batch: int) -> LaplaceImage:
+    torch.manual_seed(0)
+    return LaplaceImage(torch.rand(*batch, 4, 5, 3).double(), torch.rand(*batch, 4, 5, 1).double() + 0.1)
+
+
+def test_it_is_torchs_laplace_of_every_number() -> None:
+    ours = density(2, 3)
+    theirs = Independent(Laplace(ours.location, ours.scale), 3)
+    value = torch.randn(7, 2, 3, 4, 5, 3).double()
+    torch.testing.assert_close(ours.log_prob(value), theirs.log_prob(value))
+    torch.testing.assert_close(ours.entropy(), theirs.entropy())
+    torch.testing.assert_close(ours.variance, theirs.variance)
+    drawn = ours.sample(torch.Size((20_000,)))
+    torch.testing.assert_close(drawn.std(0), theirs.stddev, rtol=0.06, atol=0)
+    torch.testing.assert_close((drawn - ours.location).abs().mean(0) / ours.scale, torch.ones(2, 3, 4, 5, 3).double(),
+                               rtol=0.06, atol=0)  # fmt: skip
+    torch.testing.assert_close(median(ours, 1), ours.location)
+
+
+def test_members_tempering_and_picking_keep_the_shape_of_an_image() -> None:
+    members = density(2, 3)
+    whole = Mixture(torch.zeros(2, 3).double(), members)
+    value = torch.rand(2, 4, 5, 3).double()
+    parts = torch.stack(
+        [LaplaceImage(members.location[:, k], members.scale[:, k]).log_prob(value) for k in range(3)]
+    )
+    torch.testing.assert_close(whole.log_prob(value), parts.logsumexp(0) - torch.tensor(3.0).double().log())
+    chosen = pick(members, torch.tensor([2, 0]))
+    assert torch.equal(chosen.mode, torch.stack([members.location[0, 2], members.location[1, 0]]))
+    assert whole.sample().shape == (2, 4, 5, 3)
+    hot = temper(members, torch.tensor(2.0).double())
+    change = hot.log_prob(value.unsqueeze(1)) - members.log_prob(value.unsqueeze(1)) / 2
+    other = hot.log_prob(1 - value.unsqueeze(1)) - members.log_prob(1 - value.unsqueeze(1)) / 2
+    torch.testing.assert_close(change, other)  # a power of it, normalised
+
+
+def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean() -> None:
+    members = density(2, 3)
+    drawn = images(members, {"color"})["color"]
+    torch.testing.assert_close(encoded(drawn), members.location)
+    whole = images(Mixture(torch.zeros(2, 3).double(), members), {"color"})["color"]
+    torch.testing.assert_close(whole, drawn.mean(1))
+    with pytest.raises(UserError, match="draws no depth"):
+        images(members, {"depth"})
+
+
+def test_the_loss_is_the_distance_a_number_and_the_foreground_counts_more() -> None:
+    raw = torch.rand(2, 60)
+    target = torch.ones(2, 4, 5, 3)
+    target[:, :2] = 0.25
+    image = raw.reshape(2, 3, 4, 5).movedim(1, -1)
+    distance = (image - target).abs()
+    head = LaplaceImageHead(TARGET)
+    torch.testing.assert_close(head.loss(raw, target), distance.mean((1, 2, 3)) + torch.tensor(2.0).log())
+    weighted = LaplaceImageHead(TARGET, foreground=5.0).loss(raw, target)
+    wanted = (5 * distance[:, :2].mean((1, 2, 3)) + distance[:, 2:].mean((1, 2, 3))) / 6
+    torch.testing.assert_close(weighted, wanted + torch.tensor(2.0).log())
+
+
+@pytest.mark.parametrize("scale", ["fixed", "pixel", "number"])
+def test_calibration_takes_the_most_likely_factor_and_leaves_the_loss(scale: str) -> None:
+    head = LaplaceImageHead(TARGET, scale=scale)  # type: ignore[arg-type]
+    raw = torch.randn(6, head.size)
+    target = torch.rand(6, 4, 5, 3)
+    before = head.loss(raw, target)
+    head.calibrate(raw, target)
+    best = head(raw).log_prob(target).sum()
+    assert torch.equal(head.loss(raw, target), before)
+    for other in (0.98, 1.02):
+        head.factor *= other
+        assert head(raw).log_prob(target).sum() < best
+        head.factor /= other
+    with pytest.raises(ValueError, match="got none of it"):
+        head.calibrate(raw[:0], target[:0])
+
+
+def test_other_targets_are_refused() -> None:
+    with pytest.raises(ConfigError, match="describes targets of kind 'image'"):
+        LaplaceImageHead(Target("real", ("x",)))
+
+
+def test_light_and_numbers_are_inverse() -> None:
+    numbers = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    torch.testing.assert_close(encoded(light_of(numbers)), numbers, rtol=0, atol=1e-6)
