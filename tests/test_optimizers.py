@@ -1,11 +1,24 @@
-"""Every optimiser that a config may name is built, with its own settings and fused where torch can."""
+"""Optimisers: each that a config may name, those of rivals, and what one step computes."""
+
+import copy
+import math
+from typing import ClassVar, Literal
 
 import pytest
+import torch
+from torch import Tensor, nn
+from torch.distributions import Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
+from framework.data import Batch
+from framework.density_head import DensityHead
+from framework.encoder import Encoder
+from framework.errors import ConfigError
+from framework.model import Model, Predictor, one_pass
+from framework.objective import Objective, Rival
 from framework.target import Target
-from framework.testing.wrappers import Plain
+from framework.testing.wrappers import LENGTH, Plain
 from framework.training.module import Training
 
 
@@ -29,3 +42,113 @@ def test_settings_reach_the_optimiser(
     assert group["params"] == list(training.parameters())
     if name == "sgd":
         assert group["momentum"] == (momentum or 0.0)
+
+
+class Against(Objective):
+    """Moves the predictor's weight down its own, and its own against it."""
+
+    bibtex = ""
+
+    def __init__(self, schedule: Literal["constant", "cosine"]) -> None:
+        super().__init__()
+        self.own = nn.Parameter(torch.tensor([0.5, -1.0]))
+        self.rival = Rival(learning_rate=0.03, schedule=schedule)
+
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        weight = next(predictor.parameters())
+        self.told = {"against": (self.own.square().sum() + weight.sum()).detach()}
+        return (self.own.detach().sum() * weight).sum() + (
+            self.own - weight.detach().mean()
+        ).square().sum() * 50
+
+
+@pytest.mark.parametrize("clip", [None, 0.7])
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_a_rival_steps_as_by_an_optimiser_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, clip: float | None, schedule: Literal["constant", "cosine"]
+) -> None:
+    """Bit by bit as two optimisers of torch that are stepped one after the other, each clipped by itself."""
+    torch.manual_seed(0)
+    data = build("data", resolve("data", {"name": "moons"}))
+    predictor, objective = Plain(Target("real", ("x",))).eval(), Against(schedule)
+    twins = copy.deepcopy((predictor, objective))
+    settings = OptimizerSettings(name="adamw", learning_rate=0.01, weight_decay=0.1)
+    training = Training(predictor, [objective], data, settings, 0, {})
+    monkeypatch.setattr(training, "_planned_steps", lambda: 6)
+    made = training.configure_optimizers()
+    first = torch.optim.AdamW(twins[0].parameters(), lr=0.01, weight_decay=0.1, fused=True)
+    second = torch.optim.AdamW(
+        twins[1].parameters(), lr=0.03, weight_decay=0.0, betas=(0.5, 0.999), fused=True
+    )
+    for step in range(5):
+        given = torch.randn(4, LENGTH), torch.randn(4, 1)
+        for pair, optimizers in (((predictor, objective), [made["optimizer"]]), (twins, [first, second])):
+            for one in optimizers:
+                one.zero_grad()
+            (pair[0].loss(*given).mean() + pair[1](pair[0], {})).backward()
+        if clip:
+            training.configure_gradient_clipping(made["optimizer"], clip, "norm")
+            for one in twins:
+                nn.utils.clip_grad_norm_(one.parameters(), clip)
+        if schedule == "cosine":
+            second.param_groups[0]["lr"] = 0.03 * 0.5 * (1 + math.cos(math.pi * step / 6))
+        for one in (made["optimizer"], first, second):
+            one.step()
+        made["lr_scheduler"]["scheduler"].step()
+    for ours, theirs in zip((predictor, objective), twins, strict=True):
+        for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+            assert torch.equal(one, other)
+
+
+class Picture(Encoder):
+    """One number for each pixel, and how often it was asked."""
+
+    bibtex = ""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.output_shape = (3, 2, 2)
+        self.gain = nn.Parameter(torch.ones(()))
+        self.calls = 0
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        self.calls += 1
+        return self.gain * inputs
+
+
+class Whole(DensityHead):
+    """Laplace's place is the image itself."""
+
+    bibtex = ""
+    knobs: ClassVar = {}
+    direct = True
+    size = 12
+
+    def forward(self, raw: Tensor) -> Independent:
+        return Independent(Normal(raw.unflatten(-1, (3, 2, 2)).movedim(-3, -1), 1.0), 3)
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        pass
+
+
+def test_a_direct_head_reads_what_the_encoder_gives_once_a_step() -> None:
+    encoder = Picture()
+    model = Model([encoder], Whole())
+    inputs = torch.rand(5, 3, 2, 2)
+    assert torch.equal(model(inputs).mean, inputs.movedim(1, -1))
+    encoder.calls = 0
+    with one_pass(model):
+        loss = model.loss(inputs, inputs.movedim(1, -1)).sum() + model.training_densities(inputs).mean.sum()
+        assert encoder.calls == 1
+        model(inputs.clone())
+        assert encoder.calls == 2
+    loss.backward()
+    assert encoder.gain.grad == inputs.sum()
+    model(inputs)
+    model(inputs)
+    assert encoder.calls == 4
+    with pytest.raises(ConfigError, match=r"gives 3×2×2 numbers, but Odd reads 13 as they are"):
+        Model([encoder], type("Odd", (Whole,), {"size": 13})())

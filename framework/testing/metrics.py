@@ -7,7 +7,14 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, MultivariateNormal, constraints
+from torch.distributions import (
+    Categorical,
+    Distribution,
+    Independent,
+    MultivariateNormal,
+    Normal,
+    constraints,
+)
 
 from framework.distributions.circular import circular
 from framework.distributions.protocol import estimate, exactly, marginal, median, pick, take
@@ -96,6 +103,10 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
     """
     if target.kind == "angle":
         return Cardioid(place, None if breadth is None else 1 / breadth)
+    if target.kind == "image":
+        image = place.unflatten(-1, target.event_shape)
+        wide = torch.ones_like(image) if breadth is None else breadth[..., None, None, None].expand_as(image)
+        return Independent(Normal(image, wide.to(image), validate_args=False), 3, validate_args=False)
     if target.kind == "real":
         # MultivariateNormal, since Independent refuses empty batches
         scale = torch.eye(place.shape[-1], dtype=place.dtype)

@@ -1,6 +1,7 @@
 """The contract of an objective: one function a property, each reporting the worst case it saw."""
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Iterator
 
 import torch
@@ -33,7 +34,7 @@ class Network(nn.Module):
         self.first = nn.Linear(LENGTH, 8)
         self.norm = nn.BatchNorm1d(8)
         self.dropout = nn.Dropout(0.2)
-        self.last = nn.Linear(8, len(target.names))
+        self.last = nn.Linear(8, math.prod(target.event_shape) if target.event_shape else len(target.names))
         self.gain = 1.0
         """Of the raw numbers, to make them extreme."""
 

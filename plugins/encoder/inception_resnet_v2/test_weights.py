@@ -9,7 +9,8 @@ from safetensors.torch import save_file
 from torch import nn
 
 from framework.errors import CheckpointError, ConfigError
-from plugins.encoder.inception_resnet_v2.weights import fill_from_file, read_weights
+from framework.storage.weights import read_weights
+from plugins.encoder.inception_resnet_v2.weights import fill_from_file
 
 
 def network():

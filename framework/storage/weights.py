@@ -1,0 +1,95 @@
+"""Files of weights trained elsewhere: named tensors, whole and plain, or a sentence."""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from framework.errors import CheckpointError, ConfigError, shown
+from framework.storage.plain_values import require_flat
+from framework.storage.reading import room
+
+NUMBERS = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32)
+"""What weights may be made of; complex numbers would lose half of theirs without a word."""
+
+
+def read_weights(file: str) -> dict[str, Shaped[Tensor, "..."]]:
+    """Named tensors, on the CPU, from a `.safetensors` file or from what `torch.save` wrote (`.pth`, `.pt`).
+
+    The tensors of a torch file may lie under the key "state_dict" or "model", and their names may begin with
+    "module.", as training scripts write them. Damage is found by the checksums of torch's format;
+    `.safetensors` and files older than torch 1.6 have none, so there only damage to the structure shows.
+
+    Raises:
+        ConfigError: there is no such file.
+        CheckpointError: it is damaged, holds more than plain values, or no named tensors.
+    """
+    path = Path(file).expanduser()
+    if not path.is_file():
+        raise ConfigError(
+            f"There is no weight file {path}. Nothing is downloaded: fetch the weights yourself and give "
+            "their path."
+        )
+    content = _safetensors(path) if path.suffix == ".safetensors" else _torch(path)
+    for key in ("state_dict", "model"):
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            content = content[key]
+    if not isinstance(content, Mapping) or not content or not all(map(torch.is_tensor, content.values())):
+        raise CheckpointError(
+            f"{path} holds no named tensors; wanted what `torch.save(network.state_dict(), ...)` writes."
+        )
+    return {str(name).removeprefix("module."): tensor for name, tensor in content.items()}
+
+
+def _torch(path: Path) -> Any:
+    try:
+        # torch does not check the checksums in its own zip: a flipped bit would load as another number
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                # nor does it read a part marked as a folder (attribute 0x10): its tensor stays uninitialised
+                folders = [part.filename for part in archive.infolist() if part.external_attr & 0x10]
+                size = sum(part.file_size for part in archive.infolist())
+                if size > room(path.stat().st_size):
+                    raise ValueError(f"its parts unfold to {size} bytes")
+                failed = archive.testzip() or next(iter(folders), None)
+                for part in archive.infolist():
+                    if part.filename.endswith("data.pkl"):
+                        require_flat(archive.read(part))
+            if failed:
+                raise ValueError(f"its part {failed} fails its checksum")
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except UnpicklingError as error:
+        raise CheckpointError(
+            f"{path} is no file of plain tensors ({_first_line(error)}). Reading anything else could run "
+            "code: save it again where it comes from, with `torch.save(network.state_dict(), ...)`."
+        ) from None
+    except Exception as error:  # on damaged bytes zipfile and torch raise a dozen kinds, AssertionError too
+        raise _damaged(path, _first_line(error)) from None
+
+
+def _safetensors(path: Path) -> dict[str, Tensor]:
+    try:
+        found = load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise _damaged(path, _first_line(error)) from None
+    for name, tensor in found.items():
+        if tensor.dtype not in NUMBERS:
+            raise _damaged(
+                path, f"{name} has numbers of type {tensor.dtype}, wanted {', '.join(map(str, NUMBERS))}"
+            )
+    return found
+
+
+def _damaged(path: Path, why: str) -> CheckpointError:
+    return CheckpointError(f"The weight file {path} is damaged: {why}. Fetch it again.")
+
+
+def _first_line(error: Exception) -> str:
+    return shown((str(error).splitlines() or [type(error).__name__])[0].rstrip("."))

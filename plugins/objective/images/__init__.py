@@ -1,0 +1,1 @@
+"""Losses of predicted images beside the distance of their numbers: features of networks, and discriminators."""

@@ -1,0 +1,69 @@
+"""Networks that judge patches of an image."""
+
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, leaky_relu
+
+STEEP = 0.2
+"""Slope of leaky ReLU below 0."""
+
+
+class PatchDiscriminator(nn.Module):
+    """Judges overlapping patches of an image, at one scale (Isola et al. 2017, §3.2.2; Wang et al. 2018, §3.2).
+
+    Args:
+        width: channels of the first layer; each further one has twice as many, eight times as many at most.
+        layers: of stride 2; with three a patch has 70 pixels a side.
+    """
+
+    def __init__(self, width: int, layers: int) -> None:
+        super().__init__()
+        widths = [3, *(width * min(2**layer, 8) for layer in range(layers + 1)), 1]
+        steps = [2] * layers + [1, 1]
+        self.layers = nn.ModuleList(
+            nn.Conv2d(one, other, 4, step, padding=2)
+            for (one, other), step in zip(pairwise(widths), steps, strict=True)
+        )
+
+    def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
+        """What each layer gives, the last of which are the judgements: near 1 for a true patch."""
+        found = []
+        for number, layer in enumerate(self.layers):
+            images = layer(images)
+            if number + 1 < len(self.layers):
+                images = leaky_relu(normalised(images) if number else images, STEEP)
+            found.append(images)
+        return found
+
+
+def normalised(features: Float[Tensor, "image channel height width"]) -> Tensor:
+    """Each channel of each image, to mean 0 and variance 1 (Ulyanov et al. 2016)."""
+    centred = features - features.mean((-2, -1), keepdim=True)
+    return centred * (centred.square().mean((-2, -1), keepdim=True) + 1e-5).rsqrt()
+
+
+class Discriminators(nn.Module):
+    """The same at several scales, each half of the one before."""
+
+    def __init__(self, scales: int, width: int, layers: int) -> None:
+        super().__init__()
+        self.scales = nn.ModuleList(PatchDiscriminator(width, layers) for _ in range(scales))
+
+    def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[list[Tensor]]:
+        """Of each scale, as `PatchDiscriminator`."""
+        found = []
+        for number, one in enumerate(self.scales):
+            if number:
+                images = avg_pool2d(images, 3, 2, padding=1, count_include_pad=False)
+            found.append(one(images))
+        return found
+
+
+def drawn(scales: int, width: int, layers: int, seed: int) -> Discriminators:
+    """With first weights that are a function of the seed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Discriminators(scales, width, layers)

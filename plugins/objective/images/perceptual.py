@@ -1,0 +1,166 @@
+"""Distances of predicted and true images in the features of a network."""
+
+from abc import abstractmethod
+from collections import OrderedDict
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.data import Batch
+from framework.errors import ConfigError
+from framework.model import Predictor, each_alone
+from framework.objective import Objective
+from plugins.objective.images.predicted import predicted_images
+from plugins.objective.images.vgg import TAPS, VGG, Depth, drawn, trained
+
+Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Cache = Annotated[int, Field(ge=0, le=2**20)]
+
+
+class FeatureDistance(Objective):
+    """The mean L1 distance of features at several depths, the deepest counting most.
+
+    It is Σ_l 2^(l - L) ‖φ_l(x) - φ_l(y)‖₁/n_l over the taps l = 1 … L (Wang et al. 2018, §3.4).
+
+    The features of true images are kept in memory as long as they fit, and found again by the image itself: it does
+    not matter whether the data vary.
+    """
+
+    def __init__(self, weight: float, network: VGG, cache: int) -> None:
+        super().__init__()
+        self.weight = weight
+        self.network = network
+        self.most = cache * 2**20
+        self.kept: OrderedDict[bytes, list[Tensor]] = OrderedDict()
+        self.bytes = 0
+
+    @property
+    @abstractmethod
+    def term(self) -> str:
+        """What the distance is called in the journal."""
+
+    def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        images = predicted_images(predictor, batch)
+        true = batch["target"].to(images.dtype)
+        lead = images.shape[:-3]
+        found = self.network(images.reshape(-1, *images.shape[-3:]).movedim(-1, 1))
+        wanted = self._features(true)
+        distance = images.new_zeros(lead)
+        for level, (one, other) in enumerate(zip(found, wanted, strict=True), 1 - len(found)):
+            ours = one.unflatten(0, lead)
+            theirs = other.reshape(len(true), *[1] * (len(lead) - 1), *other.shape[1:])
+            distance = distance + 2.0**level * (ours - theirs).abs().mean((-3, -2, -1))
+        mean = each_alone(distance).sum() / max(1, len(true))
+        self.told = {self.term: mean.detach()}
+        return self.weight * mean
+
+    @torch.no_grad()
+    def _features(self, true: Float[Tensor, "batch height width number"]) -> list[Tensor]:
+        if not self.most:
+            return self.network(true.movedim(-1, 1))
+        names = [f"{image.dtype}".encode() + image.cpu().numpy().tobytes() for image in true]
+        keys = [hash(name).to_bytes(8, "little", signed=True) for name in names]
+        new = [row for row, key in enumerate(keys) if key not in self.kept]
+        rows = {}
+        if new:
+            found = self.network(true[new].movedim(-1, 1))
+            rows = {keys[row]: [level[place] for level in found] for place, row in enumerate(new)}
+        every = [rows[key] if key in rows else self._again(key) for key in keys]
+        for key, features in rows.items():
+            self._keep(key, features)
+        return (
+            [torch.stack(level) for level in zip(*every, strict=True)]
+            if every
+            else self.network(true.movedim(-1, 1))
+        )
+
+    def _again(self, key: bytes) -> list[Tensor]:
+        self.kept.move_to_end(key)
+        return self.kept[key]
+
+    def _keep(self, key: bytes, features: list[Tensor]) -> None:
+        size = sum(level.nbytes for level in features)
+        # once full nothing goes: each image comes once an epoch, and the oldest would be the next to be asked
+        if self.bytes + size <= self.most:
+            self.kept[key] = features
+            self.bytes += size
+
+
+class Perceptual(FeatureDistance):
+    """Distance of features of a VGG network trained on ImageNet, L_VGG of thesis eq. 7.6 (Johnson et al. 2016).
+
+    Args:
+        weight: α.
+        weights: torchvision's file of the network; there is no stand-in for it: without one choose
+            objective=random_features, which is called so.
+        layers: 16, with features of four depths, or 19, of five.
+        cache: MiB of true images' features that are kept.
+
+    Raises:
+        ConfigError: no file, or one of another network.
+        CheckpointError: it is damaged.
+    """
+
+    bibtex = """@inproceedings{johnson2016perceptual,
+  author    = {Johnson, Justin and Alahi, Alexandre and Fei-Fei, Li},
+  title     = {Perceptual Losses for Real-Time Style Transfer and Super-Resolution},
+  booktitle = {European Conference on Computer Vision (ECCV)},
+  year      = {2016}
+}"""
+
+    def __init__(
+        self,
+        *,
+        weight: Weight = 1.0,
+        weights: str | None = None,
+        layers: Depth = 16,
+        cache: Cache = 1024,
+    ) -> None:
+        if weights is None:
+            raise ConfigError(
+                f"objective.perceptual.weights is null; wanted torchvision's file of VGG{layers}, which is not "
+                "shipped. Name it, or choose objective=random_features, whose network is not trained."
+            )
+        super().__init__(weight, trained(layers, weights), cache)
+
+    @property
+    def term(self) -> str:
+        return "perceptual"
+
+
+class RandomFeatures(FeatureDistance):
+    """Distance of features of a convolutional network with random weights: edges and textures of many scales, without
+    anything learned about images. It is no perceptual loss, and is never called one.
+
+    Args:
+        weight: factor.
+        width: channels of the first block; VGG has 64.
+        depth: blocks, each of half the resolution of the one before.
+        seed: of the weights.
+        cache: as of `Perceptual`.
+    """
+
+    bibtex = """@inproceedings{ustyuzhaninov2017texture,
+  author    = {Ustyuzhaninov, Ivan and Brendel, Wieland and Gatys, Leon and Bethge, Matthias},
+  title     = {What Does it Take to Generate Natural Textures?},
+  booktitle = {International Conference on Learning Representations (ICLR)},
+  year      = {2017}
+}"""
+
+    def __init__(
+        self,
+        *,
+        weight: Weight = 1.0,
+        width: Annotated[int, Field(ge=4, le=64, multiple_of=4)] = 16,
+        depth: Annotated[int, Field(ge=1, le=4)] = 3,
+        seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
+        cache: Cache = 1024,
+    ) -> None:
+        super().__init__(weight, drawn(16, width, TAPS[16][:depth], seed), cache)
+
+    @property
+    def term(self) -> str:
+        return "random_features"

@@ -1,0 +1,119 @@
+"""The convolutional part of VGG networks, with weights from torchvision's files or drawn from a seed."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, max_pool2d, relu
+
+from framework.errors import ConfigError
+from framework.storage.weights import read_weights
+
+Depth = Literal[16, 19]
+CONVOLUTIONS: dict[Depth, tuple[int, ...]] = {16: (2, 2, 3, 3, 3), 19: (2, 2, 4, 4, 4)}
+"""Of each block, between poolings (Simonyan & Zisserman 2015, table 1, columns D and E)."""
+WIDTHS = (64, 128, 256, 512, 512)
+"""Channels of each block."""
+TAPS: dict[Depth, tuple[tuple[int, int], ...]] = {
+    16: ((0, 1), (1, 1), (2, 2), (3, 2)),
+    19: ((0, 0), (1, 0), (2, 0), (3, 0), (4, 0)),
+}
+"""Whose outputs are features: block and convolution, from 0: relu1_2, 2_2, 3_3, 4_3 of 16 layers (Johnson et al. 2016),
+relu1_1, 2_1, 3_1, 4_1, 5_1 of 19 (Wang et al. 2018)."""
+MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of red, green and blue over ImageNet, which torchvision's weights expect to be taken off and divided by."""
+
+
+class VGG(nn.Module):
+    """Features of images after some of the convolutions, in the images' own number type; nothing in it is trained.
+
+    Args:
+        depth: layers of the whole network, of which only convolutions up to the last tap are kept.
+        widths: channels of each block.
+        taps: after which convolutions features are taken, ascending.
+    """
+
+    def __init__(self, depth: Depth, widths: Sequence[int], taps: Sequence[tuple[int, int]]) -> None:
+        super().__init__()
+        self.layers = layers_of(depth, taps[-1])
+        self.taps = tuple(taps)
+        channels = 3
+        for block, place, _ in self.layers:
+            shape = (widths[block], channels, 3, 3)
+            # not in a checkpoint: they come from a file, or from a seed
+            self.register_buffer(f"weight_{block}_{place}", torch.zeros(shape), persistent=False)
+            self.register_buffer(f"bias_{block}_{place}", torch.zeros(widths[block]), persistent=False)
+            channels = widths[block]
+
+    def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
+        """Of images in numbers as files hold them, (image, channel, height, width) of each tap."""
+        mean, spread = (images.new_tensor(values)[:, None, None] for values in (MEAN, SPREAD))
+        hidden, found, block_before = (images - mean) / spread, [], 0
+        for block, place, _ in self.layers:
+            if block != block_before:
+                hidden, block_before = max_pool2d(hidden, 2), block
+            weight, bias = (
+                getattr(self, f"{name}_{block}_{place}").to(images.dtype) for name in ("weight", "bias")
+            )
+            hidden = relu(conv2d(hidden, weight, bias, padding=1))
+            if (block, place) in self.taps:
+                found.append(hidden)
+        return found
+
+    @property
+    def least_side(self) -> int:
+        """Pixels that an image needs for the last features to be there."""
+        return 2 ** self.taps[-1][0]
+
+
+def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]:
+    """Block, convolution and place in torchvision's `features` of every convolution up to the last one asked for."""
+    found, index = [], 0
+    for block, count in enumerate(CONVOLUTIONS[depth]):
+        for place in range(count):
+            found.append((block, place, index))
+            index += 2  # the convolution and its ReLU
+            if (block, place) == last:
+                return found
+        index += 1  # the pooling
+    return found
+
+
+def trained(depth: Depth, file: str) -> VGG:
+    """With the weights of a file as torchvision writes it, the whole network or its `features` alone.
+
+    Raises:
+        ConfigError: there is no such file, or it holds other weights.
+        CheckpointError: it is damaged.
+    """
+    network = VGG(depth, WIDTHS, TAPS[depth])
+    stored = read_weights(file)
+    for block, place, index in network.layers:
+        for name in ("weight", "bias"):
+            own = getattr(network, f"{name}_{block}_{place}")
+            key = f"features.{index}.{name}"
+            found = stored.get(key, stored.get(key.removeprefix("features.")))
+            if found is None or found.shape != own.shape:
+                came = "missing" if found is None else f"of shape {tuple(found.shape)}"
+                raise ConfigError(
+                    f"{file}: {key} is {came}; wanted shape {tuple(own.shape)}. Give torchvision's weights of "
+                    f"VGG{depth}, such as vgg{depth}-….pth."
+                )
+            own.copy_(found)
+    return network
+
+
+def drawn(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) -> VGG:
+    """With weights drawn from a seed, such that numbers keep their size from layer to layer (He et al. 2015, eq. 10).
+
+    Args:
+        width: channels of the first block, of which the others have as many times more as VGG's.
+    """
+    network = VGG(depth, [width * channels // WIDTHS[0] for channels in WIDTHS], taps)
+    generator = torch.Generator().manual_seed(seed)
+    for block, place, _ in network.layers:
+        weight = getattr(network, f"weight_{block}_{place}")
+        weight.normal_(0, (2 / weight[0].numel()) ** 0.5, generator=generator)
+    return network
