@@ -8,6 +8,7 @@ import pytest
 from framework.geometry.nearest import compiled
 from framework.storage.kernels import kept_in
 from plugins.renderer.rasterizer import raster
+from plugins.renderer.smplpix import compiled as projecting
 
 
 def test_code_is_kept_anew_where_any_of_its_files_changed(tmp_path: Path) -> None:
@@ -20,7 +21,10 @@ def test_code_is_kept_anew_where_any_of_its_files_changed(tmp_path: Path) -> Non
     assert kept_in("tested", sources) not in (first, None)
 
 
-@pytest.mark.parametrize(("names", "home"), [(raster.KERNELS, raster), (compiled.PARTS, compiled)])
+@pytest.mark.parametrize(
+    ("names", "home"),
+    [(raster.KERNELS, raster), (compiled.PARTS, compiled), (projecting.KERNELS, projecting)],
+)
 def test_every_file_that_compiles_is_among_the_sources(names: tuple[str, ...], home: object) -> None:
     """Numba itself sees a change in the file of a function alone, and not in what the function calls."""
     folder = Path(str(vars(home)["__file__"])).parent

@@ -11,7 +11,7 @@ CORE = sorted((ROOT / "framework").rglob("*.py"))
 PLUGINS = sorted(path for path in (ROOT / "plugins").rglob("*.py") if path.parent != ROOT / "plugins")
 
 
-MATHEMATICS = {"points", "temperature", "mixture", "categorical", "bernoulli"}
+MATHEMATICS = {"points", "projection", "temperature", "mixture", "categorical", "bernoulli"}
 """Entry points that bear the name of something mathematical which no method owns."""
 
 

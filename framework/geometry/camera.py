@@ -38,12 +38,44 @@ class Camera:
     ) -> tuple[Float[Tensor, "*points 2"], Float[Tensor, "*points"]]:
         """Pixels (column, row) at which world points are seen, and their depths along the optical axis, metres. Of a
         depth that is not above 0 the pixel means nothing."""
+        seen, focal, principal = self._seen(points)
+        return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
+
+    def canonical(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """Where world points lie before the `canonical_camera` of the same image size, metres: it sees them at the same
+        pixels and depths. So a cloud alone says what this camera sees, and no camera has to come with it.
+
+        Of (x, y, z) = rotation @ X + translation and the canonical focal length f and principal point (c, d) they are
+        ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z), since then f x'/z + c = fx x/z + cx. Differentiable in
+        points and lens.
+        """
+        seen, focal, principal = self._seen(points)
+        plain = canonical_camera(self.height, self.width)
+        depth, middle = seen[..., 2:], principal.new_tensor(plain.principal)
+        across = focal * seen[..., :2] + (principal - middle) * depth
+        return torch.cat([across / focal.new_tensor(plain.focal), depth], -1)
+
+    def _seen(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Camera coordinates of world points, and focal lengths and principal point as tensors like them."""
         seen = points @ self.rotation.to(points).T + self.translation.to(points)
         focal, principal = (
             torch.as_tensor(part, dtype=points.dtype, device=points.device)
             for part in (self.focal, self.principal)
         )
-        return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
+        return seen, focal, principal
+
+
+def canonical_camera(height: int, width: int) -> Camera:
+    """The camera of images of this size that no further number describes: in the origin, along the axes, its focal
+    length as many pixels as the image has rows, its principal point in the middle."""
+    return Camera(
+        rotation=torch.eye(3),
+        translation=torch.zeros(3),
+        focal=(float(height), float(height)),
+        principal=((width - 1) / 2, (height - 1) / 2),
+        height=height,
+        width=width,
+    )
 
 
 def look_from(

@@ -1,8 +1,5 @@
 """Finds nearest neighbours on the processor: chooses the kernel for each cloud, and the number of threads."""
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from threading import local
 from typing import NamedTuple, no_type_check
@@ -32,6 +29,7 @@ from framework.geometry.nearest.pack import (
     sort_crowded,
 )
 from framework.geometry.nearest.search import search, search_all
+from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
@@ -224,34 +222,6 @@ class Desks(local):
 
 
 DESKS = Desks()
-
-
-class Pool:
-    """Threads that are started when first needed, and anew in a child process: threads do not survive a fork."""
-
-    def __init__(self) -> None:
-        self.threads: ThreadPoolExecutor | None = None
-        self.size = 0
-        os.register_at_fork(after_in_child=self.forget)
-
-    def forget(self) -> None:
-        self.threads = None
-
-    def run(self, work: Callable[[int], object], threads: int) -> None:
-        """work(0) … work(threads - 1) at the same time, the first in this thread."""
-        if threads == 1:
-            work(0)
-            return
-        if self.threads is None or self.size < threads - 1:
-            self.size = threads - 1
-            self.threads = ThreadPoolExecutor(self.size, "nearest")
-        waiting = [self.threads.submit(work, i) for i in range(1, threads)]
-        work(0)
-        for one in waiting:
-            one.result()
-
-
-POOL = Pool()
 
 
 class Answers(NamedTuple):

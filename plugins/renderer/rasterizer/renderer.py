@@ -1,7 +1,6 @@
 """A differentiable rasteriser on one CPU core; the contract is framework.renderer's."""
 
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from framework.renderer import Renderer, Report, Scene
+from framework.storage.threads import POOL
 from plugins.renderer.rasterizer import reference
 from plugins.renderer.rasterizer.canvas import Canvas, Shelf
 from plugins.renderer.rasterizer.checks import CHANNELS, Ready, check_on_device, ready
@@ -105,18 +105,16 @@ class Rasterizer(Renderer):
         self, scenes: Sequence[Scene], channels: Collection[str] = ("color",)
     ) -> list[dict[str, Tensor]]:
         """Several scenes, side by side on as many threads as torch uses; `report` is then of the last one."""
-        threads = min(torch.get_num_threads(), len(scenes))
-        if threads < 2:
-            return [self(scene, channels) for scene in scenes]
         learning = torch.is_grad_enabled()
+        found: list[tuple[dict[str, Tensor], Report | None]] = [({}, None)] * len(scenes)
 
-        def picture(scene: Scene) -> tuple[dict[str, Tensor], Report | None]:
+        def draw(number: int) -> None:
             with torch.set_grad_enabled(learning):  # which each thread has for itself
-                return self._picture(scene, channels)
+                found[number] = self._picture(scenes[number], channels)
 
-        with ThreadPoolExecutor(threads) as pool:
-            found = list(pool.map(picture, scenes))
-        self.report = found[-1][1]
+        POOL.share(draw, len(scenes), torch.get_num_threads())
+        if found:
+            self.report = found[-1][1]
         return [drawn for drawn, _ in found]
 
     def _picture(self, scene: Scene, channels: Collection[str]) -> tuple[dict[str, Tensor], Report | None]:

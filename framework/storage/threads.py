@@ -1,0 +1,46 @@
+"""Threads for compiled code, which runs without the interpreter's lock."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+
+class Pool:
+    """Threads that are started when first needed, and anew in a child process: threads do not survive a fork."""
+
+    def __init__(self) -> None:
+        self.threads: ThreadPoolExecutor | None = None
+        self.size = 0
+        os.register_at_fork(after_in_child=self.forget)
+
+    def forget(self) -> None:
+        self.threads = None
+
+    def run(self, work: Callable[[int], object], threads: int) -> None:
+        """work(0) … work(threads - 1) at the same time, the first in this thread; work itself asks for no threads."""
+        if threads <= 1:
+            work(0)
+            return
+        if self.threads is None or self.size < threads - 1:
+            self.size = threads - 1
+            self.threads = ThreadPoolExecutor(self.size, "compiled")
+        waiting = [self.threads.submit(work, i) for i in range(1, threads)]
+        work(0)
+        for one in waiting:
+            one.result()
+
+    def share(self, work: Callable[[int], object], count: int, threads: int) -> None:
+        """work(0) … work(count - 1), each by the thread that is free next."""
+        waiting = iter(range(count))
+
+        def some(_: int) -> None:
+            for number in waiting:
+                work(number)
+
+        try:
+            self.run(some, min(threads, count))
+        finally:
+            list(waiting)  # where one failed, the other threads stop too
+
+
+POOL = Pool()

@@ -1,0 +1,93 @@
+"""Which point of a cloud each pixel shows, on one CPU core; compiled functions on NumPy arrays.
+
+Arrays:
+    cloud: (points, columns) float32 or float64: x, y, z before the canonical camera, metres; red, green, blue.
+    depth: (height, width) float32, metres; infinite where nothing is seen.
+    index: (height, width) int32: the point that is seen; -1 where there is none.
+    picture: (channels, height, width) of the cloud's type.
+"""
+
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+
+from framework.storage.kernels import compiler, kept_in
+
+KERNELS = ("compiled",)
+"""Files whose functions call each other."""
+compiled = compiler(kept_in("smplpix", [Path(__file__)]))
+
+
+@compiled
+@no_type_check
+def project(cloud, focal, middle, nearest, farthest, depth, index, picture):
+    """Fill `depth`, and `index` or `picture`; the other is None, and compiled away.
+
+    All decisions are those of `projection.project`, made in float64; a number that is NaN fails every comparison.
+
+    Args:
+        focal, middle: pixels; `middle` is (column, row) of the principal point from the image's upper left corner,
+            half a pixel more than from the centre of its first pixel.
+        nearest, farthest: metres.
+    """
+    height, width = depth.shape
+    depth[:] = np.inf
+    if index is not None:
+        index[:] = -1
+    if picture is not None:
+        picture[:] = 1.0
+    span = farthest - nearest
+    for point in range(cloud.shape[0]):
+        z = np.float64(cloud[point, 2])
+        if not (z >= nearest and z < farthest):
+            continue
+        across = focal * np.float64(cloud[point, 0]) / z + middle[0]
+        down = focal * np.float64(cloud[point, 1]) / z + middle[1]
+        if not (across >= 0 and across < width and down >= 0 and down < height):
+            continue
+        red, green, blue = cloud[point, 3], cloud[point, 4], cloud[point, 5]
+        if not (np.isfinite(red) and np.isfinite(green) and np.isfinite(blue)):
+            continue
+        column, row = np.int64(across), np.int64(down)  # floor, of what is not negative
+        distance = np.float32(z)
+        if distance < depth[row, column]:  # of equally near ones the first stays
+            depth[row, column] = distance
+            if index is not None:
+                index[row, column] = point
+            if picture is not None:
+                picture[0, row, column] = red
+                picture[1, row, column] = green
+                picture[2, row, column] = blue
+                picture[3, row, column] = (z - nearest) / span
+
+
+@compiled
+@no_type_check
+def halve(depth, index, coarse_depth, coarse_index):
+    """Fill depth and index of an image of half the size, whose pixels show the nearest of what four of these show."""
+    coarse_depth[:] = np.inf
+    coarse_index[:] = -1
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            there, half_row, half_column = depth[row, column], row >> 1, column >> 1
+            least = coarse_depth[half_row, half_column]
+            point = index[row, column]
+            if there < least or (there == least and point < coarse_index[half_row, half_column]):
+                coarse_depth[half_row, half_column] = there
+                coarse_index[half_row, half_column] = point
+
+
+@compiled
+@no_type_check
+def paint(cloud, index, level, nearest, farthest, picture):
+    """Fill the four channels of `picture` from an index whose pixels each cover 2^level × 2^level of it."""
+    span = farthest - nearest
+    picture[:] = 1.0
+    for row in range(picture.shape[1]):
+        for column in range(picture.shape[2]):
+            point = index[row >> level, column >> level]
+            if point >= 0:
+                for channel in range(3):
+                    picture[channel, row, column] = cloud[point, 3 + channel]
+                picture[3, row, column] = (np.float64(cloud[point, 2]) - nearest) / span
