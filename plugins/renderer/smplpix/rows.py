@@ -1,0 +1,28 @@
+"""Rows of the contract: odd sizes, every normalisation, with and without scales, crop and bfloat16."""
+
+from framework.testing.rows import EncoderRow
+
+UNET = {"width": 6, "levels": 3}
+SLIM = {"widths": [8, 12, 16]}
+LESS_PRECISE = {"rows of a batch apart": 1e-2}  # as far as two bfloat16 are apart
+ROWS = {
+    "unet": (
+        EncoderRow("odd size", (4, 13, 10), UNET),
+        EncoderRow(
+            "batch norm, scales, whole frame",
+            (3, 8, 9),
+            {**UNET, "normalisation": "batch", "scales": 3, "crop": None},
+        ),
+        EncoderRow("group norm", (4, 9, 8), {**UNET, "normalisation": "group", "crop": None}),
+    ),
+    "slim": (
+        EncoderRow("odd size", (4, 13, 10), SLIM),
+        EncoderRow("a scale, squares of 4", (3, 17, 20), {**SLIM, "unshuffle": 4, "scales": 1}),
+        EncoderRow(
+            "bfloat16, whole frame",
+            (4, 9, 8),
+            {**SLIM, "precision": "bfloat16", "crop": None},
+            limits=LESS_PRECISE,
+        ),
+    ),
+}
