@@ -1,8 +1,11 @@
-"""Rows of the contract: one level and several, sizes that are even and not."""
+"""Rows of the contract: one level and several, sizes even and odd, every normalisation, with and without crop."""
 
-from framework.testing.rows import CloudRow
+from framework.testing.rows import CloudRow, EncoderRow
 
 NEAR = {"nearest": 0.1, "farthest": 20.0}
+UNET = {"width": 6, "levels": 3}
+SLIM = {"widths": [8, 12, 16]}
+LESS_PRECISE = {"rows of a batch apart": 1e-2}  # as far as two bfloat16 are apart
 ROWS = {
     "projection": (
         CloudRow("the thesis's size", (40, 6), config=NEAR),
@@ -15,4 +18,23 @@ ROWS = {
         ),
         CloudRow("one point", (1, 6), config={**NEAR, "height": 12, "width": 9}),
     )
+    "unet": (
+        EncoderRow("odd size", (4, 13, 10), UNET),
+        EncoderRow(
+            "batch norm, scales, whole frame",
+            (3, 8, 9),
+            {**UNET, "normalisation": "batch", "scales": 3, "crop": None},
+        ),
+        EncoderRow("group norm", (4, 9, 8), {**UNET, "normalisation": "group", "crop": None}),
+    ),
+    "slim": (
+        EncoderRow("odd size", (4, 13, 10), SLIM),
+        EncoderRow("a scale, squares of 4", (3, 17, 20), {**SLIM, "unshuffle": 4, "scales": 1}),
+        EncoderRow(
+            "bfloat16, whole frame",
+            (4, 9, 8),
+            {**SLIM, "precision": "bfloat16", "crop": None},
+            limits=LESS_PRECISE,
+        ),
+    ),
 }

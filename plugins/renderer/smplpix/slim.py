@@ -1,0 +1,102 @@
+"""A U-Net made for processors: few pixels, dense 3×3 convolutions, channels in whole vectors."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from framework.encoder import Encoder
+from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, require_pictures
+from plugins.renderer.smplpix.layers import Layer, Normalisation, Step, doubled
+
+Channels = Annotated[int, Field(gt=0)]
+
+
+class Slim(Encoder):
+    """Squares of `unshuffle`² pixels become channels of one (Shi et al. 2016, backwards); then a small U-Net.
+
+    One 3×3 convolution a level and way. A 2×2 convolution of stride 2 leads down; up, a 3×3 convolution to the upper
+    level's channels, bilinear interpolation and a sum. An input of 1 in every channel is empty ground, and so is all
+    beyond the border: sides continue empty to a multiple of unshuffle × 2 ** (levels - 1) pixels.
+
+    Args:
+        input_shape: (channels, height, width), any size; other sizes than this one are read too.
+        widths: channels of each level. Processors compute 16 at once: 24 cost as much as 32.
+        unshuffle: side of a square, pixels.
+        normalisation, colors, scales, crop, precision: as of `unet.UNet`.
+
+    Attributes:
+        report: what evaluation computed of the last batch; None after training, and without crop.
+
+    Raises:
+        ConfigError: the input is no image, or `crop` with `normalisation="group"`.
+    """
+
+    bibtex = """@inproceedings{shi2016realtime,
+  author    = {Shi, Wenzhe and Caballero, Jose and Husz{\\'a}r, Ferenc and Totz, Johannes and Aitken, Andrew P. and
+               Bishop, Rob and Rueckert, Daniel and Wang, Zehan},
+  title     = {Real-Time Single Image and Video Super-Resolution Using an Efficient Sub-Pixel Convolutional Neural
+               Network},
+  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
+  pages     = {1874--1883},
+  year      = {2016}
+}"""
+
+    report: Report | None = None
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        widths: Annotated[list[Channels], Field(min_length=1, max_length=8)] = [32, 48, 96, 128],  # noqa: B006 - never written
+        unshuffle: Annotated[int, Field(ge=1, le=8)] = 2,
+        normalisation: Normalisation = "renorm",
+        colors: Annotated[int, Field(gt=0)] = 3,
+        scales: Literal[0, 1, 3] = 0,
+        crop: Annotated[int, Field(ge=0)] | None = 32,
+        precision: Precision = "float32",
+    ) -> None:
+        super().__init__()
+        require_pictures("slim", input_shape, normalisation, crop)
+        self.unshuffle = unshuffle
+        self.levels = len(widths)
+        first, places = widths[0], unshuffle**2
+        shapes = [(input_shape[0] * places, first, 3)]
+        for upper, lower in pairwise(widths):
+            shapes += [(upper, lower, 2), (lower, lower, 3)]
+        shapes += [(lower, upper, 3) for upper, lower in reversed(list(pairwise(widths)))]
+        shapes += [(first, first, 3)]
+        self.layers = nn.ModuleList(Layer(*shape, normalisation) for shape in shapes)
+        self.head = nn.Conv2d(first, (colors + scales) * places, 3)
+        self.canvas = Canvas(colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle)
+        self.output_shape = (colors + scales, *input_shape[1:])
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def maps(self, pictures: Tensor, layers: Iterator[Step]) -> Tensor:
+        maps = next(layers)(unshuffled(pictures, self.unshuffle))
+        across = [maps]
+        for _ in range(self.levels - 1):
+            maps = next(layers)(maps)
+            maps = next(layers)(maps)
+            across.append(maps)
+        for same_size in reversed(across[:-1]):
+            maps = doubled(next(layers)(maps)) + same_size
+        return next(layers)(maps)
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
+        answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
+        return answers
+
+
+def unshuffled(pictures: Float[Tensor, "batch channels height width"], side: int) -> Tensor:
+    """`functional.pixel_unshuffle` with channels last, in a third of its time."""
+    batch, channels, height, width = pictures.shape
+    squares = pictures.reshape(batch, channels, height // side, side, width // side, side)
+    planes = squares.permute(0, 1, 3, 5, 2, 4).reshape(
+        batch, channels * side**2, height // side, width // side
+    )
+    return planes.contiguous(memory_format=torch.channels_last)

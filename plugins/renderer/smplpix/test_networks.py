@@ -1,0 +1,282 @@
+import pytest
+import torch
+from torch.nn import functional
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError
+from plugins.renderer.smplpix.canvas import fast_bfloat16
+from plugins.renderer.smplpix.layers import EPSILON, Layer
+
+SMALL = {"unet": {"width": 4, "levels": 3}, "slim": {"widths": [6, 8, 10]}}
+STRIDE = {"unet": 4, "slim": 8}
+
+
+def network(name, shape, **config):
+    """In evaluation, with running moments, gains and offsets of no special value."""
+    torch.manual_seed(0)
+    made = build("encoder", resolve("encoder", {"name": name, **SMALL[name], **config}), input_shape=shape)
+    with torch.no_grad():
+        for key, value in made.state_dict().items():
+            if key.endswith(("gain", "variance")):
+                value.uniform_(0.5, 2)
+            elif key.endswith(("offset", "mean", "bias")):
+                value.normal_(0, 0.5)
+    return made.eval()
+
+
+def pictures(count, shape, *boxes):
+    """Random pixels in a box (top, bottom, left, right) each, the last box in all that remain; 1 elsewhere."""
+    generator = torch.Generator().manual_seed(1)
+    found = torch.ones(count, *shape)
+    for index in range(count):
+        top, bottom, left, right = boxes[min(index, len(boxes) - 1)]
+        part = found[index, :, top:bottom, left:right]
+        part.copy_(torch.rand(part.shape, generator=generator))
+    return found
+
+
+class Plain:
+    """The networks in their textbook form, on pictures as they are.
+
+    `white`, (1, channels, 1, 1), is what a layer holds in the middle of an image of ones. Maps continue with it beyond
+    their border, and running moments are of differences from it.
+    """
+
+    def __init__(self, made, name):
+        self.state, self.name, self.step = made.state_dict(), name, 0
+
+    def answer(self, inputs, colors):
+        height, width = inputs.shape[2:]
+        stride = STRIDE[self.name]
+        image = functional.pad(inputs, (0, -width % stride, 0, -height % stride), value=1.0)
+        maps, white = (self.unet if self.name == "unet" else self.slim)(
+            image, torch.ones_like(image[:1, :, :1, :1])
+        )
+        kernel = self.state["head.weight"]
+        around = kernel.shape[-1] // 2
+        raw = functional.conv2d(padded(maps - white, 0 * white, around), kernel, self.state["head.bias"])
+        raw = functional.pixel_shuffle(raw, 1 if self.name == "unet" else 2)[..., :height, :width]
+        return torch.cat([raw[:, :colors].sigmoid(), raw[:, colors:]], 1)
+
+    def layer(self, maps, white):
+        weight, mean, variance, gain, offset = (
+            self.state[f"layers.{self.step}.{part}"]
+            for part in ("weight", "mean", "variance", "gain", "offset")
+        )
+        self.step += 1
+        stride, around = (2, 0) if weight.shape[-1] == 2 else (1, 1)
+        found = functional.conv2d(padded(maps, white, around), weight, stride=stride)
+        ground = functional.conv2d(white.expand(-1, -1, *weight.shape[2:]), weight)
+        moments = (mean + ground[0, :, 0, 0], variance)
+        return (
+            functional.batch_norm(part, *moments, gain, offset, eps=EPSILON).relu()
+            for part in (found, ground)
+        )
+
+    def doubled(self, maps, white):
+        wide = functional.interpolate(padded(maps, white, 1), scale_factor=2, mode="bilinear")
+        return wide[..., 2:-2, 2:-2], white
+
+    def unet(self, maps, white):
+        across = []
+        for level in range(3):
+            maps = functional.max_pool2d(maps, 2) if level else maps
+            maps, white = self.layer(*self.layer(maps, white))
+            across.append((maps, white))
+        for same_size in (across[1], across[0]):
+            both = zip(same_size, self.layer(*self.doubled(maps, white)), strict=True)
+            maps, white = self.layer(*self.layer(*(torch.cat(pair, 1) for pair in both)))
+        return maps, white
+
+    def slim(self, maps, white):
+        maps, white = self.layer(functional.pixel_unshuffle(maps, 2), white.repeat_interleave(4, 1))
+        across = [(maps, white)]
+        for _ in range(2):
+            maps, white = self.layer(*self.layer(maps, white))
+            across.append((maps, white))
+        for same_size in (across[1], across[0]):
+            both = zip(same_size, self.doubled(*self.layer(maps, white)), strict=True)
+            maps, white = (sum(pair) for pair in both)
+        return self.layer(maps, white)
+
+
+def padded(maps, white, around):
+    return functional.pad(maps - white, (around,) * 4) + white
+
+
+@pytest.mark.parametrize("dtype, limit", [(torch.float32, 1e-5), (torch.float64, 1e-13)])
+@pytest.mark.parametrize("size", [(13, 10), (16, 24), (1, 1), (1, 9)])
+@pytest.mark.parametrize("name", SMALL)
+def test_agrees_with_a_plain_network(name, size, dtype, limit):
+    """Folded, and with the answer to white beyond its borders, whatever the size of the picture."""
+    made = network(name, (4, *size), scales=3, crop=None).to(dtype)
+    inputs = pictures(
+        3, (4, *size), (0, 1, 0, 5), (0, 0, 0, 0), (0, *size, 0)[:0] or (0, size[0], 0, size[1])
+    )
+    found = made(inputs.to(dtype))
+    assert found.shape == (3, 6, *size)
+    wanted = Plain(made, name).answer(inputs.to(dtype), 3)
+    assert wanted.std() > 0.01
+    torch.testing.assert_close(found, wanted, rtol=limit, atol=limit)
+
+
+@pytest.mark.parametrize("normalisation", ["batch", "renorm"])
+@pytest.mark.parametrize("size", [3, 2])
+def test_a_layer_in_training_is_normalised_as_published(normalisation, size):
+    """Renormalised as of Ioffe 2017, Algorithm 1, with the running moments of the batches before."""
+    torch.manual_seed(0)
+    layer = Layer(3, 5, size, normalisation).double()
+    gain, offset = layer.gain.data.uniform_(0.5, 2), layer.offset.data.normal_()
+    stride, around = (2, 0) if size == 2 else (1, 1)
+    seen = []
+    for number in range(4):
+        maps = torch.randn(4, 3, 8, 8).double() * (1 + 3 * number)
+        raw = functional.conv2d(maps, layer.weight, stride=stride, padding=around).transpose(0, 1)
+        mean, variance = raw.flatten(1).mean(1), raw.flatten(1).var(1, correction=0)
+        deviation = (variance + EPSILON).sqrt()
+        ratio, moved = torch.ones(5).double(), torch.zeros(5).double()
+        if normalisation == "renorm" and seen:  # the mean of all batches at first
+            usual = (torch.stack([spread for _, spread in seen]).mean(0) + EPSILON).sqrt()
+            ratio = (deviation / usual).clamp(1 / 3, 3)
+            moved = ((mean - torch.stack([middle for middle, _ in seen]).mean(0)) / usual).clamp(-5, 5)
+        columns = (mean, deviation, ratio, moved, gain, offset)
+        m, d, r, b, g, o = (column.detach()[:, None, None, None] for column in columns)
+        wanted = (((raw - m) / d * r + b) * g + o).relu() - ((-m / d * r + b) * g + o).relu()
+        torch.testing.assert_close(layer(maps), wanted.transpose(0, 1))
+        seen.append((mean.detach(), variance.detach()))
+
+
+@pytest.mark.parametrize("normalisation", ["batch", "renorm", "group"])
+def test_gradients_of_a_layer_in_training(normalisation):
+    """Of batch norm and group norm against differences; the correction of `renorm` is a constant, by definition."""
+    torch.manual_seed(0)
+    layer = Layer(2, 4, 3, normalisation).double()
+    maps = torch.randn(2, 2, 4, 4).double()
+    if normalisation == "renorm":
+        layer(maps)
+        layer.batches.zero_()  # a first batch again, so that there is no correction
+    parts = [maps.requires_grad_(), *layer.parameters()]
+
+    def answer(maps, *parameters):
+        names = [name for name, _ in layer.named_parameters()]
+        state = dict(zip(names, parameters, strict=True))
+        if normalisation != "group":
+            state["batches"] = torch.tensor(0)
+        return torch.func.functional_call(layer, state, (maps,))
+
+    assert torch.autograd.gradcheck(answer, parts)
+
+
+def test_group_norm_is_torchs():
+    torch.manual_seed(0)
+    made = build(
+        "encoder",
+        resolve("encoder", {"name": "slim", "normalisation": "group", "crop": None}),
+        input_shape=(4, 8, 8),
+    )
+    layer = made.layers[0]
+    maps = torch.randn(2, 16, 6, 7)
+    raw = functional.conv2d(maps, layer.weight, padding=1)
+    padded = functional.group_norm(raw, 8, layer.gain, layer.offset)
+    found = layer(maps)
+    change = found.flatten(2).diff() - padded.relu().flatten(2).diff()  # but for one number a channel
+    assert change.abs().max() < 1e-5
+    torch.testing.assert_close(layer.folded(torch.float32)(maps), found)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_an_empty_ground_stays_empty_in_every_layer(name):
+    made = network(name, (4, 21, 18), scales=1, crop=None)
+    answer = made(torch.ones(1, 4, 21, 18))
+    side = made.canvas.shuffle
+    assert torch.equal(answer, answer[..., :side, :side].repeat(1, 1, 21, 18)[..., :21, :18])
+    assert torch.equal(made(torch.full((1, 4, 21, 18), 255, dtype=torch.uint8)), answer)
+
+
+@pytest.mark.parametrize("change", ["data", "load", "step", "swap"])
+def test_nothing_is_kept_of_weights_that_have_changed(change):
+    made, other = network("slim", (3, 9, 9)), network("slim", (3, 9, 9))
+    with torch.no_grad():
+        for value in other.state_dict().values():
+            if value.is_floating_point():
+                value.mul_(1.25)
+    inputs = pictures(1, (3, 9, 9), (1, 6, 2, 7))
+    keys, before = list(made.state_dict()), made(inputs)
+    if change == "data":
+        for mine, theirs in zip(
+            [*made.parameters(), *made.buffers()], [*other.parameters(), *other.buffers()], strict=True
+        ):
+            mine.data.copy_(theirs)
+    elif change == "load":
+        made.load_state_dict(other.state_dict())
+    elif change == "step":
+        optimizer = torch.optim.SGD(made.parameters(), lr=0.5)
+        made(inputs).square().sum().backward()
+        optimizer.step()
+        other.load_state_dict(made.state_dict())
+    else:
+        made.layers, made.head = other.layers, other.head
+    assert list(made.state_dict()) == keys
+    assert torch.equal(made(inputs), other(inputs))
+    assert not torch.equal(made(inputs), before)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_bfloat16_is_near_and_leaves_training_and_float64_alone(name):
+    shape = (4, 33, 20)
+    inputs = pictures(2, shape, (4, 30, 5, 15))
+    exact, fast = network(name, shape), network(name, shape, precision="bfloat16")
+    difference = (fast(inputs) - exact(inputs)).abs().max()
+    assert 0 < difference < 0.05
+    assert fast(inputs).dtype == torch.float32
+    chosen = fast if fast_bfloat16(inputs.device) else exact
+    assert torch.equal(network(name, shape, precision="auto")(inputs), chosen(inputs))
+    assert torch.equal(fast.double()(inputs), exact.double()(inputs))
+    assert torch.equal(fast.float().train()(inputs), exact.float().train()(inputs))
+
+
+@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("shape", [(5,), (3, 0, 4), (0, 4, 4), (3, 4, 0), (2, 3, 4, 4)])
+def test_what_is_no_image_is_refused(name, shape):
+    with pytest.raises(ConfigError, match=rf"{name} reads images of shape \(channels, height, width\)"):
+        network(name, shape)
+
+
+@pytest.mark.parametrize(
+    "name, config",
+    [
+        ("unet", {"width": 0}),
+        ("unet", {"levels": 0}),
+        ("unet", {"colors": 0}),
+        ("unet", {"scales": 2}),
+        ("unet", {"normalisation": "layer"}),
+        ("slim", {"widths": []}),
+        ("slim", {"widths": [8, 0]}),
+        ("slim", {"unshuffle": 0}),
+        ("slim", {"crop": -1}),
+        ("slim", {"precision": "float16"}),
+    ],
+)
+def test_a_config_out_of_range_is_refused(name, config):
+    with pytest.raises(ConfigError, match=r"encoder\."):
+        resolve("encoder", {"name": name, **config})
+
+
+def test_the_reference_has_the_published_size():
+    """Channels 32 to 512 at five levels; two convolutions a level and way, one behind each interpolation."""
+    torch.manual_seed(0)
+    made = build("encoder", resolve("encoder", {"name": "unet"}), input_shape=(4, 410, 308))
+    assert [layer.weight.shape[0] for layer in made.layers][:10] == [
+        32,
+        32,
+        64,
+        64,
+        128,
+        128,
+        256,
+        256,
+        512,
+        512,
+    ]
+    assert len(made.layers) == 2 * 5 + 3 * 4
+    assert sum(parameter.numel() for parameter in made.parameters()) == pytest.approx(8.64e6, rel=0.01)

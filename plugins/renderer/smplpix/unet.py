@@ -1,0 +1,104 @@
+"""The U-Net of the thesis: the reference among networks that fill pictures of projected vertices."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from framework.encoder import Encoder
+from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, require_pictures
+from plugins.renderer.smplpix.layers import Layer, Normalisation, Step, doubled
+
+
+class UNet(Encoder):
+    """Five levels of two 3×3 convolutions each, joined across at equal size (thesis §7.3.2; Ronneberger et al. 2015).
+
+    Max-pooling leads down; bilinear interpolation and a 3×3 convolution lead up, without the checkerboards of
+    transposed convolutions. An input of 1 in every channel is empty ground, and so is all beyond the border: sides
+    continue empty to a multiple of 2 ** (levels - 1) pixels.
+
+    Args:
+        input_shape: (channels, height, width), any size; other sizes than this one are read too.
+        width: channels of the first level; each level down has twice as many.
+        normalisation: by running moments of batches (`batch`), the same with training corrected towards them
+            (`renorm`), or by each picture's groups of channels (`group`); see `layers.Layer`.
+        colors: outputs that are colours, 0 to 1.
+        scales: further outputs, any real number: logarithms of scales.
+        crop: margin, pixels, around the subject's box to which evaluation keeps; None computes all.
+        precision: of evaluation; `auto` is bfloat16 where the processor is made for it.
+
+    Attributes:
+        report: what evaluation computed of the last batch; None after training, and without crop.
+
+    Raises:
+        ConfigError: the input is no image, or `crop` with `normalisation="group"`.
+    """
+
+    bibtex = """@inproceedings{prokudin2021smplpix,
+  author    = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
+  title     = {{SMPLpix}: Neural Avatars from {3D} Human Models},
+  booktitle = {IEEE Winter Conference on Applications of Computer Vision (WACV)},
+  pages     = {1810--1819},
+  year      = {2021}
+}
+@inproceedings{ronneberger2015unet,
+  author    = {Ronneberger, Olaf and Fischer, Philipp and Brox, Thomas},
+  title     = {{U-Net}: Convolutional Networks for Biomedical Image Segmentation},
+  booktitle = {Medical Image Computing and Computer-Assisted Intervention (MICCAI)},
+  pages     = {234--241},
+  year      = {2015}
+}"""
+
+    report: Report | None = None
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        width: Annotated[int, Field(gt=0)] = 32,
+        levels: Annotated[int, Field(ge=1, le=8)] = 5,
+        normalisation: Normalisation = "renorm",
+        colors: Annotated[int, Field(gt=0)] = 3,
+        scales: Literal[0, 1, 3] = 0,
+        crop: Annotated[int, Field(ge=0)] | None = 32,
+        precision: Precision = "float32",
+    ) -> None:
+        super().__init__()
+        require_pictures("unet", input_shape, normalisation, crop)
+        self.levels = levels
+        widths = [width * 2**level for level in range(levels)]
+        sides: list[tuple[int, int]] = []
+        before = input_shape[0]
+        for after in widths:
+            sides += [(before, after), (after, after)]
+            before = after
+        for after in widths[-2::-1]:
+            sides += [(before, after), (2 * after, after), (after, after)]
+            before = after
+        self.layers = nn.ModuleList(Layer(*pair, 3, normalisation) for pair in sides)
+        self.head = nn.Conv2d(width, colors + scales, 1)
+        self.canvas = Canvas(colors, 2 ** (levels - 1), crop, precision)
+        self.output_shape = (colors + scales, *input_shape[1:])
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def maps(self, pictures: Tensor, layers: Iterator[Step]) -> Tensor:
+        maps = pictures.contiguous(memory_format=torch.channels_last)
+        across: list[Tensor] = []
+        for level in range(self.levels):
+            maps = functional.max_pool2d(maps, 2) if level else maps
+            maps = next(layers)(maps)
+            maps = next(layers)(maps)
+            across.append(maps)
+        for same_size in reversed(across[:-1]):
+            maps = torch.cat([same_size, next(layers)(doubled(maps))], 1)
+            maps = next(layers)(maps)
+            maps = next(layers)(maps)
+        return maps
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
+        answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
+        return answers
