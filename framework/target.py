@@ -5,7 +5,7 @@ from typing import Literal
 
 from framework.errors import ConfigError
 
-Kind = Literal["angle", "real", "class"]
+Kind = Literal["angle", "real", "class", "image"]
 MOST = 40
 """Names that a sentence lists in full."""
 
@@ -15,19 +15,23 @@ class Target:
     """The quantity a density head predicts.
 
     Attributes:
-        kind: "angle": radians, read modulo 2π; "real": any real number; "class": one of several labels.
+        kind: "angle": radians, read modulo 2π; "real": any real number; "class": one of several labels;
+            "image": pixels.
         names: for angles and reals the name of each number, e.g. ("azimuth", "elevation", "tilt"), and a batch
             of targets is a float tensor of shape (batch, len(names)); for classes the label names, and a batch
-            of targets is an int64 tensor of shape (batch,).
+            of targets is an int64 tensor of shape (batch,); for images the name of each channel, and a batch of
+            targets is a float tensor of shape (batch, *size, len(names)).
         location, scale: of reals, the mean and standard deviation of each number over the training split: a head
             is scaled by them, so that its raw numbers are of the order of 1 in whatever unit. () where the numbers
             are of that order already; the head then takes 0 and 1.
+        size: of images (height, width), pixels; else ().
     """
 
     kind: Kind
     names: tuple[str, ...]
     location: tuple[float, ...] = ()
     scale: tuple[float, ...] = ()
+    size: tuple[int, int] | tuple[()] = ()
 
     @property
     def told(self) -> str:

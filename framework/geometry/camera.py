@@ -38,12 +38,39 @@ class Camera:
     ) -> tuple[Float[Tensor, "*points 2"], Float[Tensor, "*points"]]:
         """Pixels (column, row) at which world points are seen, and their depths along the optical axis, metres. Of a
         depth that is not above 0 the pixel means nothing."""
+        seen, focal, principal = self._seen(points)
+        return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
+
+    def canonical(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        """World points in the axes of `canonical_camera(height, width)`, which sees each at the same pixel and depth.
+
+        x right, y down, z forward, metres: x' = (fx x + (cx - (width - 1) / 2) z) / height, y' likewise, z' = z.
+        """
+        seen, focal, principal = self._seen(points)
+        middle = principal.new_tensor([(self.width - 1) / 2, (self.height - 1) / 2])
+        moved = (focal * seen[..., :2] + (principal - middle) * seen[..., 2:]) / self.height
+        return torch.cat([moved, seen[..., 2:]], -1)
+
+    def _seen(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Points in the camera's axes, the focal lengths and the principal point, all as the points are."""
         seen = points @ self.rotation.to(points).T + self.translation.to(points)
         focal, principal = (
             torch.as_tensor(part, dtype=points.dtype, device=points.device)
             for part in (self.focal, self.principal)
         )
-        return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
+        return seen, focal, principal
+
+
+def canonical_camera(height: int, width: int) -> Camera:
+    """At the origin, looking along z: focal length = height pixels, principal point in the middle of the image."""
+    return Camera(
+        torch.eye(3),
+        torch.zeros(3),
+        (float(height), float(height)),
+        ((width - 1) / 2, (height - 1) / 2),
+        height,
+        width,
+    )
 
 
 def look_from(

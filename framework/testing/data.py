@@ -183,7 +183,7 @@ def _target(data: Data, target: Tensor, where: str, worst: Worst) -> None:
             (target < 0) | (target >= len(names)), f"{where}: class {target.tolist()} of {len(names)}"
         )
         return
-    worst.same(f"{where}: target", tuple(target.shape), (len(names),))
+    worst.same(f"{where}: target", tuple(target.shape), (*data.target.size, len(names)))
     worst.count(not target.is_floating_point(), f"{where}: target of {target.dtype}, wanted a float")
     worst.finite(f"{where}: target", target)
 
