@@ -32,6 +32,8 @@ class Body:
             features a joint but the root, rotation matrix less identity, row by row (Loper et al. 2015, eq. 9); or 4,
             unit quaternion (x, y, z, w) less identity, and the second shape coefficient (Osman et al. 2020, eq. 4).
         names: of the joints; empty where they have none.
+        uv, uv_faces: places in a texture, u to the right and v upwards, and three rows of them a face; None for a body
+            without.
 
     Raises:
         DataError: parts that do not fit together, a number that is not finite, weights that are no shares, parents
@@ -48,6 +50,8 @@ class Body:
     joint_shapes: Float[np.ndarray, "_joint 3 _shape"]
     pose_shapes: Float[np.ndarray, "_vertex 3 _feature"] | None = None
     names: tuple[str, ...] = ()
+    uv: Float[np.ndarray, "place 2"] | None = None
+    uv_faces: Int[np.ndarray, "face 3"] | None = None
 
     def __post_init__(self) -> None:
         vertices, joints, shapes = len(self.template), len(self.parents), self.shapes.shape[-1]
@@ -77,6 +81,8 @@ class Body:
             raise DataError(f"{self.source}: {len(self.names)} names for {joints} joints; wanted one each.")
         self._check_weights()
         self._check_tree()
+        if self.uv is not None and self.uv_faces is not None:
+            self._check_places(self.uv, self.uv_faces)
         if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < vertices):
             raise DataError(
                 f"{self.source}: faces name the vertices {self.faces.min()} to {self.faces.max()}, but there are 0 to "
@@ -93,6 +99,14 @@ class Body:
             )
         if (np.abs(total - 1) > ROUNDING).any():
             object.__setattr__(self, "weights", (self.weights / total).astype(self.weights.dtype))
+
+    def _check_places(self, uv: np.ndarray, uv_faces: np.ndarray) -> None:
+        fits = uv.ndim == 2 and uv.shape[1] == 2 and uv_faces.shape == self.faces.shape
+        if not fits or not np.isfinite(uv).all() or uv_faces.min(initial=0) < 0 or uv_faces.max() >= len(uv):
+            raise DataError(
+                f"{self.source}: uv {uv.shape} and uv_faces {uv_faces.shape} do not fit {len(self.faces)} faces, or hold "
+                "numbers that are not finite. Restore it from its source."
+            )
 
     def _check_tree(self) -> None:
         roots = [joint for joint, parent in enumerate(self.parents) if parent < 0]

@@ -46,8 +46,9 @@ def save(body: Body, file: Path) -> None:
     """Write a body as an .npz of our own layout, whole or not at all."""
     arrays = {name: np.asarray(getattr(body, name)) for name in OWN}
     arrays |= {"source": np.array(body.source), "names": np.array(body.names, dtype=np.str_)}
-    if body.pose_shapes is not None:
-        arrays["pose_shapes"] = body.pose_shapes
+    for name in ("pose_shapes", "uv", "uv_faces"):
+        if getattr(body, name) is not None:
+            arrays[name] = getattr(body, name)
     with replacing(file) as part, part.open("wb") as stream:
         np.savez(stream, allow_pickle=False, **arrays)
 

@@ -24,7 +24,7 @@ from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies import body_files
 from plugins.data.bodies.body import Body
 
-VERSION = 2
+VERSION = 3
 """Of what is kept; a change takes a new number."""
 
 

@@ -1,0 +1,209 @@
+"""A dressed person as a scanner sees one, and the smooth body registered to that scan.
+
+The scan has what photographs show: cloth with thickness and wrinkles, hair, light. The registration is the body with a
+part of the garments' thickness, blurred, and colours sampled from the scan: what a renderer gets (thesis §7.3.1).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from numpy.random import Generator
+from scipy.sparse import coo_matrix, csr_matrix, diags
+from scipy.spatial import cKDTree
+
+from framework.geometry.light import eight_bit
+from plugins.data.bodies import skins
+from plugins.data.bodies.anatomy import Anatomy, anatomy
+from plugins.data.bodies.body import Body, BodyModel
+from plugins.data.bodies.fabrics import noise
+from plugins.data.bodies.garments import outfit
+from plugins.data.bodies.hair import Piece, hair, tied
+from plugins.data.bodies.hanging import hung
+from plugins.data.bodies.topologies import Sheet, edges, sheet
+
+FOLLOWED = (0.5, 0.75)
+"""Share of the garments' thickness that a registration has, between these."""
+ERROR = 0.003
+"""Standard deviation of what else a registration is off, metres."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What photographs show; metres, linear light with the scanner's own light in it.
+
+    Attributes:
+        vertices, faces, colors: of the body's sheet and of what hangs beside it.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    colors: Float[np.ndarray, "vertices 3"]
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The smooth body on every vertex of the sheet, of which each topology has some; metres, 8-bit sRGB."""
+
+    vertices: Float[np.ndarray, "sheet 3"]
+    colors: UInt8[np.ndarray, "sheet 3"]
+
+
+class Wardrobe:
+    """Dresses posed people of one body; holds what is the same for all of them.
+
+    Args:
+        stages: how often the body's edges are split for the scan.
+    """
+
+    def __init__(self, body: Body, stages: int = 2) -> None:
+        self.body = body
+        self.model = BodyModel(body)
+        self.sheet: Sheet = sheet(body, stages)
+        self.anatomy: Anatomy = anatomy(body, self.sheet.carried)
+        self.faces = self.sheet.faces
+        self._spread = _spread(self.faces, len(self.anatomy.place))
+        self._neighbours = _neighbours(body.faces, len(body.template))
+        self.vertices = len(body.template)
+        self.uv = None if body.uv is None else self.sheet.carried_uv(body.uv)
+        places = self.sheet.corners[-1].uv_faces
+        self._place_of = np.zeros(len(self.anatomy.place), np.int64)
+        self._place_of[self.faces.ravel()] = places.ravel()
+        self.vertex_of_place = np.zeros(places.max() + 1 if self.uv is None else len(self.uv), np.int64)
+        self.vertex_of_place[places.ravel()] = self.faces.ravel()
+
+    def dress(
+        self,
+        posed: Float[np.ndarray, "vertices 3"],
+        skin: UInt8[np.ndarray, "height width 3"] | None,
+        random: Generator,
+    ) -> tuple[Scan, Registered]:
+        """Clothes, hair and skin drawn for a posed body; `skin` is a picture of one in the body's texture layout."""
+        where = self.anatomy
+        worn = outfit(where, random)
+        grown = hair(where, random)
+        if skin is None or self.uv is None:
+            colors = skins.painted(where, random)
+        else:
+            colors = skins.shown(skin, self.uv)[self._place_of]
+        raised = np.zeros(len(where.place))
+        cover = np.zeros(len(where.place))
+        for garment in worn.garments:
+            colors = np.where((garment.inside > 0)[:, None], garment.colors, colors)
+            raised = raised + garment.raised()
+            cover = np.maximum(cover, (garment.inside / 0.03).clip(0, 1))
+        colors = colors + grown.share[:, None] * (grown.colors - colors)
+        bare = self.sheet.carried(posed)
+        draped = self.sheet.carried(self._smoothed(posed, cover[: self.vertices]))
+        vertices = draped + (raised + grown.raised)[:, None] * self.normals(draped)
+        pieces = [Piece(vertices, self.faces, colors)]
+        hidden = np.zeros(len(vertices), bool)
+        if worn.skirt is not None:
+            held = np.flatnonzero(where.arms[: self.vertices] < 0.3)
+            piece = hung(
+                worn.skirt, vertices[held], np.abs(where.place[held, 1] - where.waist) < 0.03, random
+            )
+            pieces.append(piece)
+            low, high = piece.vertices[:, 1].min() + 0.01, piece.vertices[:, 1].max() - 0.01
+            hidden = (where.arms < 0.3) & (vertices[:, 1] > low) & (vertices[:, 1] < high)
+        locks = tied(grown.style, grown.color, *self._head(posed), random)
+        if locks is not None:
+            pieces.append(locks)
+        light = Light(random)
+        lit = [
+            light.on(piece, self.normals(piece.vertices) if piece is pieces[0] else _normals(piece))
+            for piece in pieces
+        ]
+        starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+        scan = Scan(
+            np.concatenate([piece.vertices for piece in pieces]),
+            np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=False)]),
+            np.concatenate(lit).clip(0, 1),
+        )
+        seen = np.concatenate([~hidden, *(np.ones(len(piece.vertices), bool) for piece in pieces[1:])])
+        return scan, self._registered(bare, raised + 0.6 * grown.raised, scan, seen, random)
+
+    def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
+        """Unit normals of the sheet's vertices, outwards, means over their faces by area."""
+        return _unit(self._spread @ _cross(vertices, self.faces))
+
+    def _registered(
+        self, bare: np.ndarray, raised: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator
+    ) -> Registered:
+        """The body, moved towards the scan as far as registrations do, with the colours of the scan's nearest points."""
+        own = raised[: self.vertices]
+        for _ in range(12):
+            own = self._neighbours @ own
+        off = self.sheet.carried(own * random.uniform(*FOLLOWED)) + ERROR * noise(
+            self.anatomy.place, 0.25, random
+        )
+        vertices = bare + off[:, None] * self.normals(bare)
+        points = np.flatnonzero(seen)
+        _, nearest = cKDTree(scan.vertices[points], balanced_tree=False, compact_nodes=False).query(vertices)
+        colors = eight_bit(torch.from_numpy(scan.colors[points[nearest]])).numpy()
+        return Registered(vertices, colors)
+
+    def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
+        """Without what cloth hides: each step blurs, and undoes the shrinking that comes of it (Taubin 1995)."""
+        found = posed.astype(np.float64)
+        for _ in range(12):
+            for weight in (0.5, -0.53):
+                found = found + weight * cover[:, None] * (self._neighbours @ found - found)
+        return found
+
+    def _head(self, posed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The affine map that takes the template's head to where it is, and the template's box of it."""
+        head = self.anatomy.head[: self.vertices] > 0.9
+        if head.sum() < 4:
+            head = np.ones(self.vertices, bool)
+        template = self.body.template[head].astype(np.float64)
+        given = np.concatenate([template, np.ones((len(template), 1))], 1)
+        found = np.linalg.lstsq(given, posed[head].astype(np.float64), rcond=None)[0]
+        return found, np.stack([template.min(0), template.max(0)], 1)
+
+
+class Light:
+    """A scanner's light: from everywhere, more from above, and from one side."""
+
+    def __init__(self, random: Generator) -> None:
+        turn, lift = random.uniform(0, 2 * np.pi), random.uniform(0.3, 0.9)
+        self.towards = np.array([np.cos(lift) * np.sin(turn), np.sin(lift), np.cos(lift) * np.cos(turn)])
+        self.key = random.uniform(0.35, 0.6)
+
+    def on(self, piece: Piece, normals: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+        """Linear light that a matt surface of these colours sends back."""
+        around = 0.62 + 0.22 * normals[:, 1]
+        side = ((normals @ self.towards + 0.3) / 1.3).clip(0, 1)
+        return piece.colors * (around + self.key * side)[:, None]
+
+
+def _cross(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "faces 3"]:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _normals(piece: Piece) -> Float[np.ndarray, "vertices 3"]:
+    spread = _spread(piece.faces, len(piece.vertices))
+    return _unit(spread @ _cross(piece.vertices, piece.faces))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
+    """Sums over the faces of every vertex."""
+    columns = np.repeat(np.arange(len(faces)), 3)
+    return coo_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces))).tocsr()
+
+
+def _neighbours(faces: np.ndarray, vertices: int) -> csr_matrix:
+    """Means over the neighbours of every vertex and itself."""
+    pairs, _ = edges(faces)
+    one, other = pairs.T
+    ends = np.concatenate([one, other]), np.concatenate([other, one])
+    near = coo_matrix((np.ones(2 * len(pairs)), ends), (vertices, vertices)).tocsr() + diags(
+        np.ones(vertices)
+    )
+    return csr_matrix(diags(1 / np.asarray(near.sum(1)).ravel()) @ near)

@@ -1,0 +1,114 @@
+"""Cloth by procedure: noise of a band of wavelengths, folds, and patterns finer than a mesh's vertices carry."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from numpy.random import Generator
+
+Color = Float[np.ndarray, "3"]
+"""Linear light in [0, 1]."""
+WAVES = 10
+"""Plane waves of a noise."""
+
+
+def hue(degrees: float, saturation: float, value: float) -> Color:
+    """Linear light of a colour by hue, saturation and value of its sRGB numbers."""
+    sector = (np.array([5.0, 3.0, 1.0]) + degrees / 60) % 6
+    return (value * (1 - saturation * np.minimum(sector, 4 - sector).clip(0, 1))) ** 2.2
+
+
+def dye(random: Generator) -> Color:
+    """A colour that clothes are of: muted ones mostly, black, white and grey often."""
+    kind = random.random()
+    if kind < 0.2:
+        return hue(220, 0.1, random.uniform(0.1, 0.25))
+    if kind < 0.38:
+        return hue(40, 0.06, random.uniform(0.8, 0.95))
+    if kind < 0.48:
+        return hue(30, 0.05, random.uniform(0.35, 0.6))
+    return hue(random.uniform(0, 360), random.uniform(0.25, 0.85), random.uniform(0.3, 0.85))
+
+
+def noise(
+    place: Float[np.ndarray, "points 3"],
+    wavelength: float,
+    random: Generator,
+    squeezed: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    waves: int = WAVES,
+) -> Float[np.ndarray, "points"]:
+    """Smooth noise of standard deviation 1 whose waves are within a factor 1.5 of a wavelength, metres.
+
+    `squeezed`: along x, y and z the wavelength is this many times as short.
+    """
+    direction = random.normal(size=(3, waves))
+    direction /= np.linalg.norm(direction, axis=0)
+    number = 2 * np.pi / (wavelength * 1.5 ** random.uniform(-1, 1, waves))
+    phase = random.uniform(0, 2 * np.pi, waves)
+    wave = (direction * number * np.array(squeezed)[:, None]).astype(np.float32)
+    return np.sin(place.astype(np.float32) @ wave + phase.astype(np.float32)).sum(1) * (2 / waves) ** 0.5
+
+
+def folds(
+    place: Float[np.ndarray, "points 3"],
+    wavelength: float,
+    across: tuple[float, float, float],
+    random: Generator,
+) -> Float[np.ndarray, "points"]:
+    """Wrinkles that run across a direction, narrow ridges between wide valleys, about 0 and 1 high."""
+    direction = np.array(across)[:, None] + 0.35 * random.normal(size=(3, 5))
+    direction /= np.linalg.norm(direction, axis=0)
+    number = 2 * np.pi / (wavelength * 1.4 ** random.uniform(-1, 1, 5))
+    bent = place + 0.2 * wavelength * noise(place, 3 * wavelength, random, waves=5)[:, None]
+    phase = random.uniform(0, 2 * np.pi, 5).astype(np.float32)
+    waves = np.sin(bent.astype(np.float32) @ (direction * number).astype(np.float32) + phase).sum(1) * 0.63
+    come_and_go = (0.5 + 0.6 * noise(place, 2.2 * wavelength, random, waves=5)).clip(0, 1.2)
+    return (np.exp(0.9 * waves.clip(-2, 1.2)) - 1.2) * 0.6 * come_and_go
+
+
+Pattern = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From across and along a piece of cloth (points,), metres, to colours (points, 3)."""
+
+
+def pattern(random: Generator) -> Pattern:
+    """A piece of cloth, drawn."""
+    first, second, third = dye(random), dye(random), dye(random)
+    if np.abs(first - second).max() < 0.15:
+        second = (1 - first) * 0.8
+    kind = random.choice(
+        ["plain", "plain", "stripes", "upright", "check", "dots", "blocks", "melange", "zigzag"]
+    )
+    width, share = random.uniform(0.02, 0.09), random.uniform(0.25, 0.6)
+    if kind in ("dots", "upright"):
+        width = random.uniform(0.025, 0.06)
+
+    def colors(across: np.ndarray, along: np.ndarray) -> np.ndarray:
+        if kind == "stripes":
+            where = _band(along, width, share)
+        elif kind == "upright":
+            where = _band(across, width, share)
+        elif kind == "zigzag":
+            where = _band(along + 0.4 * np.abs((across / width) % 2 - 1) * width, width, share)
+        elif kind == "check":
+            where = 0.5 * _band(along, width, 0.5) + 0.5 * _band(across, width, 0.5)
+        elif kind == "dots":
+            odd = np.floor(along / width) % 2
+            x, y = (across / width + odd / 2) % 1 - 0.5, (along / width) % 1 - 0.5
+            where = (np.hypot(x, y) < 0.15 + 0.25 * share).astype(float)
+        elif kind == "blocks":
+            where = (along > np.median(along)).astype(float)
+        elif kind == "melange":
+            where = 0.25 + 0.25 * np.sin(900 * across) * np.sin(700 * along)
+        else:
+            where = np.zeros(len(across))
+        found = first + where[:, None] * (second - first)
+        if kind == "check":
+            line = _band(along, width, 0.08) + _band(across, width, 0.08)
+            found = np.where(line[:, None] > 0, third, found)
+        return found
+
+    return colors
+
+
+def _band(values: np.ndarray, width: float, share: float) -> np.ndarray:
+    return ((values / width) % 1 < share).astype(float)

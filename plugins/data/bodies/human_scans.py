@@ -1,0 +1,270 @@
+"""Photographs of scanned people, with registered meshes of one colour a vertex; the contract is framework.data's."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data, Splits
+from framework.datasets.fields import Fields
+from framework.errors import ConfigError, DataError
+from framework.geometry import clouds
+from framework.geometry.camera import Camera, canonical_camera
+from framework.geometry.light import encoded, linear
+from framework.geometry.mesh_files import COLOURS, XYZ
+from framework.geometry.meshes import READERS, read
+from framework.renderer import Renderer
+from framework.storage.generated import read_mark
+from framework.target import Target
+from plugins.data.bodies import scan_layout
+from plugins.data.bodies.scan_generator import Drawing, scans_root
+from plugins.data.bodies.scan_layout import Subject, View
+
+VERSION = 1
+"""Of how the files are read; a change takes a new number."""
+Number = Annotated[int, Field(ge=1, le=100_000)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,40}$")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """Subjects of each split, where they are generated."""
+
+    train: Number = 40
+    validation: Number = 4
+    test: Number = 8
+
+
+class HumanScans(Data):
+    """Photographs of people, each with the mesh that was registered to the person's scan (thesis §7.3.1, §7.4.1).
+
+    An input is (points, 6): each vertex in the axes of the canonical camera of the image
+    (`framework.geometry.camera.canonical_camera`: x right, y down, z forward, metres) and its red, green and blue as
+    files hold them, sRGB in [0, 1]. The target is the photograph, (height, width, 3), sRGB in [0, 1], put on white by
+    its mask, in light. Batches also hold "color", the same in light; "mask" (height, width), bool, where half of a
+    pixel or more is the subject; "subject", int64, its number in the split.
+
+    Args:
+        renderer: draws the photographs of generated people.
+        root: a folder laid out as plugins.data.bodies.scan_layout says; None: people are generated into the cache once.
+        topology: which of the registered meshes; generated are 7k (6,890 vertices) and 27k (27,578).
+        counts, drawing: of generated people.
+        data_seed: of their draws, whatever the seed of the run.
+
+    Raises:
+        DataError: a file is missing or damaged, images differ in size, meshes in their number of vertices.
+        ConfigError: the renderer draws no colours.
+    """
+
+    bibtex = """@inproceedings{prokudin2021smplpix,
+  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
+  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
+  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
+  year = {2021}
+}
+@inproceedings{bregier2026anny,
+  title = {Human Mesh Modeling for {A}nny {B}ody},
+  author = {Br{\\'e}gier, Romain and Fiche, Gu{\\'e}nol{\\'e} and Bravo-S{\\'a}nchez, Laura and Lucas, Thomas and
+    Armando, Matthieu and Weinzaepfel, Philippe and Rogez, Gr{\\'e}gory and Baradel, Fabien},
+  booktitle = {European Conference on Computer Vision (ECCV)},
+  year = {2026}
+}"""
+    suffixes = tuple(READERS)
+    columns = (*XYZ, *COLOURS)
+    varies = False
+
+    def __init__(
+        self,
+        *,
+        renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
+        root: str | None = None,
+        topology: Word = "7k",
+        counts: Counts,
+        drawing: Drawing,
+        data_seed: Seed = 0,
+    ) -> None:
+        if not {"color", "mask"} <= renderer.channels:
+            raise ConfigError(
+                f"data.renderer = {type(renderer).__name__} draws no color with a mask; choose another renderer."
+            )
+        self.renderer = renderer
+        self.root = root
+        self.topology = topology
+        self.counts = asdict(counts)
+        self.drawing = drawing
+        self.data_seed = data_seed
+        self.size = (drawing.height, drawing.width)
+
+    def prepare(self) -> None:
+        if self.root is None:
+            root = scans_root(self.renderer, self.counts, self.drawing, self.data_seed)
+        else:
+            root = Path(self.root).expanduser()
+        self.folder = root
+        self.groups = ("people",)
+        self.synthetic = read_mark(root) is not None
+        self.skipped = 0
+        names = scan_layout.read_splits(root)
+        subjects = {
+            split: [scan_layout.read_subject(root, name, self.topology) for name in some]
+            for split, some in names.items()
+        }
+        every = [subject for some in subjects.values() for subject in some]
+        self.size, points = _common(root, every)
+        self.input_shape = (points, len(self.columns))
+        self.target = Target("image", COLOURS, size=self.size)
+        self._digest = _digest(subjects)
+        self._splits = Splits(**{split: Photographs(some) for split, some in subjects.items()})
+
+    def splits(self) -> Splits:
+        return self._splits
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        """Coloured meshes as a camera in front sees them whole, or as those of a cameras.json beside the file do."""
+        if not files:
+            raise DataError("No file was given; wanted a mesh with vertex colours, or several.")
+        inputs = [points for file in files for points in self._seen(Path(file))]
+        return Fields(input=clouds.pad(inputs), index=torch.arange(len(inputs)))
+
+    def _seen(self, file: Path) -> list[Float[Tensor, "points 6"]]:
+        mesh = read(file)
+        colors = torch.from_numpy(scan_layout.vertex_colors(mesh))
+        vertices = torch.from_numpy(mesh.vertices).float()
+        beside = file.with_name("cameras.json")
+        cameras = (
+            list(scan_layout.read_cameras(beside).values())
+            if beside.exists()
+            else [in_front(vertices, *self.size)]
+        )
+        return [_input(vertices, colors, camera) for camera in cameras]
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return {"height": self.size[0], "width": self.size[1]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        if set(state) != {"height", "width"}:
+            raise DataError(
+                f"human_scans keeps the size of its images, but was given {', '.join(state) or 'nothing'}. Give the data "
+                "that the model was trained on."
+            )
+        self.size = (int(state["height"]), int(state["width"]))
+
+    def augment(self, batch: Batch) -> Batch:
+        return batch
+
+    def fingerprint(self) -> Mapping[str, str]:
+        return {
+            "root": "generated" if self.root is None else self.root,
+            "version": f"human_scans {VERSION}",
+            "topology": self.topology,
+            "size": "×".join(map(str, self.size)),
+            **{name: str(len(split)) for name, split in self._splits._asdict().items()},
+            "sha256": self._digest,
+        }
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        """The points that the canonical camera sees, a pixel each, on white; nearer ones hide those behind."""
+        height, width = self.size
+        points = inputs.detach().cpu().float()
+        points = points[points.isfinite().all(1)]
+        place, depth = canonical_camera(height, width).projected(points[:, :3])
+        image = torch.ones(height * width, 3)
+        order = (-depth).argsort(stable=True)  # the nearest last
+        column, row = place[order].round().T
+        seen = (depth[order] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = (row[seen] * width + column[seen]).long().numpy()
+        # of several points of one pixel NumPy keeps the last
+        image.numpy()[pixel] = points[order][seen][:, 3:].numpy()
+        return (image.clamp(0, 1) * 255).round().byte().view(height, width, 3).numpy()
+
+
+class Photographs(Dataset[Batch]):
+    """Photographs of one split, read when they are fetched; subject after subject, each in the order of its views."""
+
+    def __init__(self, subjects: Sequence[Subject]) -> None:
+        self.subjects = list(subjects)
+        self.of = [(number, view) for number, one in enumerate(subjects) for view in one.views]
+
+    def __len__(self) -> int:
+        return len(self.of)
+
+    def __getitem__(self, index: int) -> Batch:
+        number, view = self.of[index]
+        registration = self.subjects[number].registration
+        light, cover = photograph(view)
+        return {
+            "input": _input(registration.vertices, registration.colors, view.camera),
+            "target": encoded(light),
+            "color": light,
+            "mask": cover >= 0.5,
+            "subject": torch.tensor(number),
+            "group": torch.tensor(0),
+            "index": torch.tensor(range(len(self))[index]),
+        }
+
+
+def photograph(view: View) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+    """Light of a photograph on white, and how much of each pixel is the subject."""
+    pixels, mask = scan_layout.read_photograph(view)
+    cover = torch.from_numpy(mask).float() / 255
+    return linear(torch.from_numpy(pixels)) * cover[..., None] + (1 - cover[..., None]), cover
+
+
+def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> Camera:
+    """Sees a mesh whole from the front (its z axis), y up, upright; as a canonical camera does."""
+    low, high = vertices.min(0).values, vertices.max(0).values
+    middle, extent = (low + high) / 2, high - low
+    # the nearest side fills nine tenths of the image at most; focal length: height pixels
+    away = float(torch.stack([extent[1], extent[0] * height / width]).max()) / 0.9 + float(extent[2]) / 2
+    rotation = torch.tensor([1.0, -1.0, -1.0]).diag()
+    ahead = torch.tensor([0.0, 0.0, max(away, 1e-3)])
+    one = canonical_camera(height, width)
+    return Camera(rotation, ahead - rotation @ middle, one.focal, one.principal, height, width)
+
+
+def _input(vertices: Tensor, colors: Tensor, camera: Camera) -> Float[Tensor, "points 6"]:
+    return torch.cat([camera.canonical(vertices), colors.float() / 255], 1)
+
+
+def _common(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, int], int]:
+    """The size of all images, and the number of all meshes' vertices."""
+    first = subjects[0]
+    size = (first.views[0].camera.height, first.views[0].camera.width)
+    points = len(first.registration.vertices)
+    for subject in subjects:
+        folder = root / "subjects" / subject.name
+        if (found := len(subject.registration.vertices)) != points:
+            raise DataError(
+                f"{folder}: its registration has {found} vertices, that of {first.name} {points}; wanted one topology."
+            )
+        for view in subject.views:
+            if (found := (view.camera.height, view.camera.width)) != size:
+                raise DataError(
+                    f"{folder}: view {view.name} has {found[0]} × {found[1]} pixels, the first of all {size[0]} × "
+                    f"{size[1]} (height × width); wanted one size. Scale the pictures and their K."
+                )
+    return size, points
+
+
+def _digest(subjects: Mapping[str, Sequence[Subject]]) -> str:
+    """Hash of names, meshes, cameras, and the checksums that photographs and masks end with."""
+    digest = hashlib.sha256()
+    for split, some in subjects.items():
+        for subject in some:
+            digest.update(f"{split} {subject.name}\n".encode())
+            registration = subject.registration
+            for part in (registration.vertices, registration.colors, registration.faces):
+                digest.update(part.numpy().tobytes())
+            for view in subject.views:
+                digest.update(f"{view.name} {view.camera}\n".encode())
+                digest.update(scan_layout.tail(view.image) + scan_layout.tail(view.mask))
+    return digest.hexdigest()

@@ -1,0 +1,126 @@
+"""Photographs of a scan: a rig of cameras round the person, anti-aliased pictures with masks, and a texture."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy.random import Generator
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from framework.geometry.camera import Camera
+from framework.geometry.light import eight_bit
+from framework.renderer import Renderer, Scene
+
+SAMPLES = 4
+"""Of a pixel along each axis."""
+AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
+"""Places of the rig: so many round the person, at each of these elevations in degrees."""
+FOCAL = 1.25
+"""Focal length in heights of the image."""
+MARGIN = 0.05
+"""Share of the image's height and width that stays free on each side, at least."""
+
+
+class Photograph(NamedTuple):
+    """8-bit sRGB of the subject wherever the mask is above 0, and how much of each pixel is the subject."""
+
+    pixels: UInt8[np.ndarray, "height width 3"]
+    mask: UInt8[np.ndarray, "height width"]
+
+
+def rig(
+    vertices: Float[np.ndarray, "vertices 3"], count: int, size: tuple[int, int], random: Generator
+) -> list[Camera]:
+    """Cameras at different places that see all of a person; fewer places than `count` are used twice.
+
+    Each looks at the middle of the person from as near as shows it whole, or a tenth further away, rolled by a degree
+    or two, with a principal point a little off the middle.
+    """
+    places = AROUND * len(HEIGHTS)
+    order = np.concatenate([random.permutation(places) for _ in range(-(-count // places))])[:count]
+    middle = (vertices.min(0) + vertices.max(0)) / 2
+    return [_camera(vertices - middle, middle, divmod(int(place), AROUND), size, random) for place in order]
+
+
+def _camera(
+    around: np.ndarray, middle: np.ndarray, place: tuple[int, int], size: tuple[int, int], random: Generator
+) -> Camera:
+    height, width = size
+    azimuth = 2 * math.pi * (place[1] + random.uniform(-0.2, 0.2)) / AROUND
+    elevation = math.radians(HEIGHTS[place[0]] + random.uniform(-3, 3))
+    roll = math.radians(random.normal(0, 1))
+    back = np.array(
+        [
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+            math.cos(elevation) * math.cos(azimuth),
+        ]
+    )
+    right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+    rows = np.stack([right, np.cross(right, back), -back])  # x right, y down, z forward
+    turn = np.array([[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]])
+    rotation = turn @ rows
+    focal = FOCAL * height
+    off = random.uniform(-0.02, 0.02, 2) * height
+    x, y, z = (around @ rotation.T).T
+    # whole where focal |x| / (z + distance) stays within half the width but for the margin and the principal point's place
+    free = np.array([width / 2 - np.abs(off[0]), height / 2 - np.abs(off[1])]) - MARGIN * height
+    nearest = max((focal * np.abs(x) / free[0] - z).max(), (focal * np.abs(y) / free[1] - z).max())
+    distance = nearest * random.uniform(1.0, 1.1)
+    return Camera(
+        torch.from_numpy(rotation).float(),
+        torch.from_numpy(np.array([0, 0, distance]) - rotation @ middle).float(),
+        (focal, focal),
+        ((width - 1) / 2 + off[0], (height - 1) / 2 + off[1]),
+        height,
+        width,
+    )
+
+
+def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) -> list[Photograph]:
+    """The scene from each camera, every pixel the mean light of SAMPLES² points that lie on the subject."""
+    larger = [Scene(scene.vertices, scene.faces, scene.colors, _finer(camera)) for camera in cameras]
+    return [_pooled(drawn) for drawn in renderer.batch(larger, ("color", "mask"))]
+
+
+def _finer(camera: Camera) -> Camera:
+    """Of an image SAMPLES times as large: the middle of pixel p becomes S p + (S - 1) / 2."""
+    (fx, fy), (cx, cy) = (tuple(map(float, pair)) for pair in (camera.focal, camera.principal))
+    shift = (SAMPLES - 1) / 2
+    return Camera(
+        camera.rotation,
+        camera.translation,
+        (SAMPLES * fx, SAMPLES * fy),
+        (SAMPLES * cx + shift, SAMPLES * cy + shift),
+        SAMPLES * camera.height,
+        SAMPLES * camera.width,
+    )
+
+
+def _pooled(drawn: dict[str, Tensor]) -> Photograph:
+    covered = drawn["mask"].float()
+    light = avg_pool2d((drawn["color"] * covered[..., None]).movedim(-1, 0)[None], SAMPLES)[0].movedim(0, -1)
+    cover = avg_pool2d(covered[None, None], SAMPLES)[0, 0]
+    light = torch.where(cover[..., None] > 0, light / cover.clamp(min=1e-6)[..., None], 0.5)  # a grey studio
+    return Photograph(eight_bit(light).numpy(), (cover * 255).round().byte().numpy())
+
+
+def texture(
+    renderer: Renderer,
+    uv: Float[np.ndarray, "places 2"],
+    uv_faces: np.ndarray,
+    colors: Float[Tensor, "places 3"],
+    side: int,
+) -> UInt8[np.ndarray, "side side 3"]:
+    """A square texture from linear light at places, v upwards; what no triangle covers is as the nearest that one does."""
+    place = np.stack([uv[:, 0] * side - 0.5, (1 - uv[:, 1]) * side - 0.5, np.ones(len(uv))], 1)
+    camera = Camera(torch.eye(3), torch.zeros(3), (1.0, 1.0), (0.0, 0.0), side, side)
+    scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), colors, camera)
+    drawn = renderer(scene, ("color", "mask"))
+    row, column = distance_transform_edt(~drawn["mask"].numpy(), return_distances=False, return_indices=True)
+    return eight_bit(drawn["color"]).numpy()[row, column]

@@ -1,0 +1,199 @@
+"""Generates dressed people and writes what a scanner would have made of them, in the layout of `human_scans`."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.random import Generator
+from PIL import Image
+from pydantic import Field
+
+from framework.errors import ConfigError
+from framework.geometry.light import linear
+from framework.renderer import Renderer, Scene
+from framework.storage import cache
+from framework.storage.generated import draw_all, generated
+from plugins.data.bodies import poses, scan_layout, skins
+from plugins.data.bodies.dressed import Wardrobe
+from plugins.data.bodies.people import adults, chosen_body
+from plugins.data.bodies.photographs import Photograph, photographed, rig, texture
+from plugins.data.bodies.scan_layout import Registration
+from plugins.data.bodies.topologies import Name, topology
+
+VERSION = 1
+"""Of what is drawn; a change takes a new number."""
+SPLITS = ("train", "validation", "test")
+CALM = 0.4
+"""Of the usual spread of movements, that of people who stand still in an A-pose."""
+RAISED = 38.0
+"""Degrees of the arms of an A-pose from hanging."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """How people are generated and photographed.
+
+    Attributes:
+        views: photographs of each.
+        height, width: pixels of a photograph.
+        topologies: meshes registered to each scan.
+        posed: share of the test subjects that do not stand in an A-pose but anyhow.
+        texture_side: texels along a side of texture.png; 0: none is made.
+        skins: folder of pictures of skin in the default body's texture layout; None: skin is painted. Each is worn in one
+            split alone.
+        body: file of a body model of the SMPL family (.npz, .pkl); None: the default body.
+    """
+
+    views: Annotated[int, Field(ge=1, le=1_000)] = 12
+    height: Annotated[int, Field(ge=8, le=4096)] = 256
+    width: Annotated[int, Field(ge=8, le=4096)] = 192
+    topologies: Annotated[tuple[Name, ...], Field(min_length=1)] = ("7k", "27k")
+    posed: Annotated[float, Field(ge=0, le=1)] = 0.0
+    texture_side: Annotated[int, Field(ge=0, le=8192)] = 512
+    skins: str | None = None
+    body: str | None = None
+
+
+def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> Path:
+    """Where generated people lie in the cache; drawn now where they are not there.
+
+    Raises:
+        DataError: the body or the skins cannot be had or read.
+        ConfigError: fewer skins than splits, or skins for a body without texture places.
+    """
+    crowd = Crowd(renderer, counts, drawing, seed)
+    root = cache.folder("human_scans") / crowd.digest
+    return generated(root, crowd.mark, crowd.write)
+
+
+class Crowd:
+    """All people of a data set: each is a function of the seed, the split and its number there."""
+
+    def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:
+        self.renderer, self.counts, self.drawing, self.seed = renderer, dict(counts), drawing, seed
+        self.body, self.traits = chosen_body(drawing.body)
+        self.skins = _shared_out(drawing.skins, self.body.uv is not None)
+        # of the body and of the skins what is drawn from them, not where they lie
+        settings = {key: value for key, value in asdict(drawing).items() if key not in ("skins", "body")}
+        self.mark = {
+            "human_scans": VERSION,
+            "data_seed": seed,
+            **self.counts,
+            **settings,
+            "topologies": list(drawing.topologies),
+            "body": _hash(self.body.template.tobytes(), self.body.faces.tobytes()),
+            "skins": [[file.name, _hash(file.read_bytes())] for some in self.skins for file in some],
+            "renderer": f"{type(renderer).__module__}.{type(renderer).__qualname__}",
+        }
+        self.digest = _hash(repr(sorted(self.mark.items())).encode())
+
+    def write(self, root: Path) -> None:
+        self.wardrobe = Wardrobe(self.body)
+        self.meshes = {
+            name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies
+        }
+        everyone = [(split, number) for split in SPLITS for number in range(self.counts[split])]
+        scan_layout.write_splits(
+            root, {split: [_name(split, number) for number in range(self.counts[split])] for split in SPLITS}
+        )
+        if self.wardrobe.uv is not None:
+            for name, mesh in self.meshes.items():
+                uv = self.wardrobe.uv[mesh.uv_rows].astype(np.float32)
+                np.savez(root / f"topology_{name}.npz", faces=mesh.faces, uv=uv, uv_faces=mesh.uv_faces)
+        (root / "README.txt").write_text(scan_layout.__doc__ or "", encoding="utf-8")
+        draw_all(len(everyone), lambda index: self._write_person(root, *everyone[index]), "dressed people")
+
+    def _write_person(self, root: Path, split: str, number: int) -> None:
+        folder = root / "subjects" / _name(split, number)
+        random = np.random.default_rng([self.seed, SPLITS.index(split), number])
+        skin = None
+        if some := self.skins[SPLITS.index(split)]:
+            skin = skins.read(some[int(random.integers(len(some)))])
+        scan, registered = self.wardrobe.dress(self._posed(split, random), skin, random)
+        views = rig(scan.vertices, self.drawing.views, (self.drawing.height, self.drawing.width), random)
+        names = [f"{view:03}" for view in range(len(views))]
+        scan_layout.write_cameras(folder / "cameras.json", dict(zip(names, views, strict=True)))
+        for name, mesh in self.meshes.items():
+            scan_layout.write_registration(
+                folder / f"registration_{name}.ply",
+                Registration(
+                    torch.from_numpy(registered.vertices[mesh.rows]).float(),
+                    torch.from_numpy(registered.colors[mesh.rows]),
+                    torch.from_numpy(mesh.faces),
+                ),
+            )
+        scene = Scene(
+            torch.from_numpy(scan.vertices).float(),
+            torch.from_numpy(scan.faces),
+            torch.from_numpy(scan.colors).float(),
+            views[0],
+        )
+        for kind in ("images", "masks"):
+            (folder / kind).mkdir()
+        for name, one in zip(names, photographed(self.renderer, scene, views), strict=True):
+            _save(folder, name, one)
+        if self.drawing.texture_side and self.wardrobe.uv is not None:
+            faces = self.wardrobe.sheet.corners[-1].uv_faces
+            colors = linear(torch.from_numpy(registered.colors[self.wardrobe.vertex_of_place]))
+            pixels = texture(self.renderer, self.wardrobe.uv, faces, colors, self.drawing.texture_side)
+            Image.fromarray(pixels).save(folder / "texture.png")
+
+    @torch.no_grad()
+    def _posed(self, split: str, random: Generator) -> Float[np.ndarray, "vertices 3"]:
+        """The bare body of a random person as it stands."""
+        if self.traits is None:
+            shape = torch.from_numpy(random.normal(0, 1, (1, min(10, self.body.shapes.shape[2]))))
+        else:
+            shape = self.traits.coefficients(torch.from_numpy(adults(self.traits.labels, 1, random)))
+        anyhow = split == "test" and random.random() < self.drawing.posed
+        movements = poses.draw(1, random) if anyhow else a_pose(random)
+        pose = poses.rotations(self.body, poses.skeleton(self.body), movements)
+        kind = self.wardrobe.model.template.dtype
+        return self.wardrobe.model(shape.to(kind), torch.from_numpy(pose).to(kind))[0].numpy()
+
+
+def a_pose(random: Generator) -> Float[np.ndarray, "1 movement"]:
+    """Movements, degrees, of somebody who stands to be scanned: arms off the body, looking ahead, nearly still."""
+    ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
+    usual, spread, least, most = np.array(ranges, float).T
+    usual = np.where(np.char.endswith(np.array(poses.MOVEMENTS), "raise"), RAISED, usual)
+    return (usual + CALM * spread * random.normal(size=len(usual))).clip(least, most)[None]
+
+
+def _save(folder: Path, name: str, photograph: Photograph) -> None:
+    Image.fromarray(photograph.pixels).save(folder / "images" / f"{name}.png", compress_level=4)
+    Image.fromarray(photograph.mask).save(folder / "masks" / f"{name}.png", compress_level=4)
+
+
+def _name(split: str, number: int) -> str:
+    return f"{split}_{number:04}"
+
+
+def _shared_out(folder: str | None, has_places: bool) -> list[list[Path]]:
+    """Skins of each split: a quarter, at least one, for test, an eighth for validation, the others for training."""
+    if folder is None:
+        return [[], [], []]
+    if not has_places:
+        raise ConfigError(
+            "data.skins are for bodies with texture places, as the default body. Leave out data.skins or data.body."
+        )
+    found = skins.files(Path(folder).expanduser())
+    if len(found) < 3:
+        raise ConfigError(
+            f"data.skins = {folder} holds {len(found)} skins; wanted three at least, one for each split."
+        )
+    order = [found[place] for place in np.random.default_rng(0).permutation(len(found))]
+    test, validation = max(len(found) // 4, 1), max(len(found) // 8, 1)
+    return [order[test + validation :], order[test : test + validation], order[:test]]
+
+
+def _hash(*parts: bytes) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()[:16]

@@ -1,0 +1,334 @@
+"""The folder of `human_scans`: registered meshes, cameras, photographs and masks; read, and written by the generator.
+
+    train.txt, validation.txt, test.txt        names of subjects, a line each
+    topology_<topology>.npz                    optional: faces, uv, uv_faces of every registration, for texture.png
+    subjects/<name>/registration_<topology>.ply    vertices in metres, y up, with 8-bit sRGB colours; faces
+    subjects/<name>/cameras.json               {"views": [{"name", "height", "width", "K", "R", "t"}, ...]}
+    subjects/<name>/images/<view>.png          8-bit sRGB: the subject's colours wherever the mask is above 0
+    subjects/<name>/masks/<view>.png           8-bit grey: how much of a pixel is the subject
+    subjects/<name>/texture.png                optional
+
+Cameras are OpenCV's: pixel = K (R X + t), divided by depth; pixel centres at whole numbers, metres.
+"""
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
+from torch import Tensor
+
+from framework.data import Splits
+from framework.datasets import images
+from framework.errors import DataError, shown
+from framework.geometry import meshes
+from framework.geometry.camera import Camera
+from framework.geometry.mesh_files import COLOURS
+from framework.storage.arrays import archive
+from framework.storage.plain_values import read_json
+from framework.storage.reading import guarded, opened, read_bytes
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+"""Of subjects and views: they are names of files."""
+PNG_END = b"IEND\xaeB`\x82"
+SLACK = 1e-4
+"""How far the numbers of RᵀR may be from those of the identity."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph of a subject: files and camera."""
+
+    name: str
+    image: Path
+    mask: Path
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A subject's mesh: metres, 8-bit sRGB numbers, triangles."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    colors: UInt8[Tensor, "vertices 3"]
+    faces: Int[Tensor, "faces 3"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Everything of one subject but the pixels."""
+
+    name: str
+    registration: Registration
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class TexturePlaces:
+    """Where a topology's triangles lie in texture.png: u to the right, v upwards."""
+
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "places 2"]
+    uv_faces: Int[np.ndarray, "_faces 3"]
+
+
+def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
+    """Names of each split's subjects.
+
+    Raises:
+        DataError: no such folder, a list is missing, empty, names a subject twice, or one that another list names.
+    """
+    if not root.is_dir():
+        raise DataError(
+            f"data.root = {root}: no such folder; wanted one with subjects, train.txt, validation.txt and test.txt, or "
+            "null."
+        )
+    found: dict[str, tuple[str, ...]] = {}
+    seen: dict[str, Path] = {}
+    for split in Splits._fields:
+        file = root / f"{split}.txt"
+        with guarded(file, "names of subjects, a line each"):
+            names = [line.strip() for line in read_bytes(file).decode("utf-8").splitlines() if line.strip()]
+            if not names:
+                raise ValueError("it names nobody")
+            for name in names:
+                if not NAME.fullmatch(name):
+                    raise ValueError(f"{shown(name)!r} is no name of a folder in {root / 'subjects'}")
+                if name in seen:
+                    raise ValueError(
+                        f"subject {name} is in {seen[name].name} already; wanted each once, in one split"
+                    )
+                seen[name] = file
+        found[split] = tuple(names)
+    return found
+
+
+def read_subject(root: Path, name: str, topology: str) -> Subject:
+    """One subject; of photographs and masks the headers are looked at.
+
+    Raises:
+        DataError: a file is missing or damaged; says which.
+    """
+    folder = root / "subjects" / name
+    if not folder.is_dir():
+        raise DataError(
+            f"{folder}: no such folder; wanted the subject {name} there. Restore it, or take it off its list."
+        )
+    registration = read_registration(folder / f"registration_{topology}.ply")
+    views = read_cameras(folder / "cameras.json")
+    return Subject(
+        name,
+        registration,
+        tuple(_checked_view(folder, view, camera) for view, camera in views.items()),
+    )
+
+
+def read_registration(file: Path) -> Registration:
+    """A mesh with one colour a vertex.
+
+    Raises:
+        DataError: it cannot be read, has no faces, or no colours of 0 to 1 (0 to 255 in whole numbers).
+    """
+    if not file.exists() and (others := sorted(file.parent.glob("registration_*.ply"))):
+        there = ", ".join(other.stem.removeprefix("registration_") for other in others)
+        raise DataError(
+            f"{file}: no such file, but there are those of the topologies {there}. Set data.topology."
+        )
+    mesh = meshes.read(file)
+    if not len(mesh.faces):
+        raise DataError(
+            f"{file}: it has no faces; wanted the triangles of a registered mesh. Save it with them."
+        )
+    return Registration(
+        torch.from_numpy(mesh.vertices).float(),
+        torch.from_numpy(vertex_colors(mesh)),
+        torch.from_numpy(mesh.faces),
+    )
+
+
+def vertex_colors(mesh: meshes.Mesh) -> UInt8[np.ndarray, "vertices 3"]:
+    """8-bit colours of a mesh.
+
+    Raises:
+        DataError: it has none.
+    """
+    if not set(COLOURS) <= set(mesh.columns):
+        raise DataError(
+            f"{mesh.source}: its vertices have no colours; wanted red, green and blue of each. Save it with vertex "
+            "colours (a PLY can hold them)."
+        )
+    return (mesh.attribute(COLOURS) * 255).round().astype(np.uint8)
+
+
+def read_cameras(file: Path) -> dict[str, Camera]:
+    """Cameras by the names of their views.
+
+    Raises:
+        DataError: the file is missing or damaged, a view is named twice, or a number makes no camera.
+    """
+    found: dict[str, Camera] = {}
+    document = read_json(file, "cameras")
+    with guarded(file, "cameras"):
+        views = document.get("views")
+        if not isinstance(views, list) or not views:
+            raise ValueError('wanted {"views": [...]} with one camera or more')
+        for number, view in enumerate(views):
+            name = view.get("name") if isinstance(view, dict) else None
+            if not isinstance(name, str) or not NAME.fullmatch(name):
+                raise ValueError(f"view {number} (from 0) has no name that could be a file's")
+            if name in found:
+                raise ValueError(f"view {name} is there twice")
+            found[name] = _camera(name, view)
+    return found
+
+
+def _camera(name: str, view: Mapping[str, Any]) -> Camera:
+    sizes = [view.get(side) for side in ("height", "width")]
+    if not all(type(size) is int and 1 <= size <= images.LONGEST_SIDE for size in sizes):
+        raise ValueError(f"view {name}: height and width are {sizes}; wanted whole numbers of pixels")
+    numbers = {}
+    for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
+        try:
+            numbers[key] = np.array(view.get(key), np.float64)
+        except (TypeError, ValueError):
+            numbers[key] = np.empty(0)
+        if numbers[key].shape != shape or not np.isfinite(numbers[key]).all():
+            raise ValueError(f"view {name}: {key} is no array of {'×'.join(map(str, shape))} finite numbers")
+    matrix, rotation, translation = (numbers[key] for key in ("K", "R", "t"))
+    apart = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not apart < SLACK or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"view {name}: R is no rotation (RRᵀ is {apart:.2g} from the identity, determinant "
+            f"{np.linalg.det(rotation):.3g}); wanted that from the world to the camera: x right, y down, z forward"
+        )
+    if (
+        not (matrix[0, 0] > 0 and matrix[1, 1] > 0)
+        or abs(matrix[0, 1]) > 0
+        or matrix[2].tolist() != [0, 0, 1]
+    ):
+        raise ValueError(
+            f"view {name}: K is {matrix.tolist()}; wanted ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) with fx and fy above 0: "
+            "pixels without shear"
+        )
+    height, width = (int(size) for size in sizes if size is not None)
+    return Camera(
+        torch.from_numpy(rotation).float(),
+        torch.from_numpy(translation).float(),
+        (float(matrix[0, 0]), float(matrix[1, 1])),
+        (float(matrix[0, 2]), float(matrix[1, 2])),
+        height,
+        width,
+    )
+
+
+def _checked_view(folder: Path, name: str, camera: Camera) -> View:
+    view = View(name, folder / "images" / f"{name}.png", folder / "masks" / f"{name}.png", camera)
+    for file in (view.image, view.mask):
+        with images.opened(file) as image:
+            _check_size(file, image, camera)
+            if tail(file)[-8:] != PNG_END:
+                raise ValueError("it is cut short, or no PNG")
+    return view
+
+
+def tail(file: Path) -> bytes:
+    """The last bytes of a PNG: the checksum of all its pixels, and its end."""
+    with opened(file) as stream:
+        stream.seek(max(0, file.stat().st_size - 20))
+        return stream.read()
+
+
+def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
+    if image.size != (camera.width, camera.height):
+        raise DataError(
+            f"{file}: {image.width} × {image.height} pixels, but its camera has {camera.width} × {camera.height}; wanted "
+            "the same. Mend cameras.json, or scale the picture."
+        )
+
+
+def read_photograph(
+    view: View,
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
+    """Pixels and mask of a view.
+
+    Raises:
+        DataError: a file is damaged, or of another size than its camera says.
+    """
+    found = []
+    for file, channels in ((view.image, 3), (view.mask, 1)):
+        with images.opened(file) as image:
+            _check_size(file, image, view.camera)
+            found.append(np.array(images.plain(image, channels, upright=False)))
+    return found[0], found[1]
+
+
+def read_places(root: Path, topology: str) -> TexturePlaces:
+    """Where the topology's triangles lie in a texture.
+
+    Raises:
+        DataError: the file is missing or damaged, or does not fit together.
+    """
+    file = root / f"topology_{topology}.npz"
+    with guarded(file, "faces, uv and uv_faces of a topology"):
+        arrays = archive(read_bytes(file), ("faces", "uv", "uv_faces"))
+        found = TexturePlaces(
+            arrays["faces"].astype(np.int64),
+            arrays["uv"].astype(np.float32),
+            arrays["uv_faces"].astype(np.int64),
+        )
+        fits = found.uv_faces.shape == found.faces.shape and np.isfinite(found.uv).all()
+        if not fits or found.uv_faces.min() < 0 or found.uv_faces.max() >= len(found.uv):
+            raise ValueError("uv_faces do not fit faces and uv")
+    return found
+
+
+def write_registration(file: Path, registration: Registration) -> None:
+    """As binary PLY."""
+    vertices = np.empty(len(registration.vertices), [("place", "<f4", 3), ("colour", "u1", 3)])
+    vertices["place"], vertices["colour"] = registration.vertices.numpy(), registration.colors.numpy()
+    faces = np.empty(len(registration.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, registration.faces.numpy()
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {name}" for name in COLOURS),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes("\n".join(head).encode("ascii") + vertices.tobytes() + faces.tobytes())
+
+
+def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:
+    views = []
+    for name, camera in cameras.items():
+        (fx, fy), (cx, cy) = (tuple(map(float, pair)) for pair in (camera.focal, camera.principal))
+        views.append(
+            {
+                "name": name,
+                "height": camera.height,
+                "width": camera.width,
+                "K": [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+                "R": camera.rotation.double().tolist(),
+                "t": camera.translation.double().tolist(),
+            }
+        )
+    if not all(math.isfinite(number) for view in views for row in view["K"] for number in row):
+        raise ValueError("a camera has numbers that are not finite; wanted finite ones.")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps({"views": views}, indent=1) + "\n", encoding="utf-8")
+
+
+def write_splits(root: Path, names: Mapping[str, Sequence[str]]) -> None:
+    for split, subjects in names.items():
+        (root / f"{split}.txt").write_text("".join(f"{name}\n" for name in subjects), encoding="utf-8")
