@@ -35,14 +35,14 @@ from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
 from framework.runs.description import Description
-from framework.runs.loading import PREFIX, load_with_description, reader
+from framework.runs.loading import PREFIX, fill, find_checkpoint, load_with_description, reader, weights
 from framework.runs.run import Run
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, told
-from framework.training.checkpoint import WholeCheckpoints
+from framework.training.checkpoint import WholeCheckpoints, read
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
@@ -166,6 +166,8 @@ def for_training(config: Config) -> Session:
             if fitted_models(predictor)
             else "Nothing in this model learns by gradient, which objectives work by. Leave objective out."
         )
+    if config.settings.checkpoint is not None:
+        start_from(predictor, config.settings, console)
     device = torch.device("cpu")
     method = method_of(config, parts)
     session = Session(config, parts, method, data.target, data, predictor, device, console, objectives)
@@ -173,6 +175,17 @@ def for_training(config: Config) -> Session:
     if first_rank():
         rehearse(session)
     return session
+
+
+def start_from(predictor: Predictor, settings: Settings, console: Console) -> None:
+    """Fill an untrained predictor with the weights of an earlier run, from which training then starts.
+
+    Raises:
+        CheckpointError: there is none, or it is another model's.
+    """
+    path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
+    fill(predictor, weights(read(path)), str(path))
+    console.print(f"starting from the weights of {path}", soft_wrap=True)
 
 
 def method_of(config: Config, parts: Resolved) -> str:

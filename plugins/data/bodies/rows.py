@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from framework.target import Target
-from framework.testing.rows import DAMAGES, DataRow, HeadRow, MetricRow
+from framework.testing.rows import DAMAGES, DataRow, EncoderRow, HeadRow, MetricRow
 from framework.testing.sample_files import meshes, write_ply
 from plugins.data.bodies.figure import figure_of
 
@@ -112,6 +112,14 @@ ROWS = {
                 "integral by draws": "the check fits a covariance to its draws; of so many numbers it is further off "
                 "than what it looks for. A product of torch's normals; test_fit_pose.py has its log_prob and entropy"
             },
+        ),
+    ),
+    "rasterised": (
+        EncoderRow("a doll", (132, 6), {**DOLL, "renderer": "rasterizer", "height": 16, "width": 12}),
+        EncoderRow(
+            "a doll, its depth",
+            (132, 6),
+            {**DOLL, "renderer": "rasterizer", "height": 9, "width": 14, "depth": True},
         ),
     ),
     "pose_error": (MetricRow("a doll", Target("real", NUMBERS)),),

@@ -17,7 +17,7 @@ ROWS = {
             config={**NEAR, "height": 1, "width": 1, "levels": 2},
         ),
         CloudRow("one point", (1, 6), config={**NEAR, "height": 12, "width": 9}),
-    )
+    ),
     "unet": (
         EncoderRow("odd size", (4, 13, 10), UNET),
         EncoderRow(

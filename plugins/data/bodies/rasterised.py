@@ -1,0 +1,135 @@
+"""Coloured vertices as the picture of their mesh: what a learned renderer is compared with, or what it starts from."""
+
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.encoder import Encoder
+from framework.errors import ConfigError, DataError
+from framework.geometry.camera import canonical_camera
+from framework.geometry.clouds import sizes
+from framework.geometry.light import encoded, light_of
+from framework.geometry.mesh_files import COLOURS, XYZ
+from framework.renderer import Renderer, Scene
+from plugins.data.bodies import scan_layout
+from plugins.data.bodies.people import chosen_body
+from plugins.data.bodies.topologies import Name, sheet, topology
+
+COLUMNS = (*XYZ, *COLOURS)
+
+
+class Rasterised(Encoder):
+    """The mesh of a registered body with its vertices' colours, on white, as the canonical camera of its size sees it.
+
+    Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
+    averaged as light. Features are (3, height, width), numbers as files hold them, in the inputs' dtype; with `depth`
+    (4, height, width), the last 0 at `nearest` and 1 at `farthest` and beyond, as `encoder=projection` has it: what a
+    network may start from in place of points.
+
+    Args:
+        input_shape: (points, columns).
+        input_columns: names of the columns, where data give them.
+        renderer: draws the mesh.
+        height, width, topology, root, body: those of the data.
+        depth: whether there is a fourth channel.
+        nearest, farthest: metres.
+
+    Raises:
+        ConfigError: an input that is no cloud of coloured points, or a renderer that lacks a channel.
+        DataError: the mesh cannot be had.
+    """
+
+    fixed = True
+    bibtex = """@inproceedings{kato2018neural,
+  title = {Neural {3D} Mesh Renderer},
+  author = {Kato, Hiroharu and Ushiku, Yoshitaka and Harada, Tatsuya},
+  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year = {2018}
+}"""
+    faces: Tensor
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        input_columns: tuple[str, ...] = (),
+        *,
+        renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
+        height: Annotated[int, Field(ge=8, le=4096)] = 256,
+        width: Annotated[int, Field(ge=8, le=4096)] = 192,
+        topology: Name = "7k",
+        root: str | None = None,
+        body: str | None = None,
+        depth: bool = False,
+        nearest: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
+        farthest: Annotated[float, Field(gt=0, le=1e6)] = 5.0,
+    ) -> None:
+        super().__init__()
+        if len(input_shape) != 2 or input_shape[1] < len(COLUMNS) or input_columns[:6] not in ((), COLUMNS):
+            raise ConfigError(
+                f"encoder rasterised got inputs of shape {input_shape}; wanted (points, columns) whose first six columns "
+                f"are {', '.join(COLUMNS)}. Choose data=human_scans, or another encoder."
+            )
+        if missing := {"color", "depth"} - renderer.channels:
+            raise ConfigError(
+                f"encoder.rasterised.renderer = {type(renderer).__name__} draws no {' and '.join(sorted(missing))}; "
+                "choose another renderer."
+            )
+        if not nearest < farthest:
+            raise ConfigError(
+                f"encoder rasterised got nearest={nearest:g} and farthest={farthest:g}; wanted nearest below farthest."
+            )
+        self.renderer = renderer
+        self.camera = canonical_camera(height, width)
+        self.depth = depth
+        self.limits = (nearest, farthest)
+        self.register_buffer("faces", faces_of(topology, root, body), persistent=False)
+        self.output_shape = (3 + depth, height, width)
+
+    @torch.no_grad()
+    def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        sizes(inputs)  # refuses what is no cloud
+        if len(inputs) and inputs.shape[1] <= int(self.faces.max()):
+            raise DataError(
+                f"A mesh of {inputs.shape[1]} vertices came; the topology has {int(self.faces.max()) + 1}. Set "
+                "encoder.rasterised.topology to that of the data."
+            )
+        height, width = self.camera.height, self.camera.width
+        scenes = [
+            Scene(
+                cloud[:, :3].float(),
+                self.faces,
+                # the fourth channel is how much of a pixel the mesh covers
+                torch.cat([light_of(cloud[:, 3:6].float()), cloud.new_ones(len(cloud), 1).float()], 1),
+                self.camera,
+            )
+            for cloud in inputs.cpu()
+        ]
+        channels = ("color", "depth") if self.depth else ("color",)
+        drawn = self.renderer.batch(scenes, channels)
+        found = inputs.new_empty(len(inputs), 3 + self.depth, height, width)
+        for picture, one in zip(found, drawn, strict=True):
+            light, cover = one["color"][..., :3], one["color"][..., 3:]
+            picture[:3] = encoded(light + (1 - cover)).movedim(-1, 0)
+            if self.depth:
+                nearest, farthest = self.limits
+                picture[3] = ((one["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
+        return found
+
+
+def faces_of(name: Name, root: str | None, body: str | None) -> Tensor:
+    """Triangles of a topology: of generated people's, or of the first registration in a folder.
+
+    Raises:
+        DataError: the body, or the folder's meshes, cannot be had.
+    """
+    if root is None:
+        chosen, _ = chosen_body(body)
+        return torch.from_numpy(topology(chosen, sheet(chosen), name).faces.copy()).int()
+    folder = Path(root).expanduser()
+    subject = scan_layout.read_splits(folder)["train"][0]
+    file = folder / "subjects" / subject / f"registration_{name}.ply"
+    return scan_layout.read_registration(file).faces.int()
