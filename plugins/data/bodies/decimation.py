@@ -148,9 +148,7 @@ class _Collapses:
             heapq.heappush(self.heap, self._entry(u, other))
 
 
-def _normal(
-    a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]
-) -> tuple[float, float, float]:
+def _normal(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> tuple[float, float, float]:
     x, y, z = (one - other for one, other in zip(b, a, strict=True))
     p, q, r = (one - other for one, other in zip(c, a, strict=True))
     return y * r - z * q, z * p - x * r, x * q - y * p

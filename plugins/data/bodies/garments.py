@@ -66,7 +66,7 @@ class Outfit(NamedTuple):
 
 def outfit(body: Anatomy, random: Generator) -> Outfit:
     """Clothes of one person, drawn."""
-    below = random.choice(["trousers", "trousers", "trousers", "shorts", "skirt", "dress"])
+    below = random.choice(["trousers", "shorts", "skirt", "dress"], p=[0.64, 0.16, 0.12, 0.08])
     skirt = None
     garments = []
     cloth = pattern(random)
@@ -74,11 +74,11 @@ def outfit(body: Anatomy, random: Generator) -> Outfit:
         garments.append(_trousers(body, random, short=below == "shorts"))
     else:
         garments.append(_leggings(body, random))
-        length = random.uniform(0.3, 0.75) if below == "skirt" else random.uniform(0.45, 0.95)
+        length = random.uniform(0.3, 0.65) if below == "skirt" else random.uniform(0.45, 0.85)
         skirt = Skirt(
             body.waist,
             length,
-            random.uniform(0.05, 0.35),
+            random.uniform(0.0, 0.2),
             int(random.integers(7, 22)),
             random.uniform(0.004, 0.02),
             cloth,
@@ -98,11 +98,17 @@ def outfit(body: Anatomy, random: Generator) -> Outfit:
 
 def _trousers(body: Anatomy, random: Generator, *, short: bool) -> Garment:
     cuff = random.uniform(0.16, body.knee + 0.04) if short else random.uniform(body.ankle - 0.1, body.ankle)
-    inside = np.minimum(body.waist + 0.01 - body.place[:, 1], np.where(body.legs > 0.5, cuff - body.along_leg, FAR))
+    inside = np.minimum(
+        body.waist + 0.01 - body.place[:, 1], np.where(body.legs > 0.5, cuff - body.along_leg, FAR)
+    )
     inside = np.where(body.on_arm, -FAR, inside)
     loose = random.uniform(0.004, 0.022)
     jeans = random.random() < 0.5
-    color = hue(random.uniform(205, 230), random.uniform(0.3, 0.75), random.uniform(0.2, 0.65)) if jeans else dye(random)
+    color = (
+        hue(random.uniform(205, 230), random.uniform(0.3, 0.75), random.uniform(0.2, 0.65))
+        if jeans
+        else dye(random)
+    )
     across, along = _on_legs(body)
     faded = 0.2 * np.exp(-(((body.along_leg - 0.5 * body.knee) / 0.15) ** 2)) * (body.place[:, 2] > 0.03)
     found = color * (1 + (0.5 if jeans else 0.15) * faded[:, None])
@@ -119,7 +125,12 @@ def _trousers(body: Anatomy, random: Generator, *, short: bool) -> Garment:
     pocket = np.abs(np.abs(body.place[:, 0]) - 0.09 - 0.4 * (body.place[:, 1] - body.hips)) < 0.004
     pocket &= (np.abs(body.place[:, 1] - body.hips - 0.03) < 0.05) & (body.place[:, 2] > 0.04)
     found = np.where(pocket[:, None], 0.5 * found, found)
-    bends = 0.35 + _near(along, body.knee, 0.12) + 0.8 * _near(along, body.ankle, 0.12) + 0.6 * _near(along, 0.0, 0.1)
+    bends = (
+        0.35
+        + _near(along, body.knee, 0.12)
+        + 0.8 * _near(along, body.ankle, 0.12)
+        + 0.6 * _near(along, 0.0, 0.1)
+    )
     wrinkles = (0.25 * loose + 0.0025) * bends * folds(body.place, 0.06, (0.25, 1.0, 0.1), random)
     return Garment(inside, loose, wrinkles, _worn(body, found, wrinkles, inside, random))
 
@@ -140,9 +151,15 @@ def _shoes(body: Anatomy, random: Generator) -> Garment:
     color, sole = dye(random) * 0.8, hue(40, 0.05, random.choice([0.1, 0.9]))
     found = np.where((body.place[:, 1] < floor + 0.022)[:, None], sole, color)
     if random.random() < 0.5:
-        laces = (body.place[:, 2] > 0.06) & ((body.place[:, 2] / 0.02) % 1 < 0.4) & (body.place[:, 1] > floor + 0.05)
+        laces = (
+            (body.place[:, 2] > 0.06)
+            & ((body.place[:, 2] / 0.02) % 1 < 0.4)
+            & (body.place[:, 1] > floor + 0.05)
+        )
         found = np.where(laces[:, None], sole, found)
-    return Garment(inside, 0.011, np.zeros(len(inside)), _worn(body, found, np.zeros(len(inside)), inside, random))
+    return Garment(
+        inside, 0.011, np.zeros(len(inside)), _worn(body, found, np.zeros(len(inside)), inside, random)
+    )
 
 
 def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float) -> Garment:
@@ -152,8 +169,12 @@ def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float
         "blouse": random.choice([body.wrist - 0.015, body.elbow + 0.05]),
         "vest": 0.015,
     }[kind]
-    thickness = {"shirt": 0.007, "jumper": 0.014, "blouse": 0.008, "vest": 0.004}[kind] * random.uniform(0.6, 1.8)
-    inside = np.minimum(_trunk(body, hem, random.uniform(0.055, 0.1)), np.where(body.on_arm, cuff - body.along_arm, FAR))
+    thickness = {"shirt": 0.007, "jumper": 0.014, "blouse": 0.008, "vest": 0.004}[kind] * random.uniform(
+        0.6, 1.8
+    )
+    inside = np.minimum(
+        _trunk(body, hem, random.uniform(0.055, 0.1)), np.where(body.on_arm, cuff - body.along_arm, FAR)
+    )
     if kind == "vest":
         inside = np.minimum(inside, cuff + 0.02 - np.where(body.along_arm > -0.5, body.along_arm, -FAR))
     across, along = _on_trunk(body)
@@ -167,14 +188,18 @@ def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float
     ribbed = (collar < 0.12) & (inside < 0.02) & (kind != "blouse")
     found = np.where(ribbed[:, None], 0.7 * found, found)
     arm = np.where(body.on_arm, body.along_arm, 0)
-    bends = 0.45 + 0.8 * _near(body.place[:, 1], body.waist, 0.08) + body.on_arm * _near(arm, body.elbow, 0.09)
+    bends = (
+        0.45 + 0.8 * _near(body.place[:, 1], body.waist, 0.08) + body.on_arm * _near(arm, body.elbow, 0.09)
+    )
     bends = bends + 0.7 * _near(body.along_arm, 0.03, 0.06)
-    wrinkles = (0.3 * thickness + 0.002) * bends * folds(
-        body.place, random.uniform(0.06, 0.1), (random.uniform(-1, 1), 1.0, 0.3), random
+    wrinkles = (
+        (0.3 * thickness + 0.002)
+        * bends
+        * folds(body.place, random.uniform(0.06, 0.1), (random.uniform(-1, 1), 1.0, 0.3), random)
     )
     if hem < body.waist - 0.05:  # it hangs loose below the waist
         thickness = thickness + 0.004
-        wrinkles = wrinkles + 0.012 * np.exp(-((body.place[:, 1] - hem) / 0.1).clip(0, None)) * ~body.on_arm
+        wrinkles = wrinkles + 0.008 * np.exp(-((body.place[:, 1] - hem) / 0.1).clip(0, None)) * ~body.on_arm
     return Garment(inside, thickness, wrinkles, _worn(body, found, wrinkles, inside, random))
 
 
@@ -185,14 +210,20 @@ def _jacket(body: Anatomy, random: Generator) -> Garment:
     slant = open_by + 0.12 * (body.place[:, 1] - hem).clip(0, None) * random.uniform(0, 0.6)
     opening = np.where(body.place[:, 2] > 0.02, np.abs(body.place[:, 0]) - slant, FAR)
     inside = np.where(body.on_arm, inside, np.minimum(inside, opening))
-    found = pattern(random)(*_on_trunk(body)) if random.random() < 0.3 else np.tile(dye(random), (len(inside), 1))
+    found = (
+        pattern(random)(*_on_trunk(body)) if random.random() < 0.3 else np.tile(dye(random), (len(inside), 1))
+    )
     pocket = np.abs(body.place[:, 1] - (body.hips + 0.02)) < 0.005
     pocket &= (np.abs(np.abs(body.place[:, 0]) - 0.1) < 0.05) & (body.place[:, 2] > 0)
     found = np.where(pocket[:, None], 0.4 * found, found)
     arm = np.where(body.on_arm, body.along_arm, 0)
-    bends = 0.5 + 1.2 * body.on_arm * _near(arm, body.elbow, 0.1) + 0.5 * _near(body.place[:, 1], body.waist, 0.1)
+    bends = (
+        0.5 + 1.2 * body.on_arm * _near(arm, body.elbow, 0.1) + 0.5 * _near(body.place[:, 1], body.waist, 0.1)
+    )
     wrinkles = 0.004 * bends * folds(body.place, 0.08, (0.6, 1.0, 0.0), random)
-    return Garment(inside, random.uniform(0.009, 0.018), wrinkles, _worn(body, found, wrinkles, inside, random))
+    return Garment(
+        inside, random.uniform(0.009, 0.018), wrinkles, _worn(body, found, wrinkles, inside, random)
+    )
 
 
 def _trunk(body: Anatomy, hem: float, opening: float) -> Float[np.ndarray, "vertices"]:
@@ -257,7 +288,9 @@ def _on_legs(body: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     x, y, z = body.place.T
     legs = body.legs > 0.5
     middle = np.polyval(np.polyfit(y[legs], np.abs(x)[legs], 1), y) if legs.any() else 0.0
-    return 0.1 * np.arctan2(np.abs(x) - middle, np.abs(z - 0.01) + 0.06), np.where(legs, body.along_leg, body.hips - y)
+    return 0.1 * np.arctan2(np.abs(x) - middle, np.abs(z - 0.01) + 0.06), np.where(
+        legs, body.along_leg, body.hips - y
+    )
 
 
 def _near(values: np.ndarray, centre: float, width: float) -> np.ndarray:

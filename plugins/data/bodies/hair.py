@@ -55,13 +55,29 @@ def hair(body: Anatomy, random: Generator) -> Hair:
     line = line - random.uniform(-0.02, 0.03)
     inside = np.where(body.head > 0.5, (y - line) * HEAD, -1.0)
     share = (inside / 0.012 + 0.5).clip(0, 1) * (style != "none")
-    volume = {"none": 0.0, "short": 0.012, "full": 0.03, "round": 0.06, "long": 0.028, "tail": 0.012, "bun": 0.012}
+    volume = {
+        "none": 0.0,
+        "short": 0.012,
+        "full": 0.03,
+        "round": 0.06,
+        "long": 0.028,
+        "tail": 0.012,
+        "bun": 0.012,
+    }
     height = volume[style] * random.uniform(0.8, 1.3)
     swell = np.sqrt((inside / 0.05).clip(0, 1))  # rises steeply from the hairline
-    curls = noise(body.place, 0.014, random) if style == "round" else noise(body.place, 0.02, random, (2.0, 0.3, 2.0))
-    raised = share * height * (0.35 + 0.65 * swell) * (1 + 0.12 * curls + 0.1 * noise(body.place, 0.06, random))
+    curls = (
+        noise(body.place, 0.014, random)
+        if style == "round"
+        else noise(body.place, 0.02, random, (2.0, 0.3, 2.0))
+    )
+    raised = (
+        share * height * (0.35 + 0.65 * swell) * (1 + 0.12 * curls + 0.1 * noise(body.place, 0.06, random))
+    )
     squeeze = (1.0, 1.0, 1.0) if style == "round" else (1.5, 0.15, 1.5)
-    strands = 1 + 0.22 * noise(body.place, 0.009, random, squeeze) + 0.12 * noise(body.place, 0.03, random, squeeze)
+    strands = (
+        1 + 0.22 * noise(body.place, 0.009, random, squeeze) + 0.12 * noise(body.place, 0.03, random, squeeze)
+    )
     parting = random.uniform(-0.5, 0.5)
     if style in ("full", "long"):
         line_of_scalp = (np.abs(x - parting) < 0.025) & (y > 0.8) & (z > -0.3)
@@ -83,7 +99,11 @@ def _shade(random: Generator) -> Color:
 
 
 def tied(
-    style: Style, color: Color, head: Float[np.ndarray, "4 3"], lie_of_head: Float[np.ndarray, "3 2"], random: Generator
+    style: Style,
+    color: Color,
+    head: Float[np.ndarray, "4 3"],
+    lie_of_head: Float[np.ndarray, "3 2"],
+    random: Generator,
 ) -> Piece | None:
     """What hangs from the head or is tied to it; None for styles without.
 
@@ -101,7 +121,10 @@ def tied(
     else:
         return None
     place, faces, across = piece
-    waves = [noise(np.stack([across, 0.05 * place[:, 1], 0 * across], 1), length, random) for length in (0.008, 0.03)]
+    waves = [
+        noise(np.stack([across, 0.05 * place[:, 1], 0 * across], 1), length, random)
+        for length in (0.008, 0.03)
+    ]
     colors = color * (1 + 0.22 * waves[0] + 0.14 * waves[1])[:, None]
     placed = np.concatenate([place, np.ones((len(place), 1))], 1) @ head
     return Piece(placed, faces, colors.clip(0.003, 0.9))
@@ -114,7 +137,9 @@ def grid(rows: int, columns: int) -> np.ndarray:
     return np.concatenate([corner[:, None] + half for half in halves])
 
 
-def _curtain(middle: np.ndarray, half: np.ndarray, random: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _curtain(
+    middle: np.ndarray, half: np.ndarray, random: Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Long hair: round the back of the head from ear to ear, and down."""
     length, reach = random.uniform(0.2, 0.42), random.uniform(1.5, 1.9)
     angle, down = np.meshgrid(np.linspace(-reach, reach, 120), np.linspace(0, 1, 60))
@@ -126,12 +151,19 @@ def _curtain(middle: np.ndarray, half: np.ndarray, random: Generator) -> tuple[n
     ends = 1 - 0.12 * np.abs(np.sin(7 * angle + 1.3)) * (down > 0.8)
     height = middle[1] + 0.35 * half[1] - length * 1.2 * down * ends
     place = np.stack(
-        [middle[0] - wide * taper * np.sin(angle), height, middle[2] - 0.15 * half[2] - deep * taper * np.cos(angle)], -1
+        [
+            middle[0] - wide * taper * np.sin(angle),
+            height,
+            middle[2] - 0.15 * half[2] - deep * taper * np.cos(angle),
+        ],
+        -1,
     )
     return place.reshape(-1, 3), grid(*angle.shape), (0.1 * angle).ravel()
 
 
-def _tail(middle: np.ndarray, half: np.ndarray, random: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _tail(
+    middle: np.ndarray, half: np.ndarray, random: Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A tail: out of the back of the head, and down."""
     length, thick, high = random.uniform(0.18, 0.36), random.uniform(0.022, 0.034), random.uniform(-0.1, 0.5)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, 1, 48))
@@ -140,13 +172,19 @@ def _tail(middle: np.ndarray, half: np.ndarray, random: Generator) -> tuple[np.n
     back = half[2] * 0.95 + 0.05 * np.sin(np.pi * down.clip(0, 0.6) / 0.6) - 0.02 * down
     centre_y = middle[1] + high * half[1] + 0.02 - length * down**1.3
     place = np.stack(
-        [middle[0] + radius * np.cos(angle), centre_y + 0.3 * radius * np.sin(angle), middle[2] - back - radius * np.sin(angle)],
+        [
+            middle[0] + radius * np.cos(angle),
+            centre_y + 0.3 * radius * np.sin(angle),
+            middle[2] - back - radius * np.sin(angle),
+        ],
         -1,
     )
     return place.reshape(-1, 3), grid(*angle.shape), (0.03 * angle).ravel()
 
 
-def _bun(middle: np.ndarray, half: np.ndarray, random: Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bun(
+    middle: np.ndarray, half: np.ndarray, random: Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A bun: a ball at the back of the head, or on top of it."""
     size, lift = random.uniform(0.032, 0.05), random.uniform(0.2, 1.3)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 32))

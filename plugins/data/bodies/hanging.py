@@ -56,7 +56,9 @@ def hung(
     colors = skirt.cloth(across, -along)
     shade = 1 + 0.1 * wave.ravel() + 0.04 * noise(vertices, 0.01, random)
     border = np.where((along > skirt.length - 0.012) | (along < 0.025), 0.75, 1.0)
-    return Piece(vertices, grid(RINGS, AROUND)[:, ::-1], (colors * (shade * border)[:, None]).clip(0.004, 0.95))
+    return Piece(
+        vertices, grid(RINGS, AROUND)[:, ::-1], (colors * (shade * border)[:, None]).clip(0.004, 0.95)
+    )
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

@@ -141,7 +141,9 @@ class HumanScans(Data):
         vertices = torch.from_numpy(mesh.vertices).float()
         beside = file.with_name("cameras.json")
         cameras = (
-            list(scan_layout.read_cameras(beside).values()) if beside.exists() else [in_front(vertices, *self.size)]
+            list(scan_layout.read_cameras(beside).values())
+            if beside.exists()
+            else [in_front(vertices, *self.size)]
         )
         return [_input(vertices, colors, camera) for camera in cameras]
 

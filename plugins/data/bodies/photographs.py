@@ -22,7 +22,7 @@ AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
 """Places of the rig: so many round the person, at each of these elevations in degrees."""
 FOCAL = 1.25
 """Focal length in heights of the image."""
-MARGIN = 0.05
+MARGIN = 0.03
 """Share of the image's height and width that stays free on each side, at least."""
 
 
@@ -38,7 +38,7 @@ def rig(
 ) -> list[Camera]:
     """Cameras at different places that see all of a person; fewer places than `count` are used twice.
 
-    Each looks at the middle of the person from as near as shows it whole, or a tenth further away, rolled by a degree
+    Each looks at the middle of the person from as near as shows it whole, or a little further away, rolled by a degree
     or two, with a principal point a little off the middle.
     """
     places = AROUND * len(HEIGHTS)
@@ -55,7 +55,11 @@ def _camera(
     elevation = math.radians(HEIGHTS[place[0]] + random.uniform(-3, 3))
     roll = math.radians(random.normal(0, 1))
     back = np.array(
-        [math.cos(elevation) * math.sin(azimuth), math.sin(elevation), math.cos(elevation) * math.cos(azimuth)]
+        [
+            math.cos(elevation) * math.sin(azimuth),
+            math.sin(elevation),
+            math.cos(elevation) * math.cos(azimuth),
+        ]
     )
     right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
     rows = np.stack([right, np.cross(right, back), -back])  # x right, y down, z forward
@@ -67,7 +71,7 @@ def _camera(
     # whole where focal |x| / (z + distance) stays within half the width but for the margin and the principal point's place
     free = np.array([width / 2 - np.abs(off[0]), height / 2 - np.abs(off[1])]) - MARGIN * height
     nearest = max((focal * np.abs(x) / free[0] - z).max(), (focal * np.abs(y) / free[1] - z).max())
-    distance = nearest * random.uniform(1.0, 1.1)
+    distance = nearest * random.uniform(1.0, 1.06)
     return Camera(
         torch.from_numpy(rotation).float(),
         torch.from_numpy(np.array([0, 0, distance]) - rotation @ middle).float(),

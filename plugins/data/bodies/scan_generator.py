@@ -94,7 +94,9 @@ class Crowd:
 
     def write(self, root: Path) -> None:
         self.wardrobe = Wardrobe(self.body)
-        self.meshes = {name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies}
+        self.meshes = {
+            name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies
+        }
         everyone = [(split, number) for split in SPLITS for number in range(self.counts[split])]
         scan_layout.write_splits(
             root, {split: [_name(split, number) for number in range(self.counts[split])] for split in SPLITS}
@@ -177,10 +179,14 @@ def _shared_out(folder: str | None, has_places: bool) -> list[list[Path]]:
     if folder is None:
         return [[], [], []]
     if not has_places:
-        raise ConfigError("data.skins are for bodies with texture places, as the default body. Leave out data.skins or data.body.")
+        raise ConfigError(
+            "data.skins are for bodies with texture places, as the default body. Leave out data.skins or data.body."
+        )
     found = skins.files(Path(folder).expanduser())
     if len(found) < 3:
-        raise ConfigError(f"data.skins = {folder} holds {len(found)} skins; wanted three at least, one for each split.")
+        raise ConfigError(
+            f"data.skins = {folder} holds {len(found)} skins; wanted three at least, one for each split."
+        )
     order = [found[place] for place in np.random.default_rng(0).permutation(len(found))]
     test, validation = max(len(found) // 4, 1), max(len(found) // 8, 1)
     return [order[test + validation :], order[test : test + validation], order[:test]]

@@ -118,7 +118,9 @@ def read_subject(root: Path, name: str, topology: str) -> Subject:
     """
     folder = root / "subjects" / name
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; wanted the subject {name} there. Restore it, or take it off its list.")
+        raise DataError(
+            f"{folder}: no such folder; wanted the subject {name} there. Restore it, or take it off its list."
+        )
     registration = read_registration(folder / f"registration_{topology}.ply")
     views = read_cameras(folder / "cameras.json")
     return Subject(
@@ -136,10 +138,14 @@ def read_registration(file: Path) -> Registration:
     """
     if not file.exists() and (others := sorted(file.parent.glob("registration_*.ply"))):
         there = ", ".join(other.stem.removeprefix("registration_") for other in others)
-        raise DataError(f"{file}: no such file, but there are those of the topologies {there}. Set data.topology.")
+        raise DataError(
+            f"{file}: no such file, but there are those of the topologies {there}. Set data.topology."
+        )
     mesh = meshes.read(file)
     if not len(mesh.faces):
-        raise DataError(f"{file}: it has no faces; wanted the triangles of a registered mesh. Save it with them.")
+        raise DataError(
+            f"{file}: it has no faces; wanted the triangles of a registered mesh. Save it with them."
+        )
     return Registration(
         torch.from_numpy(mesh.vertices).float(),
         torch.from_numpy(vertex_colors(mesh)),
@@ -202,7 +208,11 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
             f"view {name}: R is no rotation (RRᵀ is {apart:.2g} from the identity, determinant "
             f"{np.linalg.det(rotation):.3g}); wanted that from the world to the camera: x right, y down, z forward"
         )
-    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0) or abs(matrix[0, 1]) > 0 or matrix[2].tolist() != [0, 0, 1]:
+    if (
+        not (matrix[0, 0] > 0 and matrix[1, 1] > 0)
+        or abs(matrix[0, 1]) > 0
+        or matrix[2].tolist() != [0, 0, 1]
+    ):
         raise ValueError(
             f"view {name}: K is {matrix.tolist()}; wanted ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) with fx and fy above 0: "
             "pixels without shear"
@@ -243,7 +253,9 @@ def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
         )
 
 
-def read_photograph(view: View) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
+def read_photograph(
+    view: View,
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
     """Pixels and mask of a view.
 
     Raises:
@@ -267,7 +279,9 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
     with guarded(file, "faces, uv and uv_faces of a topology"):
         arrays = archive(read_bytes(file), ("faces", "uv", "uv_faces"))
         found = TexturePlaces(
-            arrays["faces"].astype(np.int64), arrays["uv"].astype(np.float32), arrays["uv_faces"].astype(np.int64)
+            arrays["faces"].astype(np.int64),
+            arrays["uv"].astype(np.float32),
+            arrays["uv_faces"].astype(np.int64),
         )
         fits = found.uv_faces.shape == found.faces.shape and np.isfinite(found.uv).all()
         if not fits or found.uv_faces.min() < 0 or found.uv_faces.max() >= len(found.uv):
