@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
-from scipy.sparse import coo_matrix, csr_matrix, diags
-from scipy.spatial import cKDTree
+from scipy.sparse import csr_matrix
+from scipy.spatial import KDTree
 
 from framework.geometry.light import eight_bit
 from plugins.data.bodies import skins
@@ -90,7 +90,7 @@ class Wardrobe:
             colors = skins.painted(where, random)
         else:
             colors = skins.shown(skin, self.uv)[self._place_of]
-            colors = skins.filled(colors, where, self._neighbours, self.sheet.carried)
+            colors = skins.filled(colors, where, self.vertices, self._neighbours.dot, self.sheet.carried)
             colors = skins.with_eyes(where, colors, random)
         raised = np.zeros(len(where.place))
         cover = np.zeros(len(where.place))
@@ -139,7 +139,7 @@ class Wardrobe:
         some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), stays the scan's alone.
         """
         points = scan.vertices[seen]
-        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+        tree = KDTree(points, balanced_tree=False, compact_nodes=False)
         outwards = _unit(self._own_spread @ _cross(posed, self.body.faces))
         moved = np.zeros(len(posed))
         for _ in range(STEPS):
@@ -204,15 +204,12 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
     """Sums over the faces of every vertex."""
     columns = np.repeat(np.arange(len(faces)), 3)
-    return coo_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces))).tocsr()
+    return csr_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces)))
 
 
 def _neighbours(faces: np.ndarray, vertices: int) -> csr_matrix:
     """Means over the neighbours of every vertex and itself."""
-    pairs, _ = edges(faces)
-    one, other = pairs.T
-    ends = np.concatenate([one, other]), np.concatenate([other, one])
-    near = coo_matrix((np.ones(2 * len(pairs)), ends), (vertices, vertices)).tocsr() + diags(
-        np.ones(vertices)
-    )
-    return csr_matrix(diags(1 / np.asarray(near.sum(1)).ravel()) @ near)
+    (one, other), own = edges(faces)[0].T, np.arange(vertices)
+    rows = np.concatenate([one, other, own])
+    share = 1 / np.bincount(rows, minlength=vertices)
+    return csr_matrix((share[rows], (rows, np.concatenate([other, one, own]))), (vertices, vertices))

@@ -1,4 +1,4 @@
-"""What generated people wear: cloth over a body, with thickness, wrinkles, patterns, hems, buttons, belts and prints."""
+"""What generated people wear: cloth over a body, with thickness, wrinkles, patterns, hems, buttons and prints."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.random import Generator
-from scipy.sparse import csr_matrix
 
 from framework.datasets import images
 from framework.errors import DataError
@@ -27,7 +26,8 @@ def files(folder: Path) -> list[Path]:
     found = sorted(folder.glob("*.png"))
     if not found:
         raise DataError(
-            f"data.skins = {folder}: no PNG there; wanted a folder of skins in the default body's texture layout, or null."
+            f"data.skins = {folder}: no PNG there; wanted a folder of skins in the default body's texture layout, or "
+            "null."
         )
     return found
 
@@ -63,23 +63,24 @@ BLANK = 128
 
 
 def filled(
-    colors: Float[np.ndarray, "vertices 3"], body: Anatomy, average: csr_matrix, carried: Carry
+    colors: Float[np.ndarray, "vertices 3"], body: Anatomy, count: int, average: Carry, carried: Carry
 ) -> Float[np.ndarray, "vertices 3"]:
     """Linear light of a skin at all vertices, where blank that of the face, blended into what lies around.
 
     Args:
-        average: means over the neighbours of each vertex of the body itself, the first of `colors`.
-        carried: takes numbers of the body's vertices to all.
+        count: of the body's own vertices, the first of `colors`.
+        average: numbers of these to means over their neighbours.
+        carried: takes numbers of these to all.
     """
     grey = float(linear(torch.tensor(BLANK, dtype=torch.uint8)))
-    blank = (np.abs(colors - grey) < 0.002).all(1)
+    blank = np.asarray(np.abs(colors - grey).max(1) < 0.002)
     face = ~blank & (body.head > 0.5) & (body.on_head[:, 2] > 0.2)
     if not blank.any() or not face.any():
         return colors
-    own, open_ = colors[: average.shape[0]].copy(), blank[: average.shape[0]]
+    own, open_ = colors[:count].copy(), blank[:count]
     own[open_] = np.median(colors[face], axis=0)
     for _ in range(40):
-        own[open_] = (average @ own)[open_]
+        own[open_] = average(own)[open_]
     # a midpoint between what is blank and what is not takes from both
     near = carried(np.where(open_, 1.0, 0.0)) > 0
     return np.where((blank | near)[:, None], carried(own), colors)
