@@ -4,7 +4,9 @@ Everything is measured on the body's template in its rest pose, so that garments
 whatever pose, are painted and cut by the same few numbers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +26,7 @@ class Anatomy:
         place: in the template: x to the left, y up, z to the front.
         arms, legs, head: shares of the skin that follows these parts.
         along_arm, along_leg: from shoulder and hip along the bones; below 0 before the joint, AWAY on other parts.
-        on_head: x in half widths of the head, y from 0 (chin, nearly) to 1 (crown), z from -1 (back) to 1 (tip of nose).
+        on_head: x in half widths of the head, y from 0 (under the chin) to 1 (crown), z from -1 (back) to 1 (nose).
         elbow, wrist, knee, ankle: where along arm and leg they are.
         waist, hips, chest, neck: heights of the trunk.
         neck_place: of the neck's lowest joint.
@@ -52,7 +54,7 @@ class Anatomy:
         return self.arms > 0.5
 
 
-def anatomy(body: Body, carried) -> Anatomy:  # noqa: ANN001
+def anatomy(body: Body, carried: Callable[[np.ndarray], np.ndarray]) -> Anatomy:
     """The measures of a body; `carried` takes numbers of its vertices to those of the sheet."""
     where = skeleton(body)
     place = body.template.astype(np.float64)
@@ -69,7 +71,7 @@ def anatomy(body: Body, carried) -> Anatomy:  # noqa: ANN001
 
     def length(*chain: tuple[int, int]) -> float:
         ends = [joints[list(pair)] for pair in chain]
-        return float(sum(np.linalg.norm(b - a, axis=1).mean() for a, b in zip(ends, ends[1:], strict=False)))
+        return float(sum(np.linalg.norm(b - a, axis=1).mean() for a, b in pairwise(ends)))
 
     measures = {
         "place": place, "arms": shares["arms"], "legs": shares["legs"], "head": shares["head"],

@@ -104,8 +104,8 @@ class Body:
         fits = uv.ndim == 2 and uv.shape[1] == 2 and uv_faces.shape == self.faces.shape
         if not fits or not np.isfinite(uv).all() or uv_faces.min(initial=0) < 0 or uv_faces.max() >= len(uv):
             raise DataError(
-                f"{self.source}: uv {uv.shape} and uv_faces {uv_faces.shape} do not fit {len(self.faces)} faces, or hold "
-                "numbers that are not finite. Restore it from its source."
+                f"{self.source}: uv {uv.shape} and uv_faces {uv_faces.shape} do not fit {len(self.faces)} faces, or "
+                "hold numbers that are not finite. Restore it from its source."
             )
 
     def _check_tree(self) -> None:

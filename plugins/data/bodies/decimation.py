@@ -114,7 +114,7 @@ class _Collapses:
         return found if needed <= set(found) else None
 
     def _keeps_shape(self, v: int, u: int) -> bool:
-        """Whether the surface stays a surface (the two share two neighbours and no more), and no triangle turns over."""
+        """Whether the surface stays a surface (the two share two neighbours, no more) and no triangle turns."""
         if len(self.around[v] & self.around[u]) != 2 or len(self._neighbours(v) & self._neighbours(u)) != 2:
             return False
         for face in self.around[v] - self.around[u]:

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from numpy.random import Generator
-from scipy.sparse import coo_matrix, csr_matrix, diags
-from scipy.spatial import cKDTree
+from scipy.sparse import csr_matrix
+from scipy.spatial import KDTree
 
 from framework.geometry.light import eight_bit
 from plugins.data.bodies import skins
@@ -23,9 +23,11 @@ from plugins.data.bodies.hair import Piece, hair, tied
 from plugins.data.bodies.hanging import hung
 from plugins.data.bodies.topologies import Sheet, edges, sheet
 
-FOLLOWED = (0.5, 0.75)
-"""Share of the garments' thickness that a registration has, between these."""
-ERROR = 0.003
+FURTHEST = 0.045
+"""How far a registration may be from the bare body, metres."""
+STEPS, BLUR = 4, 3
+"""Of a registration, and means over neighbours after each."""
+ERROR = 0.0015
 """Standard deviation of what else a registration is off, metres."""
 
 
@@ -64,6 +66,7 @@ class Wardrobe:
         self.anatomy: Anatomy = anatomy(body, self.sheet.carried)
         self.faces = self.sheet.faces
         self._spread = _spread(self.faces, len(self.anatomy.place))
+        self._own_spread = _spread(body.faces, len(body.template))
         self._neighbours = _neighbours(body.faces, len(body.template))
         self.vertices = len(body.template)
         self.uv = None if body.uv is None else self.sheet.carried_uv(body.uv)
@@ -87,6 +90,8 @@ class Wardrobe:
             colors = skins.painted(where, random)
         else:
             colors = skins.shown(skin, self.uv)[self._place_of]
+            colors = skins.filled(colors, where, self.vertices, self._neighbours.dot, self.sheet.carried)
+            colors = skins.with_eyes(where, colors, random)
         raised = np.zeros(len(where.place))
         cover = np.zeros(len(where.place))
         for garment in worn.garments:
@@ -94,7 +99,6 @@ class Wardrobe:
             raised = raised + garment.raised()
             cover = np.maximum(cover, (garment.inside / 0.03).clip(0, 1))
         colors = colors + grown.share[:, None] * (grown.colors - colors)
-        bare = self.sheet.carried(posed)
         draped = self.sheet.carried(self._smoothed(posed, cover[: self.vertices]))
         vertices = draped + (raised + grown.raised)[:, None] * self.normals(draped)
         pieces = [Piece(vertices, self.faces, colors)]
@@ -122,27 +126,31 @@ class Wardrobe:
             np.concatenate(lit).clip(0, 1),
         )
         seen = np.concatenate([~hidden, *(np.ones(len(piece.vertices), bool) for piece in pieces[1:])])
-        return scan, self._registered(bare, raised + 0.6 * grown.raised, scan, seen, random)
+        return scan, self._registered(posed, scan, seen, random)
 
     def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
         """Unit normals of the sheet's vertices, outwards, means over their faces by area."""
         return _unit(self._spread @ _cross(vertices, self.faces))
 
-    def _registered(
-        self, bare: np.ndarray, raised: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator
-    ) -> Registered:
-        """The body, moved towards the scan as far as registrations do, with the colours of the scan's nearest points."""
-        own = raised[: self.vertices]
-        for _ in range(12):
-            own = self._neighbours @ own
-        off = self.sheet.carried(own * random.uniform(*FOLLOWED)) + ERROR * noise(
-            self.anatomy.place, 0.25, random
-        )
-        vertices = bare + off[:, None] * self.normals(bare)
-        points = np.flatnonzero(seen)
-        _, nearest = cKDTree(scan.vertices[points], balanced_tree=False, compact_nodes=False).query(vertices)
-        colors = eight_bit(torch.from_numpy(scan.colors[points[nearest]])).numpy()
-        return Registered(vertices, colors)
+    def _registered(self, posed: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator) -> Registered:
+        """The body, drawn towards the nearest points of the scan as registrations are, with their colours.
+
+        Vertices move along their normals, no further than FURTHEST, and each as its neighbours do: what is thinner than
+        some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), stays the scan's alone.
+        """
+        points = scan.vertices[seen]
+        tree = KDTree(points, balanced_tree=False, compact_nodes=False)
+        outwards = _unit(self._own_spread @ _cross(posed, self.body.faces))
+        moved = np.zeros(len(posed))
+        for _ in range(STEPS):
+            now = posed + moved[:, None] * outwards
+            moved = moved + ((points[tree.query(now)[1]] - now) * outwards).sum(1)
+            for _ in range(BLUR):
+                moved = self._neighbours @ moved.clip(-0.01, FURTHEST)
+        off = moved + ERROR * noise(self.body.template, 0.25, random)
+        vertices = self.sheet.carried(posed + off[:, None] * outwards)
+        nearest = np.flatnonzero(seen)[tree.query(vertices)[1]]
+        return Registered(vertices, eight_bit(torch.from_numpy(scan.colors[nearest])).numpy())
 
     def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
         """Without what cloth hides: each step blurs, and undoes the shrinking that comes of it (Taubin 1995)."""
@@ -179,8 +187,9 @@ class Light:
 
 
 def _cross(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "faces 3"]:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return np.cross(b - a, c - a)
+    x, y, z = vertices.T[:, faces.T]  # each (corner, face)
+    p, q, r = (along[1:] - along[:1] for along in (x, y, z))  # from the first corner to the others
+    return np.stack([q[0] * r[1] - r[0] * q[1], r[0] * p[1] - p[0] * r[1], p[0] * q[1] - q[0] * p[1]], 1)
 
 
 def _normals(piece: Piece) -> Float[np.ndarray, "vertices 3"]:
@@ -195,15 +204,12 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
     """Sums over the faces of every vertex."""
     columns = np.repeat(np.arange(len(faces)), 3)
-    return coo_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces))).tocsr()
+    return csr_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces)))
 
 
 def _neighbours(faces: np.ndarray, vertices: int) -> csr_matrix:
     """Means over the neighbours of every vertex and itself."""
-    pairs, _ = edges(faces)
-    one, other = pairs.T
-    ends = np.concatenate([one, other]), np.concatenate([other, one])
-    near = coo_matrix((np.ones(2 * len(pairs)), ends), (vertices, vertices)).tocsr() + diags(
-        np.ones(vertices)
-    )
-    return csr_matrix(diags(1 / np.asarray(near.sum(1)).ravel()) @ near)
+    (one, other), own = edges(faces)[0].T, np.arange(vertices)
+    rows = np.concatenate([one, other, own])
+    share = 1 / np.bincount(rows, minlength=vertices)
+    return csr_matrix((share[rows], (rows, np.concatenate([other, one, own]))), (vertices, vertices))

@@ -46,8 +46,8 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
         shapes=np.moveaxis(_turned(buffers["blendshapes"]), 0, 2),
         joint_shapes=np.moveaxis(_turned(buffers["bone_heads_blendshapes"]), 0, 2),
         names=tuple(model.bone_labels),
-        uv=model.texture_coordinates.numpy().astype(np.float32),
-        uv_faces=model.face_texture_coordinate_indices.numpy().astype(np.int64),
+        uv=np.asarray(model.texture_coordinates, np.float32),
+        uv_faces=np.asarray(model.face_texture_coordinate_indices, np.int64),
     )
     variations = {trait: list(names) for trait, names in PHENOTYPE_VARIATIONS.items()}
     tables = {

@@ -1,4 +1,4 @@
-"""What generated people wear: cloth over a body, with thickness, wrinkles, patterns, hems, buttons, belts and prints."""
+"""What generated people wear: cloth over a body, with thickness, wrinkles, patterns, hems, buttons and prints."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -66,7 +66,7 @@ class Outfit(NamedTuple):
 
 def outfit(body: Anatomy, random: Generator) -> Outfit:
     """Clothes of one person, drawn."""
-    below = random.choice(["trousers", "trousers", "trousers", "shorts", "skirt", "dress"])
+    below = random.choice(["trousers", "shorts", "skirt", "dress"], p=[0.64, 0.16, 0.12, 0.08])
     skirt = None
     garments = []
     cloth = pattern(random)
@@ -74,11 +74,11 @@ def outfit(body: Anatomy, random: Generator) -> Outfit:
         garments.append(_trousers(body, random, short=below == "shorts"))
     else:
         garments.append(_leggings(body, random))
-        length = random.uniform(0.3, 0.75) if below == "skirt" else random.uniform(0.45, 0.95)
+        length = random.uniform(0.3, 0.65) if below == "skirt" else random.uniform(0.45, 0.85)
         skirt = Skirt(
             body.waist,
             length,
-            random.uniform(0.05, 0.35),
+            random.uniform(0.0, 0.2),
             int(random.integers(7, 22)),
             random.uniform(0.004, 0.02),
             cloth,
@@ -199,7 +199,7 @@ def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float
     )
     if hem < body.waist - 0.05:  # it hangs loose below the waist
         thickness = thickness + 0.004
-        wrinkles = wrinkles + 0.012 * np.exp(-((body.place[:, 1] - hem) / 0.1).clip(0, None)) * ~body.on_arm
+        wrinkles = wrinkles + 0.008 * np.exp(-((body.place[:, 1] - hem) / 0.1).clip(0, None)) * ~body.on_arm
     return Garment(inside, thickness, wrinkles, _worn(body, found, wrinkles, inside, random))
 
 

@@ -153,8 +153,8 @@ class HumanScans(Data):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if set(state) != {"height", "width"}:
             raise DataError(
-                f"human_scans keeps the size of its images, but was given {', '.join(state) or 'nothing'}. Give the data "
-                "that the model was trained on."
+                f"human_scans keeps the size of its images, but was given {', '.join(state) or 'nothing'}. Give the "
+                "data that the model was trained on."
             )
         self.size = (int(state["height"]), int(state["width"]))
 

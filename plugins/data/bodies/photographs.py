@@ -22,7 +22,7 @@ AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
 """Places of the rig: so many round the person, at each of these elevations in degrees."""
 FOCAL = 1.25
 """Focal length in heights of the image."""
-MARGIN = 0.05
+MARGIN = 0.03
 """Share of the image's height and width that stays free on each side, at least."""
 
 
@@ -38,7 +38,7 @@ def rig(
 ) -> list[Camera]:
     """Cameras at different places that see all of a person; fewer places than `count` are used twice.
 
-    Each looks at the middle of the person from as near as shows it whole, or a tenth further away, rolled by a degree
+    Each looks at the middle of the person from as near as shows it whole, or a little further away, rolled by a degree
     or two, with a principal point a little off the middle.
     """
     places = AROUND * len(HEIGHTS)
@@ -68,10 +68,10 @@ def _camera(
     focal = FOCAL * height
     off = random.uniform(-0.02, 0.02, 2) * height
     x, y, z = (around @ rotation.T).T
-    # whole where focal |x| / (z + distance) stays within half the width but for the margin and the principal point's place
+    # whole where focal |x| / (z + distance) stays within half the width less the margin and what is off the middle
     free = np.array([width / 2 - np.abs(off[0]), height / 2 - np.abs(off[1])]) - MARGIN * height
     nearest = max((focal * np.abs(x) / free[0] - z).max(), (focal * np.abs(y) / free[1] - z).max())
-    distance = nearest * random.uniform(1.0, 1.1)
+    distance = nearest * random.uniform(1.0, 1.06)
     return Camera(
         torch.from_numpy(rotation).float(),
         torch.from_numpy(np.array([0, 0, distance]) - rotation @ middle).float(),
@@ -117,10 +117,12 @@ def texture(
     colors: Float[Tensor, "places 3"],
     side: int,
 ) -> UInt8[np.ndarray, "side side 3"]:
-    """A square texture from linear light at places, v upwards; what no triangle covers is as the nearest that one does."""
+    """A square texture from linear light at places, v upwards; what no triangle covers is as what lies nearest."""
     place = np.stack([uv[:, 0] * side - 0.5, (1 - uv[:, 1]) * side - 0.5, np.ones(len(uv))], 1)
     camera = Camera(torch.eye(3), torch.zeros(3), (1.0, 1.0), (0.0, 0.0), side, side)
     scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), colors, camera)
     drawn = renderer(scene, ("color", "mask"))
-    row, column = distance_transform_edt(~drawn["mask"].numpy(), return_distances=False, return_indices=True)
+    outside = ~drawn["mask"].numpy()
+    nearest = np.asarray(distance_transform_edt(outside, return_distances=False, return_indices=True))
+    row, column = nearest
     return eight_bit(drawn["color"]).numpy()[row, column]

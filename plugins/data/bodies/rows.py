@@ -1,16 +1,21 @@
 """Rows of the contract: scans of a doll, and a few people in FAUST's layout."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import torch
 from PIL import Image
 
+from framework.geometry.camera import Camera
 from framework.target import Target
 from framework.testing.rows import DAMAGES, DataRow, EncoderRow, HeadRow, MetricRow
 from framework.testing.sample_files import meshes, write_ply
+from plugins.data.bodies import scan_layout
 from plugins.data.bodies.figure import figure_of
+from plugins.data.bodies.scan_layout import Registration
 
 FOLDER = TemporaryDirectory()
 # the SMPL family's first 22 joints: pelvis, hips, spine, knees, spine, ankles, spine, toes, neck, collars, head,
@@ -82,8 +87,52 @@ def people(folder: Path) -> Mapping[str, str]:
     return {"root": str(folder)}
 
 
+def scanned(folder: Path) -> Mapping[str, str]:
+    """Six subjects of 40 coloured vertices, photographed twice each: 12 × 9 pixels of noise, half of them masked."""
+    names = {"train": ("ann", "bob", "cleo"), "validation": ("dan",), "test": ("eve", "fay")}
+    scan_layout.write_splits(folder, names)
+    for number, name in enumerate(name for some in names.values() for name in some):
+        home, random = folder / "subjects" / name, np.random.default_rng(number)
+        scan_layout.write_registration(home / "registration_7k.ply", colored(number))
+        view = Camera(
+            torch.diag(torch.tensor([1.0, -1, -1])),
+            torch.tensor([0, 1, 3.0]),
+            (12.0, 12.0),
+            (4.0, 5.5),
+            12,
+            9,
+        )
+        scan_layout.write_cameras(
+            home / "cameras.json", {"front": view, "near": replace(view, focal=(14.0, 15.0))}
+        )
+        for place in ("images/front", "images/near", "masks/front", "masks/near"):
+            pixels = random.integers(0, 256, (12, 9, 3), np.uint8)
+            file = home / f"{place}.png"
+            file.parent.mkdir(exist_ok=True)
+            Image.fromarray(pixels if "images" in place else pixels[..., 0]).save(file)
+    return {"root": str(folder)}
+
+
+def colored(number: int) -> Registration:
+    """A person's mesh with random colours."""
+    colors = np.random.default_rng(number).integers(0, 256, (40, 3), np.uint8)
+    faces = np.array([(0, 1, 2), (2, 1, 3)])
+    return Registration(
+        torch.from_numpy(person(number)[0]).float(), torch.from_numpy(colors), torch.from_numpy(faces)
+    )
+
+
+def colored_meshes(folder: Path) -> Sequence[Path]:
+    """Two meshes with vertex colours."""
+    files = [folder / "one.ply", folder / "other.ply"]
+    for number, file in enumerate(files):
+        scan_layout.write_registration(file, colored(number))
+    return files
+
+
 DOLL = small_body()
 NUMBERS = figure_of(DOLL["body"]).names
+SMALL = {"renderer": "rasterizer", "topologies": ["7k"], "views": 2}
 ROWS = {
     "pose_from_image": (
         DataRow(
@@ -123,6 +172,29 @@ ROWS = {
         ),
     ),
     "pose_error": (MetricRow("a doll", Target("real", NUMBERS)),),
+    "human_scans": (
+        DataRow(
+            "a dressed doll",
+            {**SMALL, "train": 3, "validation": 1, "test": 2, "height": 24, "width": 18, "texture_side": 0},
+            write=body_file,
+            synthetic=True,
+            files=colored_meshes,
+            fragile={"doll.npz": DAMAGES},
+            changes={"data_seed": 1, "test": 3, "views": 3, "width": 20, "posed": 1.0},
+        ),
+        DataRow(
+            "six people",
+            {**SMALL, **DOLL, "train": 1, "validation": 1, "test": 1, "height": 12, "width": 9},
+            write=scanned,
+            synthetic=False,
+            files=colored_meshes,
+            fragile={
+                "test.txt": ("missing", "empty", "folder", "garbage"),
+                **{f"subjects/*/{name}": DAMAGES for name in ("registration_7k.ply", "cameras.json")},
+                **{f"subjects/*/{name}/*.png": DAMAGES for name in ("images", "masks")},
+            },
+        ),
+    ),
     "registration": (
         DataRow(
             "a doll",

@@ -44,8 +44,8 @@ class Drawing:
         topologies: meshes registered to each scan.
         posed: share of the test subjects that do not stand in an A-pose but anyhow.
         texture_side: texels along a side of texture.png; 0: none is made.
-        skins: folder of pictures of skin in the default body's texture layout; None: skin is painted. Each is worn in one
-            split alone.
+        skins: folder of pictures of skin in the default body's texture layout, each worn in one split alone; None: skin
+            is painted.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body.
     """
 

@@ -214,8 +214,8 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
         or matrix[2].tolist() != [0, 0, 1]
     ):
         raise ValueError(
-            f"view {name}: K is {matrix.tolist()}; wanted ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) with fx and fy above 0: "
-            "pixels without shear"
+            f"view {name}: K is {matrix.tolist()}; wanted ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) with fx and fy above "
+            "0: pixels without shear"
         )
     height, width = (int(size) for size in sizes if size is not None)
     return Camera(
@@ -248,8 +248,8 @@ def tail(file: Path) -> bytes:
 def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
     if image.size != (camera.width, camera.height):
         raise DataError(
-            f"{file}: {image.width} × {image.height} pixels, but its camera has {camera.width} × {camera.height}; wanted "
-            "the same. Mend cameras.json, or scale the picture."
+            f"{file}: {image.width} × {image.height} pixels, but its camera has {camera.width} × {camera.height}; "
+            "wanted the same. Mend cameras.json, or scale the picture."
         )
 
 

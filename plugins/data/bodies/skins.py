@@ -1,5 +1,6 @@
 """The skin of generated people: painted by procedure, or a picture in the body's own texture layout."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from framework.geometry.light import linear
 from plugins.data.bodies.anatomy import Anatomy
 from plugins.data.bodies.fabrics import Color, hue, noise
 
+Carry = Callable[[np.ndarray], np.ndarray]
+
 
 def files(folder: Path) -> list[Path]:
     """Pictures of a folder, by name.
@@ -23,7 +26,8 @@ def files(folder: Path) -> list[Path]:
     found = sorted(folder.glob("*.png"))
     if not found:
         raise DataError(
-            f"data.skins = {folder}: no PNG there; wanted a folder of skins in the default body's texture layout, or null."
+            f"data.skins = {folder}: no PNG there; wanted a folder of skins in the default body's texture layout, or "
+            "null."
         )
     return found
 
@@ -54,6 +58,34 @@ def shown(
     return top * (1 - down) + bottom * down
 
 
+BLANK = 128
+"""Red, green and blue of texels that no one has painted: what garments are expected to cover."""
+
+
+def filled(
+    colors: Float[np.ndarray, "vertices 3"], body: Anatomy, count: int, average: Carry, carried: Carry
+) -> Float[np.ndarray, "vertices 3"]:
+    """Linear light of a skin at all vertices, where blank that of the face, blended into what lies around.
+
+    Args:
+        count: of the body's own vertices, the first of `colors`.
+        average: numbers of these to means over their neighbours.
+        carried: takes numbers of these to all.
+    """
+    grey = float(linear(torch.tensor(BLANK, dtype=torch.uint8)))
+    blank = np.asarray(np.abs(colors - grey).max(1) < 0.002)
+    face = ~blank & (body.head > 0.5) & (body.on_head[:, 2] > 0.2)
+    if not blank.any() or not face.any():
+        return colors
+    own, open_ = colors[:count].copy(), blank[:count]
+    own[open_] = np.median(colors[face], axis=0)
+    for _ in range(40):
+        own[open_] = average(own)[open_]
+    # a midpoint between what is blank and what is not takes from both
+    near = carried(np.where(open_, 1.0, 0.0)) > 0
+    return np.where((blank | near)[:, None], carried(own), colors)
+
+
 def painted(body: Anatomy, random: Generator) -> Float[np.ndarray, "vertices 3"]:
     """Skin with a face, linear light of every vertex."""
     tone = _tone(random)
@@ -76,7 +108,7 @@ def _with_face(body: Anatomy, found: np.ndarray, tone: Color, random: Generator)
     def blot(at: tuple[float, float], wide: float, high: float) -> np.ndarray:
         return face * np.exp(-(((side - at[0]) / wide) ** 2) - ((y - at[1]) / high) ** 2)
 
-    lips = blot((0, 0.19), 0.22, 0.026) ** 0.7
+    lips = blot((0.0, 0.19), 0.22, 0.026) ** 0.7
     cheeks = blot((0.45, 0.35), 0.18, 0.08)
     sockets = blot((0.36, 0.485), 0.2, 0.045)
     brow = face & (np.abs(y - 0.56 + 0.25 * (side - 0.36) ** 2) < 0.014) & (np.abs(side - 0.36) < 0.22)
@@ -85,9 +117,15 @@ def _with_face(body: Anatomy, found: np.ndarray, tone: Color, random: Generator)
     found = found + (np.array([0.12, 0.0, 0.0]) * tone)[None] * cheeks[:, None]
     found = found * (1 - 0.7 * lips[:, None] * (1 - np.array([0.85, 0.4, 0.42])))
     found = np.where(brow[:, None], 0.25 * tone, found)
-    found = found * (1 - 0.5 * stubble)[:, None]
-    open_eye = face & (np.hypot((side - 0.355) / 0.13, (y - 0.482) / 0.022) < 1)
-    iris = open_eye & (np.hypot((side - 0.355) / 0.055, (y - 0.482) / 0.024) < 1)
-    colour = hue(random.choice([25, 30, 205, 110]), 0.5, random.uniform(0.2, 0.5))
-    found = np.where(open_eye[:, None], 0.75, found)
-    return np.where(iris[:, None], colour * 0.6, found)
+    return with_eyes(body, found * (1 - 0.5 * stubble)[:, None], random)
+
+
+def with_eyes(body: Anatomy, found: np.ndarray, random: Generator) -> Float[np.ndarray, "vertices 3"]:
+    """With the white, the iris and the pupil of both eyes, at their places on the head."""
+    x, y, z = body.on_head.T
+    face = (body.head > 0.5) & (z > 0.35)
+    away = (np.abs(x) - 0.355, y - 0.482)
+    colour = hue(random.choice([25.0, 30.0, 205.0, 110.0]), 0.5, random.uniform(0.2, 0.5)) * 0.6
+    for wide, high, paint in ((0.13, 0.022, 0.7), (0.055, 0.024, colour), (0.02, 0.009, 0.01)):
+        found = np.where((face & (np.hypot(away[0] / wide, away[1] / high) < 1))[:, None], paint, found)
+    return found

@@ -5,6 +5,7 @@ All of them are rows of one finely split surface, so that what is known there (c
 
 import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -199,7 +200,7 @@ def _decimated(body: Body, corners: Corners, count: int) -> Decimated:
     mark = {"decimated": digest.hexdigest(), "vertices": count, "version": VERSION}
     root = cached.folder("body") / f"decimated-{digest.hexdigest()[:12]}-{count}-{VERSION}"
 
-    def write(folder):  # noqa: ANN001, ANN202
+    def write(folder: Path) -> None:
         np.savez(folder / "mesh.npz", **decimated(body.template, *corners, count)._asdict())
 
     generated(root, mark, write)
