@@ -102,9 +102,3 @@ class Layer(nn.Module):
 
 def convolved(maps: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1) -> Tensor:
     return functional.conv2d(maps, weight, bias, stride, padding=weight.shape[-1] // 2 if stride == 1 else 0)
-
-
-def doubled(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-    """Bilinear interpolation to twice the size, beyond the border the empty ground."""
-    wide = functional.pad(maps, (1, 1, 1, 1))
-    return functional.interpolate(wide, scale_factor=2, mode="bilinear")[..., 2:-2, 2:-2]

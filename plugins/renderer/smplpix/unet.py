@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from framework.encoder import Encoder
 from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, require_pictures
-from plugins.renderer.smplpix.layers import Layer, Normalisation, Step, doubled
+from plugins.renderer.smplpix.layers import Layer, Normalisation, Step
 
 
 class UNet(Encoder):
@@ -102,3 +102,9 @@ class UNet(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
         answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
         return answers
+
+
+def doubled(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
+    """Bilinear interpolation to twice the size; beyond the border lies the empty ground."""
+    wide = functional.pad(maps, (1, 1, 1, 1))
+    return functional.interpolate(wide, scale_factor=2.0, mode="bilinear")[..., 2:-2, 2:-2]
