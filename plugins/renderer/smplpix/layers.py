@@ -2,7 +2,7 @@
 
 Maps hold differences from what a layer would hold on an empty picture without end. There a convolution gives 0,
 normalisation and ReLU give relu(shift), and that is subtracted again. So zero padding continues the empty ground
-beyond a border exactly, and what is far from any subject need not be computed.
+beyond a border in every layer, and what is far from any subject need not be computed.
 """
 
 from collections.abc import Callable

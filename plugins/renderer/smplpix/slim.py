@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
-from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, require_pictures
+from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, head, require_pictures
 from plugins.renderer.smplpix.layers import Layer, Normalisation, Step
 
 Channels = Annotated[int, Field(gt=0)]
@@ -58,7 +58,7 @@ class Slim(Encoder):
         normalisation: Normalisation = "renorm",
         colors: Annotated[int, Field(gt=0)] = 3,
         scales: Literal[0, 1, 3] = 0,
-        crop: Annotated[int, Field(ge=0)] | None = 32,
+        crop: Annotated[int, Field(ge=0)] | None = 24,
         precision: Precision = "float32",
     ) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ class Slim(Encoder):
         shapes += [(lower, upper, 3) for upper, lower in reversed(list(pairwise(widths)))]
         shapes += [(first, first, 3)]
         self.layers = nn.ModuleList(Layer(*shape, normalisation) for shape in shapes)
-        self.head = nn.Conv2d(first, (colors + scales) * places, 3)
+        self.head = head(first, 3, colors, scales, places)
         self.canvas = Canvas(colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle)
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
