@@ -45,10 +45,13 @@ def first_calls(script: str, **elsewhere: str) -> tuple[float, float]:
 
 
 def milliseconds(
-    call: Callable[[], object], repeats: int = 300, clock: Callable[[], float] = time.thread_time
+    call: Callable[[], object],
+    repeats: int = 300,
+    clock: Callable[[], float] = time.thread_time,
+    warm_up: int = 10,
 ) -> float:
-    """Median processor time, after ten calls to warm up: of the calling thread, or what else the clock counts."""
-    for _ in range(10):
+    """Median processor time, after calls to warm up: of the calling thread, or what else the clock counts."""
+    for _ in range(warm_up):
         call()
     times = []
     for _ in range(repeats):

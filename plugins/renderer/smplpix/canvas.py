@@ -13,8 +13,10 @@ from framework.errors import ConfigError
 from plugins.renderer.smplpix.layers import Layer, Step, convolved
 
 Precision = Literal["auto", "float32", "bfloat16"]
-FAST = ("avx512_bf16", "amx_bf16")
-"""What a processor must have for bfloat16 to be faster than float32."""
+
+
+WHITE = 6.0
+"""What an untrained head answers to an empty picture, before the sigmoid: white but for 0.6 of 255."""
 
 
 class Box(NamedTuple):
@@ -91,7 +93,7 @@ class Canvas:
 
         def answer(pictures: Tensor) -> Tensor:
             height, width = pictures.shape[2:]
-            whole = functional.pad(pictures, (0, -width % self.stride, 0, -height % self.stride)).to(kind)
+            whole = functional.pad(pictures.to(kind), (0, -width % self.stride, 0, -height % self.stride))
             raw = convolved(maps(whole, iter(steps)), head_weight, head_bias)
             return self._colored(functional.pixel_shuffle(raw, self.shuffle)[..., :height, :width].to(weight))
 
@@ -107,8 +109,10 @@ class Canvas:
         """One box after the other: what else is in the batch does not matter."""
         count, _, height, width = pictures.shape
         side = empty.shape[-1]
-        ground = empty.repeat(1, 1, -(-height // side), -(-width // side))[..., :height, :width]
-        answers = ground.repeat(count, 1, 1, 1)
+        answers = empty.new_empty(count, empty.shape[1], height, width)
+        for row in range(min(side, height)):
+            line = empty[:, :, row : row + 1].repeat(1, 1, 1, -(-width // side))
+            answers[:, :, row::side] = line[..., :width]
         computed, left_out = 0, count * height * width
         for index, box in enumerate(boxes):
             if box is None:
@@ -137,21 +141,29 @@ def fast_bfloat16(device: torch.device) -> bool:
     """Whether the device multiplies matrices of bfloat16 faster than of float32."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    has = torch.cpu.get_capabilities()
-    return any(has.get(name, False) for name in FAST)
+    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
 def subject(picture: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:
     """The box around what is not empty (0 in every channel), a margin wider and out to whole strides."""
-    occupied = (picture != 0).any(0)
+    most = picture.detach().abs().amax(0)  # NaN where any is
     ends: list[int] = []
-    for line in (occupied.any(1), occupied.any(0)):
+    for line in (most.amax(1), most.amax(0)):
         where = line.nonzero()
         if len(where) == 0:
             return None
         first, last = int(where[0]) - margin, int(where[-1]) + 1 + margin
         ends += [max(0, first // stride * stride), -(-min(last, len(line)) // stride) * stride]
     return Box(*ends)
+
+
+def head(channels: int, size: int, colors: int, scales: int, places: int = 1) -> nn.Conv2d:
+    """From maps to colours and scales, each of so many places. An empty picture is white from the start: one that is
+    never trained on, as where all that is seen is near a subject, would else stay grey."""
+    made = nn.Conv2d(channels, (colors + scales) * places, size)
+    assert made.bias is not None
+    nn.init.constant_(made.bias[: colors * places], WHITE)
+    return made
 
 
 def require_pictures(name: str, input_shape: tuple[int, ...], normalisation: str, crop: int | None) -> None:

@@ -2,7 +2,7 @@
 
 Maps hold differences from what a layer would hold on an empty picture without end. There a convolution gives 0,
 normalisation and ReLU give relu(shift), and that is subtracted again. So zero padding continues the empty ground
-beyond a border exactly, and what is far from any subject need not be computed.
+beyond a border in every layer, and what is far from any subject need not be computed.
 """
 
 from collections.abc import Callable
@@ -102,9 +102,3 @@ class Layer(nn.Module):
 
 def convolved(maps: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1) -> Tensor:
     return functional.conv2d(maps, weight, bias, stride, padding=weight.shape[-1] // 2 if stride == 1 else 0)
-
-
-def doubled(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-    """Bilinear interpolation to twice the size, beyond the border the empty ground."""
-    wide = functional.pad(maps, (1, 1, 1, 1))
-    return functional.interpolate(wide, scale_factor=2, mode="bilinear")[..., 2:-2, 2:-2]

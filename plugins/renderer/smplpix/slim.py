@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional
 
 from framework.encoder import Encoder
-from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, require_pictures
-from plugins.renderer.smplpix.layers import Layer, Normalisation, Step, doubled
+from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, head, require_pictures
+from plugins.renderer.smplpix.layers import Layer, Normalisation, Step
 
 Channels = Annotated[int, Field(gt=0)]
 
@@ -20,8 +21,8 @@ class Slim(Encoder):
     """Squares of `unshuffle`² pixels become channels of one (Shi et al. 2016, backwards); then a small U-Net.
 
     One 3×3 convolution a level and way. A 2×2 convolution of stride 2 leads down; up, a 3×3 convolution to the upper
-    level's channels, bilinear interpolation and a sum. An input of 1 in every channel is empty ground, and so is all
-    beyond the border: sides continue empty to a multiple of unshuffle × 2 ** (levels - 1) pixels.
+    level's channels, each number repeated on 2×2 pixels, and a sum. An input of 1 in every channel is empty ground, and
+    so is all beyond the border: sides continue empty to a multiple of unshuffle × 2 ** (levels - 1) pixels.
 
     Args:
         input_shape: (channels, height, width), any size; other sizes than this one are read too.
@@ -52,12 +53,12 @@ class Slim(Encoder):
         self,
         input_shape: tuple[int, ...],
         *,
-        widths: Annotated[list[Channels], Field(min_length=1, max_length=8)] = [32, 48, 96, 128],  # noqa: B006 - never written
+        widths: Annotated[list[Channels], Field(min_length=1, max_length=8)] = [32, 48, 64, 96],  # noqa: B006 - never written
         unshuffle: Annotated[int, Field(ge=1, le=8)] = 2,
         normalisation: Normalisation = "renorm",
         colors: Annotated[int, Field(gt=0)] = 3,
         scales: Literal[0, 1, 3] = 0,
-        crop: Annotated[int, Field(ge=0)] | None = 32,
+        crop: Annotated[int, Field(ge=0)] | None = 24,
         precision: Precision = "float32",
     ) -> None:
         super().__init__()
@@ -71,7 +72,7 @@ class Slim(Encoder):
         shapes += [(lower, upper, 3) for upper, lower in reversed(list(pairwise(widths)))]
         shapes += [(first, first, 3)]
         self.layers = nn.ModuleList(Layer(*shape, normalisation) for shape in shapes)
-        self.head = nn.Conv2d(first, (colors + scales) * places, 3)
+        self.head = head(first, 3, colors, scales, places)
         self.canvas = Canvas(colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle)
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -84,7 +85,7 @@ class Slim(Encoder):
             maps = next(layers)(maps)
             across.append(maps)
         for same_size in reversed(across[:-1]):
-            maps = doubled(next(layers)(maps)) + same_size
+            maps = functional.interpolate(next(layers)(maps), scale_factor=2.0) + same_size
         return next(layers)(maps)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:

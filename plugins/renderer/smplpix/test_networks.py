@@ -95,8 +95,10 @@ class Plain:
             maps, white = self.layer(*self.layer(maps, white))
             across.append((maps, white))
         for same_size in (across[1], across[0]):
-            both = zip(same_size, self.doubled(*self.layer(maps, white)), strict=True)
-            maps, white = (sum(pair) for pair in both)
+            maps, white = self.layer(maps, white)
+            each = torch.ones(maps.shape[1], 1, 2, 2).to(maps)
+            spread = functional.conv_transpose2d(maps, each, stride=2, groups=len(each))
+            maps, white = same_size[0] + spread, same_size[1] + white
         return self.layer(maps, white)
 
 

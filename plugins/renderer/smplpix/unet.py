@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
-from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, require_pictures
-from plugins.renderer.smplpix.layers import Layer, Normalisation, Step, doubled
+from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, head, require_pictures
+from plugins.renderer.smplpix.layers import Layer, Normalisation, Step
 
 
 class UNet(Encoder):
@@ -64,7 +64,7 @@ class UNet(Encoder):
         normalisation: Normalisation = "renorm",
         colors: Annotated[int, Field(gt=0)] = 3,
         scales: Literal[0, 1, 3] = 0,
-        crop: Annotated[int, Field(ge=0)] | None = 32,
+        crop: Annotated[int, Field(ge=0)] | None = 24,
         precision: Precision = "float32",
     ) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class UNet(Encoder):
             sides += [(before, after), (2 * after, after), (after, after)]
             before = after
         self.layers = nn.ModuleList(Layer(*pair, 3, normalisation) for pair in sides)
-        self.head = nn.Conv2d(width, colors + scales, 1)
+        self.head = head(width, 1, colors, scales)
         self.canvas = Canvas(colors, 2 ** (levels - 1), crop, precision)
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -102,3 +102,9 @@ class UNet(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
         answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
         return answers
+
+
+def doubled(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
+    """Bilinear interpolation to twice the size; beyond the border lies the empty ground."""
+    wide = functional.pad(maps, (1, 1, 1, 1))
+    return functional.interpolate(wide, scale_factor=2.0, mode="bilinear")[..., 2:-2, 2:-2]
