@@ -32,6 +32,7 @@ from framework.datasets.images import Crop
 from framework.geometry import meshes
 from framework.runs import loading
 from framework.storage.generated import read_mark
+from framework.storage.weights import read_weights
 from framework.sweeps import jobs
 from framework.testing import sample_files
 from framework.tracking.journal import Journal
@@ -42,7 +43,6 @@ from plugins.data.head_pose import caviar_labels, idiap_labels, towncentre_label
 from plugins.data.images_with_angles.table import read_table
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.pascal3d import layout
-from plugins.encoder.inception_resnet_v2.weights import read_weights
 from plugins.renderer.rasterizer import sample_scenes as scenes
 from plugins.renderer.rasterizer import scene_files, turntable
 

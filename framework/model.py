@@ -1,11 +1,11 @@
 """The model of the density pipeline: encoders, one linear layer, a density head."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import final
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
@@ -13,9 +13,6 @@ from framework.data import Batch
 from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-
-LISTED = 5
-"""Names of weights that a message lists before it counts the rest."""
 
 
 class Predictor(nn.Module, ABC):
@@ -150,35 +147,3 @@ def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]
         return values
     total = values.sum(-1)
     return total + (values.mean(-1) - total).detach()
-
-
-def describe_mismatch(
-    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Shaped[Tensor, "..."]]
-) -> str | None:
-    """One sentence on how the weights of a file differ from those a model wants, or None where they fit."""
-    missing = [name for name in wanted if name not in found]
-    unexpected = [name for name in found if name not in wanted]
-    reshaped = [
-        f"{name} ({_shape(found[name])}, wanted {_shape(tensor)})"
-        for name, tensor in wanted.items()
-        if name in found and found[name].shape != tensor.shape
-    ]
-    parts = [
-        f"{len(names)} of {total} {what}: {_some(names)}"
-        for names, total, what in (
-            (missing, len(wanted), "weights are missing"),
-            (unexpected, len(found), "weights found are unknown"),
-            (reshaped, len(wanted), "weights have another shape"),
-        )
-        if names
-    ]
-    return "; ".join(parts) + "." if parts else None
-
-
-def _shape(tensor: Shaped[Tensor, "..."]) -> str:
-    return "×".join(map(str, tensor.shape)) or "scalar"
-
-
-def _some(names: list[str]) -> str:
-    rest = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {rest} more" if rest > 0 else "")
