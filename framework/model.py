@@ -2,12 +2,12 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import final
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
@@ -15,9 +15,6 @@ from framework.data import Batch
 from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-
-LISTED = 5
-"""Names of weights that a message lists before it counts the rest."""
 
 
 class Predictor(nn.Module, ABC):
@@ -80,7 +77,7 @@ class Model(Predictor):
         elif head.direct:
             if math.prod(shape) != head.size:
                 raise ConfigError(
-                    f"The last encoder gives {_times(shape)} numbers, but {type(head).__name__} reads "
+                    f"The last encoder gives {'×'.join(map(str, shape))} numbers, but {type(head).__name__} reads "
                     f"{head.size:,} as they are. Choose an encoder that gives as many, or change its channels."
                 )
             self.projection = nn.Flatten()
@@ -188,39 +185,3 @@ def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]
         return values
     total = values.sum(-1)
     return total + (values.mean(-1) - total).detach()
-
-
-def describe_mismatch(
-    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Shaped[Tensor, "..."]]
-) -> str | None:
-    """One sentence on how the weights of a file differ from those a model wants, or None where they fit."""
-    missing = [name for name in wanted if name not in found]
-    unexpected = [name for name in found if name not in wanted]
-    reshaped = [
-        f"{name} ({_shape(found[name])}, wanted {_shape(tensor)})"
-        for name, tensor in wanted.items()
-        if name in found and found[name].shape != tensor.shape
-    ]
-    parts = [
-        f"{len(names)} of {total} {what}: {_some(names)}"
-        for names, total, what in (
-            (missing, len(wanted), "weights are missing"),
-            (unexpected, len(found), "weights found are unknown"),
-            (reshaped, len(wanted), "weights have another shape"),
-        )
-        if names
-    ]
-    return "; ".join(parts) + "." if parts else None
-
-
-def _shape(tensor: Shaped[Tensor, "..."]) -> str:
-    return _times(tensor.shape) or "scalar"
-
-
-def _times(shape: Sequence[int]) -> str:
-    return "×".join(map(str, shape))
-
-
-def _some(names: list[str]) -> str:
-    rest = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {rest} more" if rest > 0 else "")

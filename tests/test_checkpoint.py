@@ -17,7 +17,7 @@ import torch
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError
-from framework.model import describe_mismatch
+from framework.storage.weights import describe_mismatch
 from framework.training.checkpoint import WholeCheckpoints, latest_good, read, verify
 
 CONTENTS: dict[str, Any] = {

@@ -16,9 +16,10 @@ from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
 from framework.distributions.moved import Moved
 from framework.errors import CheckpointError
-from framework.model import Predictor, describe_mismatch
+from framework.model import Predictor
 from framework.runs.description import Description
 from framework.storage.reading import guarded
+from framework.storage.weights import describe_mismatch
 from framework.training.checkpoint import latest_good, read
 
 FOREIGN = "This framework did not write it: do not use it."

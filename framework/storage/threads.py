@@ -34,13 +34,13 @@ class Pool:
         waiting = iter(range(count))
 
         def some(_: int) -> None:
-            for number in waiting:
-                work(number)
+            try:
+                for number in waiting:
+                    work(number)
+            finally:
+                list(waiting)  # where one failed, the other threads stop too
 
-        try:
-            self.run(some, min(threads, count))
-        finally:
-            list(waiting)  # where one failed, the other threads stop too
+        self.run(some, min(threads, count))
 
 
 POOL = Pool()

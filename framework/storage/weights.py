@@ -1,5 +1,6 @@
-"""Files of weights trained elsewhere: named tensors, whole and plain, or a sentence."""
+"""Weights trained elsewhere: fills a network from a local file of named tensors, or says what differs."""
 
+import logging
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,14 +11,49 @@ import torch
 from jaxtyping import Shaped
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.errors import CheckpointError, ConfigError, shown
 from framework.storage.plain_values import require_flat
 from framework.storage.reading import room
 
+_log = logging.getLogger(__name__)
+
+LISTED = 5
+"""Names of weights that a message lists before it counts the rest."""
 NUMBERS = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32)
 """What weights may be made of; complex numbers would lose half of theirs without a word."""
+
+
+def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...], within: str = "") -> None:
+    """Copy the weights of `file` into `network`, name by name.
+
+    Args:
+        network: whose `state_dict` names the weights.
+        file: what `read_weights` reads.
+        ignored: beginnings of names the network has no use for, such as the classifier's; they may be absent.
+        within: what the file's names begin with beside the network's, all or none of them: "features." say.
+
+    Raises:
+        ConfigError: there is no such file.
+        CheckpointError: it cannot be read, or its names or shapes are not the network's.
+    """
+    found = read_weights(file)
+    kept = {name: tensor for name, tensor in found.items() if not name.startswith(ignored)}
+    if len(kept) < len(found):
+        names = ", ".join(sorted(found.keys() - kept.keys()))
+        _log.info("%s: ignored %s, not used here.", file, names)
+    kept = {name.removeprefix(within): tensor for name, tensor in kept.items()}
+    wanted = network.state_dict()
+    # Batch norm counts its batches since torch 0.4.1 only; older files lack the count, and nothing reads it.
+    counters = {name: tensor for name, tensor in wanted.items() if name.endswith(".num_batches_tracked")}
+    kept = counters | kept
+    mismatch = describe_mismatch(wanted, kept)
+    if mismatch:
+        raise CheckpointError(
+            f"{file} does not fit {type(network).__name__}: {mismatch} Give a file with its names and shapes."
+        )
+    network.load_state_dict(kept)
 
 
 def read_weights(file: str) -> dict[str, Shaped[Tensor, "..."]]:
@@ -93,3 +129,35 @@ def _damaged(path: Path, why: str) -> CheckpointError:
 
 def _first_line(error: Exception) -> str:
     return shown((str(error).splitlines() or [type(error).__name__])[0].rstrip("."))
+
+
+def describe_mismatch(
+    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Shaped[Tensor, "..."]]
+) -> str | None:
+    """One sentence on how the weights of a file differ from those a model wants, or None where they fit."""
+    missing = [name for name in wanted if name not in found]
+    unexpected = [name for name in found if name not in wanted]
+    reshaped = [
+        f"{name} ({_shape(found[name])}, wanted {_shape(tensor)})"
+        for name, tensor in wanted.items()
+        if name in found and found[name].shape != tensor.shape
+    ]
+    parts = [
+        f"{len(names)} of {total} {what}: {_some(names)}"
+        for names, total, what in (
+            (missing, len(wanted), "weights are missing"),
+            (unexpected, len(found), "weights found are unknown"),
+            (reshaped, len(wanted), "weights have another shape"),
+        )
+        if names
+    ]
+    return "; ".join(parts) + "." if parts else None
+
+
+def _shape(tensor: Shaped[Tensor, "..."]) -> str:
+    return "×".join(map(str, tensor.shape)) or "scalar"
+
+
+def _some(names: list[str]) -> str:
+    rest = len(names) - LISTED
+    return ", ".join(names[:LISTED]) + (f" and {rest} more" if rest > 0 else "")

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from framework.encoder import Encoder
 from framework.errors import ConfigError
+from framework.storage.weights import fill_from_file
 from plugins.encoder.inception_resnet_v2.layers import (
     ConvNorm,
     block8,
@@ -18,7 +19,6 @@ from plugins.encoder.inception_resnet_v2.layers import (
     mixed_6a,
     mixed_7a,
 )
-from plugins.encoder.inception_resnet_v2.weights import fill_from_file
 
 SMALLEST = 75
 
@@ -33,7 +33,7 @@ class InceptionResNetV2(Encoder):
     Args:
         input_shape: (channels, height, width), 1 or 3 channels, at least 75 × 75 pixels; the published
             network reads 299 × 299.
-        weights: a local file (`weights.read_weights`), or None to start from random weights.
+        weights: a local file (`framework.storage.weights`), or None to start from random weights.
         dropout: probability of dropping a feature.
 
     Raises:

@@ -9,8 +9,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from framework.errors import CheckpointError, ConfigError
-from framework.storage.weights import read_weights
-from plugins.encoder.inception_resnet_v2.weights import fill_from_file
+from framework.storage.weights import fill_from_file, read_weights
 
 
 def network():
@@ -84,9 +83,19 @@ def test_half_precision_is_widened_and_a_missing_counter_is_no_fault(tmp_path):
 def test_the_classifier_is_left_out_and_said_to_be(tmp_path, caplog):
     file = tmp_path / "weights.pth"
     torch.save(state() | {"classif.weight": torch.zeros(1000, 4)}, file)
-    with caplog.at_level("INFO", "plugins.encoder.inception_resnet_v2.weights"):
+    with caplog.at_level("INFO", "framework.storage.weights"):
         fill_from_file(network(), str(file), ignored=("classif.",))
     assert "ignored classif.weight" in caplog.text
+
+
+def test_the_network_may_be_a_part_of_the_one_in_the_file(tmp_path):
+    file = tmp_path / "weights.pth"
+    torch.save(
+        {"features." + name: tensor for name, tensor in state().items()} | {"top.bias": torch.zeros(1)}, file
+    )
+    filled = network()
+    fill_from_file(filled, str(file), ignored=("top.",), within="features.")
+    assert all(torch.equal(tensor, state()[name]) for name, tensor in filled.state_dict().items())
 
 
 @pytest.mark.parametrize(

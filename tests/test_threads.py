@@ -1,0 +1,43 @@
+"""Work that is shared out to threads is done once, and ends where some of it fails."""
+
+import threading
+import time
+
+import pytest
+
+from framework.storage.threads import Pool
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_each_number_is_worked_on_once_by_as_many_threads_as_may(threads: int, count: int) -> None:
+    pool, done, helping = Pool(), [], set()
+
+    def work(number: int) -> None:
+        helping.add(threading.get_ident())
+        time.sleep(1e-4)
+        done.append(number)
+
+    for _ in range(2):  # the threads stay
+        pool.share(work, count, threads)
+        assert sorted(done) == list(range(count))
+        assert len(helping) <= min(threads, max(count, 1))
+        done.clear()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_where_one_fails_its_error_comes_and_the_others_stop(threads: int) -> None:
+    pool, done = Pool(), []
+
+    def work(number: int) -> None:
+        if number == 7:
+            raise ValueError("the eighth")
+        time.sleep(1e-3)
+        done.append(number)
+
+    with pytest.raises(ValueError, match="the eighth"):
+        pool.share(work, 1000, threads)
+    time.sleep(0.02)
+    assert len(done) < 500
+    pool.share(done.append, 3, threads)  # and is of use again
+    assert sorted(done[-3:]) == [0, 1, 2]
