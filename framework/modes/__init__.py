@@ -12,8 +12,8 @@ from framework.errors import ConfigError, did_you_mean
 
 MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
 
-READING = ("test", "predict", "work_precision")
-"""Modes that read `checkpoint`."""
+READING = ("train", "test", "predict", "work_precision")
+"""Modes that read `checkpoint`; training starts from its weights."""
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
@@ -34,8 +34,8 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     config = Config.of(values, folder, overrides)
     if config.settings.checkpoint is not None and name not in READING:
         raise ConfigError(
-            f"checkpoint={config.settings.checkpoint}: mode={name} reads none, {', '.join(READING)} do. To go "
-            "on with a run that was stopped: resume=<run folder>."
+            f"checkpoint={config.settings.checkpoint}: mode={name} reads none, {', '.join(READING)} do. Leave "
+            "it out."
         )
     if name == "train":  # what is wrong is found before Lightning is imported, which takes seconds
         require_device(config.settings.trainer.get("accelerator"))

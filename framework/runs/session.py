@@ -185,7 +185,8 @@ def start_from(predictor: Predictor, settings: Settings, console: Console) -> No
     """
     path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
     fill(predictor, weights(read(path)), str(path))
-    console.print(f"starting from the weights of {path}", soft_wrap=True)
+    said = "a run that was stopped goes on with resume=<its folder>"
+    console.print(f"starting anew from the weights of {path} ({said})", soft_wrap=True)
 
 
 def method_of(config: Config, parts: Resolved) -> str:

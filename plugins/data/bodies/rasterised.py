@@ -70,8 +70,8 @@ class Rasterised(Encoder):
         super().__init__()
         if len(input_shape) != 2 or input_shape[1] < len(COLUMNS) or input_columns[:6] not in ((), COLUMNS):
             raise ConfigError(
-                f"encoder rasterised got inputs of shape {input_shape}; wanted (points, columns) whose first six columns "
-                f"are {', '.join(COLUMNS)}. Choose data=human_scans, or another encoder."
+                f"encoder rasterised got inputs of shape {input_shape}; wanted (points, columns) whose first six "
+                f"columns are {', '.join(COLUMNS)}. Choose data=human_scans, or another encoder."
             )
         if missing := {"color", "depth"} - renderer.channels:
             raise ConfigError(

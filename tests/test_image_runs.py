@@ -1,0 +1,205 @@
+"""Runs whose targets are images: the same pipeline as any, with objectives, rivals, members, and pictures after it."""
+
+import base64
+import json
+import signal
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import framework as package
+from framework.deployment.served import _load_pyfunc
+from framework.geometry.light import eight_bit, light_of
+from plugins.data.bodies.rows import body_file, colored_meshes
+from tests.conftest import Done, Framework
+
+SQUARES = (
+    "data=faded",
+    "encoder=[slim]",
+    "encoder.slim.widths=[8,8]",
+    "density_head=laplace_image",
+    "metric=[psnr,ssim]",
+    "batch_size=12",
+    "trainer.max_epochs=3",
+    "trainer.log_every_steps=1",
+    "trainer.checkpoint_every_steps=1",
+    "optimizer.learning_rate=3e-3",
+    "threads=1",
+    "logger=none",
+    "pictures=false",
+    "samples=1",
+)
+"""9 steps, 3 an epoch."""
+RIVALS = (
+    "objective=[random_features,patch_gan]",
+    "objective.random_features.width=4",
+    "objective.random_features.depth=2",
+    "objective.patch_gan.width=4",
+    "objective.patch_gan.learning_rate=1e-2",
+    "objective.patch_gan.schedule=cosine",
+)
+
+
+def journal(done: Done) -> dict[int, dict[str, Any]]:
+    """Everything logged in training, by step."""
+    found: dict[int, dict[str, Any]] = {}
+    for line in (done.folder / "journal.jsonl").read_text(encoding="utf-8").splitlines():
+        record = json.loads(line)
+        if any(name.startswith("train/") for name in record.get("values", {})):
+            found[record["step"]] = record["values"]
+    return found
+
+
+def trained(framework: Framework, *more: str, folder: str) -> Done:
+    done = framework(*SQUARES, *more, folder=folder)
+    assert done.code == 0, done.out
+    return done
+
+
+@pytest.mark.parametrize("objectives", [(), RIVALS], ids=["likelihood", "rivals"])
+@pytest.mark.parametrize("at", [2, 7])
+def test_a_killed_run_goes_on_bit_by_bit(
+    framework: Framework, tmp_path: Path, objectives: tuple[str, ...], at: int
+) -> None:
+    """Losses of the predictor and of its rivals, and the weights that are left."""
+    whole = trained(framework, *objectives, folder="whole")
+    signals = (f"+data.signal_at={at}", f"+data.signal_marker={tmp_path / 'marker'}")
+    killed = framework(*SQUARES, *objectives, *signals, folder="killed")
+    assert killed.code == -signal.SIGKILL
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    first, again = journal(whole), journal(killed)
+    assert sorted(first) == sorted(again) == list(range(1, 10))
+    assert first == again
+    terms = {"train/discriminator", "train/generator", "train/feature_matching", "train/random_features"}
+    assert terms <= set(first[1]) if objectives else not terms & set(first[1])
+    models = [
+        torch.load(done.folder / "checkpoints" / "model.ckpt", weights_only=True)["state_dict"]
+        for done in (whole, killed)
+    ]
+    assert all(torch.equal(models[1][name], tensor) for name, tensor in models[0].items())
+    assert not any("discriminator" in name for name in models[0]), "a rival is no part of the model"
+
+
+def people(folder: Path) -> tuple[str, ...]:
+    """A run on photographs of a dressed doll, small."""
+    file = body_file(folder)["body"]
+    drawing = ("views=3", "height=32", "width=24", "texture_side=0", "topologies=[7k]")
+    counts = ("train=2", "validation=1", "test=1")
+    return (
+        "experiment=smplpix/quick",
+        f"data.body={file}",
+        *(f"data.{setting}" for setting in (*drawing, *counts)),
+        "metric=[psnr]",
+        "encoder.slim.widths=[8,8]",
+        "trainer.max_epochs=2",
+        "threads=1",
+        "logger=none",
+        "pictures=false",
+    )
+
+
+def test_images_are_predicted_loaded_frozen_served_and_trained_further(
+    framework: Framework, tmp_path: Path
+) -> None:
+    """From a user's coloured mesh to the picture, by every road the same one."""
+    done = framework(*people(tmp_path), folder="first")
+    assert done.code == 0, done.out
+    files = list(colored_meshes(tmp_path))
+    for file in files:
+        (tmp_path / "meshes").mkdir(exist_ok=True)
+        file.rename(tmp_path / "meshes" / file.name)
+    files = [tmp_path / "meshes" / file.name for file in files]
+    options = (f"mode.files={tmp_path / 'meshes'}", f"checkpoint={done.folder}", "logger=none")
+    predicted = framework("mode=predict", *options, folder="predicted")
+    assert predicted.code == 0, predicted.out
+    rows = (predicted.folder / "predictions.csv").read_text(encoding="utf-8").splitlines()
+    assert rows[0] == "sample,image,entropy_nats"
+    pictures = [np.asarray(Image.open(predicted.folder / row.split(",")[1])).astype(int) for row in rows[1:]]
+    assert len(pictures) == 2
+
+    model, frozen = package.load(done.folder), package.freeze(done.folder)
+    assert "predicts images: red, green, blue" in repr(model)
+    served = _load_pyfunc(str(done.folder / "checkpoints" / "model.ckpt")).answer(files)
+    with torch.no_grad():
+        for number, file in enumerate(files):
+            density = model(file)
+            assert density.event_shape == (32, 24, 3)
+            np.testing.assert_allclose(frozen(file), density.mean.numpy(), atol=1e-5)
+            wanted = eight_bit(light_of(density.mean[0])).numpy().astype(int)
+            answered = Image.open(BytesIO(base64.b64decode(served["png"][number])))
+            for picture in (pictures[number], np.asarray(answered).astype(int)):
+                assert np.abs(picture - wanted).max() <= 1
+
+    again = framework(
+        *people(tmp_path), f"checkpoint={done.folder}", "optimizer.learning_rate=1e-9", folder="further"
+    )
+    assert again.code == 0, again.out
+    assert "starting anew from the weights of" in again.out
+    results = [json.loads((one.folder / "results.json").read_text(encoding="utf-8")) for one in (done, again)]
+    assert results[1]["psnr_db"] == pytest.approx(results[0]["psnr_db"], abs=1e-2)
+    other = framework(
+        *people(tmp_path), "encoder.slim.widths=[8,16]", f"checkpoint={done.folder}", folder="other"
+    )
+    assert other.code == 1
+    assert "belongs to another model" in other.out
+    assert not (other.folder / "run.json").exists()
+
+
+def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: Path) -> None:
+    """A rasteriser has nothing to train; its one scale is fitted."""
+    run = [item for item in people(tmp_path) if not item.startswith(("experiment", "encoder"))]
+    done = framework("experiment=smplpix/rasterised", *run, folder="drawn")
+    assert done.code == 0, done.out
+    assert "epoch 1" not in done.out
+    results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+    assert results["psnr_db"] > 15
+    tested = framework("mode=test", f"checkpoint={done.folder}", "logger=none", folder="tested")
+    assert tested.code == 0, tested.out
+    refused = framework("experiment=smplpix/rasterised", *run, "objective=[random_features]", folder="no")
+    assert refused.code == 2
+    assert "Nothing in this model learns by gradient" in refused.out
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        ("uncertainty=[ensemble]", "uncertainty.ensemble.members=2"),
+        ("uncertainty=[temperature]",),
+        ("density_head.scale=pixel", "encoder.slim.scales=1", "uncertainty=[ensemble,temperature]"),
+    ],
+    ids=["ensemble", "temperature", "scales"],
+)
+def test_wrappers_and_objectives_work_on_images(framework: Framework, wrapped: tuple[str, ...]) -> None:
+    done = trained(framework, *wrapped, *RIVALS, "metric=[psnr,log_likelihood]", folder="wrapped")
+    results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+    assert np.isfinite(results["psnr_db"])
+    assert np.isfinite(results["log_likelihood"])
+    tested = framework("mode=test", f"checkpoint={done.folder}", "logger=none", folder="tested")
+    assert tested.code == 0, tested.out
+    again = json.loads((tested.folder / "results.json").read_text(encoding="utf-8"))
+    assert {name: again[name] for name in ("psnr_db", "log_likelihood")} == {
+        name: results[name] for name in ("psnr_db", "log_likelihood")
+    }
+
+
+def test_what_does_not_fit_an_image_gets_a_sentence(framework: Framework) -> None:
+    for wrong, wanted in (
+        (("encoder.slim.colors=1",), "gives 1×16×12 numbers, but LaplaceImageHead reads 576 as they are"),
+        (("density_head.scale=pixel",), "gives 3×16×12 numbers, but LaplaceImageHead reads 768 as they are"),
+        (("density_head=gaussian",), "describes targets of kind 'real', but this data set's are 'image'"),
+        (("metric=[rmse]",), "kind"),
+        (
+            ("data=dial", "encoder=[mlp]"),
+            "describes targets of kind 'image', but this data set's are 'angle'",
+        ),
+    ):
+        refused = framework(*SQUARES, *wrong, folder="refused")
+        assert refused.code == 2, refused.out
+        assert wanted in refused.out, (wrong, refused.out)
+        assert not (refused.folder / "run.json").exists(), wrong
