@@ -71,7 +71,7 @@ def pair(
     source[at[inside, 1].numpy(), at[inside, 0].numpy()] = values[
         inside
     ].numpy()  # in NumPy the last one stays
-    return torch.from_numpy(source).permute(2, 0, 1), target.permute(2, 0, 1)
+    return torch.from_numpy(source).permute(2, 0, 1).contiguous(), target.permute(2, 0, 1).contiguous()
 
 
 def pairs(size: tuple[int, int], seeds: range, points: int) -> tuple[Tensor, Tensor]:

@@ -194,10 +194,6 @@ def test_what_does_not_fit_an_image_gets_a_sentence(framework: Framework) -> Non
         (("density_head.scale=pixel",), "gives 3×16×12 numbers, but LaplaceImageHead reads 768 as they are"),
         (("density_head=gaussian",), "describes targets of kind 'real', but this data set's are 'image'"),
         (("metric=[rmse]",), "kind"),
-        (
-            ("data=dial", "encoder=[mlp]"),
-            "describes targets of kind 'image', but this data set's are 'angle'",
-        ),
     ):
         refused = framework(*SQUARES, *wrong, folder="refused")
         assert refused.code == 2, refused.out
