@@ -16,7 +16,8 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 
 WHITE = 6.0
-"""What an untrained head answers to an empty picture, before the sigmoid: white but for 0.6 of 255."""
+"""Colours are sigmoid(WHITE (1 + raw)): a raw 0 is white but for 0.6 of 255, -1 is grey, -2 black. An empty picture is
+white so from the start, also where training sees nothing far from a subject, and leaves it in steps of usual size."""
 
 
 class Box(NamedTuple):
@@ -125,7 +126,7 @@ class Canvas:
         return answers, Report(boxes, computed, left_out)
 
     def _colored(self, raw: Tensor) -> Tensor:
-        colors = raw[:, : self.colors].sigmoid()
+        colors = (WHITE + WHITE * raw[:, : self.colors]).sigmoid()
         return colors if raw.shape[1] == self.colors else torch.cat([colors, raw[:, self.colors :]], 1)
 
     def _kind(self, weight: Tensor) -> torch.dtype:
@@ -158,11 +159,10 @@ def subject(picture: Float[Tensor, "channels height width"], stride: int, margin
 
 
 def head(channels: int, size: int, colors: int, scales: int, places: int = 1) -> nn.Conv2d:
-    """From maps to colours and scales, each of so many places. An empty picture is white from the start: one that is
-    never trained on, as where all that is seen is near a subject, would else stay grey."""
+    """From maps to colours and scales, each of so many places; to an empty picture it answers 0 before training."""
     made = nn.Conv2d(channels, (colors + scales) * places, size)
     assert made.bias is not None
-    nn.init.constant_(made.bias[: colors * places], WHITE)
+    nn.init.zeros_(made.bias)
     return made
 
 

@@ -56,7 +56,7 @@ class Plain:
         around = kernel.shape[-1] // 2
         raw = functional.conv2d(padded(maps - white, 0 * white, around), kernel, self.state["head.bias"])
         raw = functional.pixel_shuffle(raw, 1 if self.name == "unet" else 2)[..., :height, :width]
-        return torch.cat([raw[:, :colors].sigmoid(), raw[:, colors:]], 1)
+        return torch.cat([(6 * (1 + raw[:, :colors])).sigmoid(), raw[:, colors:]], 1)
 
     def layer(self, maps, white):
         weight, mean, variance, gain, offset = (
@@ -193,6 +193,15 @@ def test_an_empty_ground_stays_empty_in_every_layer(name):
     side = made.canvas.shuffle
     assert torch.equal(answer, answer[..., :side, :side].repeat(1, 1, 21, 18)[..., :21, :18])
     assert torch.equal(made(torch.full((1, 4, 21, 18), 255, dtype=torch.uint8)), answer)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_an_untrained_network_sees_white_in_an_empty_picture(name):
+    torch.manual_seed(0)
+    made = build("encoder", resolve("encoder", {"name": name, "scales": 1}), input_shape=(4, 30, 20))
+    for answer in (made(torch.ones(2, 4, 30, 20)), made.eval()(torch.ones(2, 4, 30, 20))):
+        assert (answer[:, :3] - 1).abs().max() < 1 / 255
+        assert (answer[:, 3] == 0).all()
 
 
 @pytest.mark.parametrize("change", ["data", "load", "step", "swap"])

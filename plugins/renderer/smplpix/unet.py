@@ -64,7 +64,7 @@ class UNet(Encoder):
         normalisation: Normalisation = "renorm",
         colors: Annotated[int, Field(gt=0)] = 3,
         scales: Literal[0, 1, 3] = 0,
-        crop: Annotated[int, Field(ge=0)] | None = 24,
+        crop: Annotated[int, Field(ge=0)] | None = 32,
         precision: Precision = "float32",
     ) -> None:
         super().__init__()
