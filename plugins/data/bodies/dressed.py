@@ -23,7 +23,7 @@ from plugins.data.bodies.hair import Piece, hair, tied
 from plugins.data.bodies.hanging import hung
 from plugins.data.bodies.topologies import Sheet, edges, sheet
 
-FURTHEST = 0.045
+FURTHEST = 0.05
 """How far a registration may be from the bare body, metres."""
 STEPS, BLUR = 4, 3
 """Of a registration, and means over neighbours after each."""
