@@ -167,6 +167,26 @@ def test_a_subject_is_a_function_of_seed_split_and_number(tmp_path, monkeypatch)
             assert torch.equal(one[number]["target"], other[number]["target"])
     names = scan_layout.read_splits(more.folder)
     assert [len(some) for some in names.values()] == [3, 1, 2]
+    lively = prepared(posed=1.0).splits()
+    assert torch.equal(lively.train[0]["input"], few.splits().train[0]["input"])
+    assert not torch.equal(lively.test[0]["input"], few.splits().test[0]["input"])
+
+
+def test_a_topology_that_is_not_generated_is_told_before_anything_is_drawn():
+    with pytest.raises(ConfigError, match=r"data\.topology = 27k is not one of data\.topologies = \[7k\]"):
+        prepared(topology="27k")
+
+
+def test_a_renderer_that_smooths_edges_itself_draws_nearly_the_same():
+    """The light of a pixel is that of the subject alone, whatever else the pixel shows."""
+    corners = torch.tensor([[0.0, 0, 2], [0.3, 0.9, 2], [0.8, 0.1, 2.5]])
+    camera = Camera(torch.eye(3), torch.zeros(3), (40.0, 40.0), (2.0, 2.0), 24, 24)
+    scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.tensor([[0.2, 0.5, 0.9]]).expand(3, 3), camera)
+    smooth = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 3}))
+    one, other = (photographs.photographed(renderer, scene, [camera])[0] for renderer in (RENDERER, smooth))
+    assert np.abs(one.mask.astype(int) - other.mask).max() < 30
+    both = (one.mask > 0) & (other.mask > 0)
+    assert both.sum() > 50 and np.abs(one.pixels[both].astype(int) - other.pixels[both]).max() <= 1
 
 
 def test_skins_are_worn_in_one_split_each(tmp_path):
