@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torch.nn.functional import avg_pool2d
 from framework.geometry.camera import Camera
 from framework.geometry.light import eight_bit
 from framework.renderer import Renderer, Scene
+from plugins.data.bodies.scan_layout import Photograph
 
 SAMPLES = 4
 """Of a pixel along each axis."""
@@ -24,13 +24,6 @@ FOCAL = 1.25
 """Focal length in heights of the image."""
 MARGIN = 0.03
 """Share of the image's height and width that stays free on each side, at least."""
-
-
-class Photograph(NamedTuple):
-    """8-bit sRGB of the subject wherever the mask is above 0, and how much of each pixel is the subject."""
-
-    pixels: UInt8[np.ndarray, "height width 3"]
-    mask: UInt8[np.ndarray, "height width"]
 
 
 def rig(
