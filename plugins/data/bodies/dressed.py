@@ -1,7 +1,7 @@
 """A dressed person as a scanner sees one, and the smooth body registered to that scan.
 
-The scan has what photographs show: cloth with thickness and wrinkles, hair, light. The registration is the body with a
-part of the garments' thickness, blurred, and colours sampled from the scan: what a renderer gets (thesis §7.3.1).
+The scan has what photographs show: cloth with thickness and wrinkles, hair, light. The registration is the body, drawn
+smoothly towards the scan, with the colours of the scan's nearest points: what a renderer gets (thesis §7.3.1).
 """
 
 from dataclasses import dataclass

@@ -20,6 +20,8 @@ SAMPLES = 4
 """Of a pixel along each axis."""
 AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
 """Places of the rig: so many round the person, at each of these elevations in degrees."""
+TOGETHER = 4
+"""Photographs that are drawn at once; before they are pooled each takes some 30 MB."""
 FOCAL = 1.25
 """Focal length in heights of the image."""
 MARGIN = 0.03
@@ -81,7 +83,10 @@ def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) ->
     larger = [
         Scene(scene.vertices, scene.faces, _with_cover(scene.colors), _finer(camera)) for camera in cameras
     ]
-    return [_pooled(drawn["color"]) for drawn in renderer.batch(larger)]
+    found = []
+    for first in range(0, len(larger), TOGETHER):
+        found += [_pooled(drawn["color"]) for drawn in renderer.batch(larger[first : first + TOGETHER])]
+    return found
 
 
 def _with_cover(colors: Tensor | None) -> Float[Tensor, "vertices 4"]:

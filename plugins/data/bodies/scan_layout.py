@@ -294,6 +294,16 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
     return found
 
 
+def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of a subject's texture.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    with images.opened(root / "subjects" / name / "texture.png") as image:
+        return np.array(images.plain(image, 3, upright=False))
+
+
 def write_registration(file: Path, registration: Registration) -> None:
     """As binary PLY."""
     vertices = np.empty(len(registration.vertices), [("place", "<f4", 3), ("colour", "u1", 3)])

@@ -1,15 +1,21 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
-from framework.geometry.light import eight_bit, linear
-from framework.renderer import Scene
+from framework.geometry.light import eight_bit, encoded, linear
+from framework.renderer import Scene, Texture
+from framework.storage import cache
+from framework.testing.data_folders import damage
+from framework.testing.rows import DAMAGES
 from plugins.data.bodies import photographs, scan_generator, scan_layout, skins
 from plugins.data.bodies.dressed import ERROR, FURTHEST, Wardrobe
+from plugins.data.bodies.human_scans import photograph
 from plugins.data.bodies.people import chosen_body
 from plugins.data.bodies.rows import DOLL, SMALL
 
@@ -170,6 +176,50 @@ def test_a_subject_is_a_function_of_seed_split_and_number(tmp_path, monkeypatch)
     lively = prepared(posed=1.0).splits()
     assert torch.equal(lively.train[0]["input"], few.splits().train[0]["input"])
     assert not torch.equal(lively.test[0]["input"], few.splits().test[0]["input"])
+
+
+def test_the_default_body_is_photographed_with_what_textured_renderers_need(tmp_path, monkeypatch):
+    """From what is read the photograph can be drawn again: less well from fewer vertices, best with the texture."""
+    root = Path(cache.folder("body")).resolve()
+    (tmp_path / "body").symlink_to(root)
+    monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
+    size = {"height": 128, "width": 96, "views": 1, "train": 1, "validation": 1, "test": 1}
+    config = {"name": "human_scans", "renderer": "rasterizer", **size, "texture_side": 512}
+    found = build("data", resolve("data", config))
+    found.prepare()
+    smooth = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 4}))
+    errors = []
+    for topology in ("7k", "27k"):
+        subject = scan_layout.read_subject(found.folder, "test_0000", topology)
+        places = scan_layout.read_places(found.folder, topology)
+        mesh, camera = subject.registration, subject.views[0].camera
+        assert np.array_equal(places.faces, mesh.faces)
+        texture = linear(torch.from_numpy(scan_layout.read_texture(found.folder, "test_0000")))
+        light, cover = photograph(subject.views[0])
+        ones = torch.ones(len(mesh.vertices), 1)
+        shares = smooth(Scene(mesh.vertices, mesh.faces, ones, camera))["color"]
+        shown = Texture((texture,), torch.from_numpy(places.uv), torch.from_numpy(places.uv_faces))
+        for scene in (
+            Scene(mesh.vertices, mesh.faces, linear(mesh.colors), camera),
+            Scene(mesh.vertices, mesh.faces, None, camera, shown),
+        ):
+            drawn = encoded(smooth(scene)["color"] + 1 - shares)
+            errors.append(float((drawn - encoded(light))[cover > 0].square().mean()))
+    few, few_textured, many, many_textured = errors
+    assert 10**-3 < many < few < 10**-1.3
+    assert few_textured < few and many_textured < many
+    for read, file in (
+        (lambda: scan_layout.read_places(found.folder, "7k"), "topology_7k.npz"),
+        (lambda: scan_layout.read_texture(found.folder, "test_0000"), "subjects/test_0000/texture.png"),
+    ):
+        for kind in DAMAGES:
+            before = (found.folder / file).read_bytes()
+            damage(found.folder / file, kind)
+            with pytest.raises(DataError, match=Path(file).name):
+                read()
+            if (found.folder / file).is_dir():
+                (found.folder / file).rmdir()
+            (found.folder / file).write_bytes(before)
 
 
 def test_a_topology_that_is_not_generated_is_told_before_anything_is_drawn():
