@@ -50,8 +50,8 @@ class Body:
     joint_shapes: Float[np.ndarray, "_joint 3 _shape"]
     pose_shapes: Float[np.ndarray, "_vertex 3 _feature"] | None = None
     names: tuple[str, ...] = ()
-    uv: Float[np.ndarray, "place 2"] | None = None
-    uv_faces: Int[np.ndarray, "face 3"] | None = None
+    uv: Float[np.ndarray, "_place 2"] | None = None
+    uv_faces: Int[np.ndarray, "_face 3"] | None = None
 
     def __post_init__(self) -> None:
         vertices, joints, shapes = len(self.template), len(self.parents), self.shapes.shape[-1]

@@ -1,7 +1,7 @@
 """A dressed person as a scanner sees one, and the smooth body registered to that scan.
 
-The scan has what photographs show: cloth with thickness and wrinkles, hair, light. The registration is the body with a
-part of the garments' thickness, blurred, and colours sampled from the scan: what a renderer gets (thesis §7.3.1).
+The scan has what photographs show: cloth with thickness and wrinkles, hair, light. The registration is the body, drawn
+smoothly towards the scan, with the colours of the scan's nearest points: what a renderer gets (thesis §7.3.1).
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from plugins.data.bodies.hair import Piece, hair, tied
 from plugins.data.bodies.hanging import hung
 from plugins.data.bodies.topologies import Sheet, edges, sheet
 
-FURTHEST = 0.045
+FURTHEST = 0.05
 """How far a registration may be from the bare body, metres."""
 STEPS, BLUR = 4, 3
 """Of a registration, and means over neighbours after each."""

@@ -59,7 +59,7 @@ def hair(body: Anatomy, random: Generator) -> Hair:
         "none": 0.0,
         "short": 0.012,
         "full": 0.03,
-        "round": 0.06,
+        "round": 0.045,
         "long": 0.028,
         "tail": 0.012,
         "bun": 0.012,

@@ -62,7 +62,7 @@ class HumanScans(Data):
 
     Raises:
         DataError: a file is missing or damaged, images differ in size, meshes in their number of vertices.
-        ConfigError: the renderer draws no colours.
+        ConfigError: the renderer draws no colours; a topology that is not generated.
     """
 
     bibtex = """@inproceedings{prokudin2021smplpix,
@@ -92,9 +92,9 @@ class HumanScans(Data):
         drawing: Drawing,
         data_seed: Seed = 0,
     ) -> None:
-        if not {"color", "mask"} <= renderer.channels:
+        if "color" not in renderer.channels:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} draws no color with a mask; choose another renderer."
+                f"data.renderer = {type(renderer).__name__} draws no color; choose another renderer."
             )
         self.renderer = renderer
         self.root = root
@@ -106,6 +106,11 @@ class HumanScans(Data):
 
     def prepare(self) -> None:
         if self.root is None:
+            if self.topology not in self.drawing.topologies:
+                raise ConfigError(
+                    f"data.topology = {self.topology} is not one of data.topologies = "
+                    f"[{', '.join(self.drawing.topologies)}], which are generated. Name it there too."
+                )
             root = scans_root(self.renderer, self.counts, self.drawing, self.data_seed)
         else:
             root = Path(self.root).expanduser()

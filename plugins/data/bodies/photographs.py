@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,22 +14,18 @@ from torch.nn.functional import avg_pool2d
 from framework.geometry.camera import Camera
 from framework.geometry.light import eight_bit
 from framework.renderer import Renderer, Scene
+from plugins.data.bodies.scan_layout import Photograph
 
 SAMPLES = 4
 """Of a pixel along each axis."""
 AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
 """Places of the rig: so many round the person, at each of these elevations in degrees."""
+TOGETHER = 4
+"""Photographs that are drawn at once; before they are pooled each takes some 30 MB."""
 FOCAL = 1.25
 """Focal length in heights of the image."""
 MARGIN = 0.03
 """Share of the image's height and width that stays free on each side, at least."""
-
-
-class Photograph(NamedTuple):
-    """8-bit sRGB of the subject wherever the mask is above 0, and how much of each pixel is the subject."""
-
-    pixels: UInt8[np.ndarray, "height width 3"]
-    mask: UInt8[np.ndarray, "height width"]
 
 
 def rig(
@@ -83,9 +78,21 @@ def _camera(
 
 
 def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) -> list[Photograph]:
-    """The scene from each camera, every pixel the mean light of SAMPLES² points that lie on the subject."""
-    larger = [Scene(scene.vertices, scene.faces, scene.colors, _finer(camera)) for camera in cameras]
-    return [_pooled(drawn) for drawn in renderer.batch(larger, ("color", "mask"))]
+    """The scene, whose colours are red, green and blue, from each camera; every pixel the mean light of SAMPLES² points
+    that lie on the subject."""
+    larger = [
+        Scene(scene.vertices, scene.faces, _with_cover(scene.colors), _finer(camera)) for camera in cameras
+    ]
+    found = []
+    for first in range(0, len(larger), TOGETHER):
+        found += [_pooled(drawn["color"]) for drawn in renderer.batch(larger[first : first + TOGETHER])]
+    return found
+
+
+def _with_cover(colors: Tensor | None) -> Float[Tensor, "vertices 4"]:
+    """A fourth channel of ones: what is drawn of it is how much of a pixel is the subject."""
+    assert colors is not None
+    return torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
 
 
 def _finer(camera: Camera) -> Camera:
@@ -102,11 +109,12 @@ def _finer(camera: Camera) -> Camera:
     )
 
 
-def _pooled(drawn: dict[str, Tensor]) -> Photograph:
-    covered = drawn["mask"].float()
-    light = avg_pool2d((drawn["color"] * covered[..., None]).movedim(-1, 0)[None], SAMPLES)[0].movedim(0, -1)
-    cover = avg_pool2d(covered[None, None], SAMPLES)[0, 0]
-    light = torch.where(cover[..., None] > 0, light / cover.clamp(min=1e-6)[..., None], 0.5)  # a grey studio
+def _pooled(drawn: Float[Tensor, "height width 4"]) -> Photograph:
+    found = avg_pool2d(drawn.movedim(-1, 0)[None], SAMPLES)[0].movedim(0, -1)
+    cover = found[..., 3]
+    light = torch.where(
+        cover[..., None] > 0, found[..., :3] / cover.clamp(min=1e-6)[..., None], 0.5
+    )  # a grey studio
     return Photograph(eight_bit(light).numpy(), (cover * 255).round().byte().numpy())
 
 
@@ -120,9 +128,8 @@ def texture(
     """A square texture from linear light at places, v upwards; what no triangle covers is as what lies nearest."""
     place = np.stack([uv[:, 0] * side - 0.5, (1 - uv[:, 1]) * side - 0.5, np.ones(len(uv))], 1)
     camera = Camera(torch.eye(3), torch.zeros(3), (1.0, 1.0), (0.0, 0.0), side, side)
-    scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), colors, camera)
-    drawn = renderer(scene, ("color", "mask"))
-    outside = ~drawn["mask"].numpy()
-    nearest = np.asarray(distance_transform_edt(outside, return_distances=False, return_indices=True))
-    row, column = nearest
-    return eight_bit(drawn["color"]).numpy()[row, column]
+    scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), _with_cover(colors), camera)
+    drawn = renderer(scene)["color"]
+    outside = (drawn[..., 3] == 0).numpy()
+    row, column = np.asarray(distance_transform_edt(outside, return_distances=False, return_indices=True))
+    return eight_bit(drawn[..., :3] / drawn[..., 3:].clamp(min=1e-6)).numpy()[row, column]

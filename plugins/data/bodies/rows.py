@@ -180,7 +180,7 @@ ROWS = {
             synthetic=True,
             files=colored_meshes,
             fragile={"doll.npz": DAMAGES},
-            changes={"data_seed": 1, "test": 3, "views": 3, "width": 20, "posed": 1.0},
+            changes={"data_seed": 1, "test": 3, "views": 3, "width": 20},
         ),
         DataRow(
             "six people",

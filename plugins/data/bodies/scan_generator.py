@@ -21,7 +21,7 @@ from framework.storage.generated import draw_all, generated
 from plugins.data.bodies import poses, scan_layout, skins
 from plugins.data.bodies.dressed import Wardrobe
 from plugins.data.bodies.people import adults, chosen_body
-from plugins.data.bodies.photographs import Photograph, photographed, rig, texture
+from plugins.data.bodies.photographs import photographed, rig, texture
 from plugins.data.bodies.scan_layout import Registration
 from plugins.data.bodies.topologies import Name, topology
 
@@ -116,8 +116,6 @@ class Crowd:
             skin = skins.read(some[int(random.integers(len(some)))])
         scan, registered = self.wardrobe.dress(self._posed(split, random), skin, random)
         views = rig(scan.vertices, self.drawing.views, (self.drawing.height, self.drawing.width), random)
-        names = [f"{view:03}" for view in range(len(views))]
-        scan_layout.write_cameras(folder / "cameras.json", dict(zip(names, views, strict=True)))
         for name, mesh in self.meshes.items():
             scan_layout.write_registration(
                 folder / f"registration_{name}.ply",
@@ -133,10 +131,7 @@ class Crowd:
             torch.from_numpy(scan.colors).float(),
             views[0],
         )
-        for kind in ("images", "masks"):
-            (folder / kind).mkdir()
-        for name, one in zip(names, photographed(self.renderer, scene, views), strict=True):
-            _save(folder, name, one)
+        scan_layout.write_views(folder, views, photographed(self.renderer, scene, views))
         if self.drawing.texture_side and self.wardrobe.uv is not None:
             faces = self.wardrobe.sheet.corners[-1].uv_faces
             colors = linear(torch.from_numpy(registered.colors[self.wardrobe.vertex_of_place]))
@@ -163,11 +158,6 @@ def a_pose(random: Generator) -> Float[np.ndarray, "1 movement"]:
     usual, spread, least, most = np.array(ranges, float).T
     usual = np.where(np.char.endswith(np.array(poses.MOVEMENTS), "raise"), RAISED, usual)
     return (usual + CALM * spread * random.normal(size=len(usual))).clip(least, most)[None]
-
-
-def _save(folder: Path, name: str, photograph: Photograph) -> None:
-    Image.fromarray(photograph.pixels).save(folder / "images" / f"{name}.png", compress_level=4)
-    Image.fromarray(photograph.mask).save(folder / "masks" / f"{name}.png", compress_level=4)
 
 
 def _name(split: str, number: int) -> str:

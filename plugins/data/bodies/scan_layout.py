@@ -17,7 +17,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -77,6 +77,13 @@ class TexturePlaces:
     faces: Int[np.ndarray, "faces 3"]
     uv: Float[np.ndarray, "places 2"]
     uv_faces: Int[np.ndarray, "_faces 3"]
+
+
+class Photograph(NamedTuple):
+    """8-bit sRGB of the subject wherever the mask is above 0, and how much of each pixel is the subject."""
+
+    pixels: UInt8[np.ndarray, "height width 3"]
+    mask: UInt8[np.ndarray, "height width"]
 
 
 def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
@@ -253,9 +260,7 @@ def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
         )
 
 
-def read_photograph(
-    view: View,
-) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
+def read_photograph(view: View) -> Photograph:
     """Pixels and mask of a view.
 
     Raises:
@@ -266,7 +271,7 @@ def read_photograph(
         with images.opened(file) as image:
             _check_size(file, image, view.camera)
             found.append(np.array(images.plain(image, channels, upright=False)))
-    return found[0], found[1]
+    return Photograph(*found)
 
 
 def read_places(root: Path, topology: str) -> TexturePlaces:
@@ -287,6 +292,16 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
         if not fits or found.uv_faces.min() < 0 or found.uv_faces.max() >= len(found.uv):
             raise ValueError("uv_faces do not fit faces and uv")
     return found
+
+
+def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Pixels of a subject's texture.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    with images.opened(root / "subjects" / name / "texture.png") as image:
+        return np.array(images.plain(image, 3, upright=False))
 
 
 def write_registration(file: Path, registration: Registration) -> None:
@@ -327,6 +342,17 @@ def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:
         raise ValueError("a camera has numbers that are not finite; wanted finite ones.")
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps({"views": views}, indent=1) + "\n", encoding="utf-8")
+
+
+def write_views(folder: Path, cameras: Sequence[Camera], photographs: Sequence[Photograph]) -> None:
+    """Cameras, images and masks of a subject; views are called 000, 001 and so on."""
+    names = [f"{view:03}" for view in range(len(cameras))]
+    write_cameras(folder / "cameras.json", dict(zip(names, cameras, strict=True)))
+    for kind in ("images", "masks"):
+        (folder / kind).mkdir()
+    for name, one in zip(names, photographs, strict=True):
+        Image.fromarray(one.pixels).save(folder / "images" / f"{name}.png", compress_level=4)
+        Image.fromarray(one.mask).save(folder / "masks" / f"{name}.png", compress_level=4)
 
 
 def write_splits(root: Path, names: Mapping[str, Sequence[str]]) -> None:

@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,6 +38,33 @@ def test_it_stands_upright_faces_the_front_and_has_two_sides(found):
     assert 0.01 < volume < 0.2
 
 
+def test_it_has_places_in_a_texture_with_seams(found):
+    body, _ = found
+    assert body.uv.shape == (21_334, 2) and body.uv_faces.shape == body.faces.shape
+    assert body.uv.min() > 0 and body.uv.max() < 1
+    pairs = np.unique(np.stack([body.faces.ravel(), body.uv_faces.ravel()]), axis=1)
+    # a place belongs to one vertex, and few vertices lie on a seam
+    assert len(np.unique(pairs[1])) == pairs.shape[1]
+    assert 1.02 < pairs.shape[1] / len(body.template) < 1.2
+    # hands lie apart from the face: a skin's v upwards puts hands and feet low
+    face, hands = (
+        body.uv[pairs[1][body.weights[pairs[0]][:, joints].sum(1) > 0.9]] for joints in _joints(body)
+    )
+    assert face[:, 0].mean() > 0.6 and np.abs(face[:, 1] - 0.5).mean() < 0.3
+    assert hands[:, 1].max() < 0.35
+    for wrong in ({"uv": body.uv[:50]}, {"uv": body.uv * np.nan}, {"uv_faces": body.uv_faces[:9]}):
+        with pytest.raises(DataError, match="do not fit 27420 faces"):
+            replace(body, **wrong)
+
+
+def _joints(body):
+    """Of the head, and of the fingers."""
+    return [
+        [number for number, name in enumerate(body.names) if name.startswith(words)]
+        for words in (("head", "eye"), ("finger",))
+    ]
+
+
 def test_traits_do_what_they_are_called(found):
     body, traits = found
     model = BodyModel(body)
@@ -55,7 +83,7 @@ def test_traits_do_what_they_are_called(found):
 def test_it_comes_from_the_cache_the_second_time(found, monkeypatch):
     monkeypatch.setattr(default_body, "_write", lambda folder: pytest.fail("extracted twice"))
     again = default_body.default_body()
-    for name in ("template", "weights", "shapes", "joint_shapes"):
+    for name in ("template", "weights", "shapes", "joint_shapes", "uv", "uv_faces"):
         assert np.array_equal(getattr(again[0], name), getattr(found[0], name))
 
 
