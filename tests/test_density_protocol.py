@@ -42,6 +42,7 @@ from framework.distributions.protocol import (
 )
 from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
+from framework.geometry.light import light_of
 from framework.model import Model
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
@@ -89,7 +90,7 @@ class Made:
         }
         if self.target.kind == "real":
             found["moved there and back"] = there_and_back(first)
-        else:
+        elif self.target.kind != "image":
             found["floored"] = floored(first, self.target)
         if self.one_turn and not self.slow:
             found["power"] = CircularPower(first, WARM)
@@ -210,7 +211,8 @@ def everywhere(density: Distribution, value: Tensor, index: int | None = None) -
 
 
 def event(made: Made) -> range:
-    return range(made.parts[0].event_shape[0]) if made.parts[0].event_shape else range(0)
+    """Places of the target's numbers, each of which has a marginal; an image is asked as a whole."""
+    return range(made.parts[0].event_shape[0] if made.target.kind in ("angle", "real") else 0)
 
 
 def ids(rows) -> Iterator[str]:
@@ -229,6 +231,24 @@ def shown_or_refused(part: Distribution, density: Distribution) -> None:
     assert all(one.shape[: len(density.batch_shape)] == density.batch_shape for one in found.values())
 
 
+def pictured(kind: str, made: Made, density: Distribution) -> None:
+    """An image over every structure: the light of one density's mean, of several the mean of theirs."""
+    found = images(density, {"color"})["color"]
+    parts = torch.stack([light_of(part.mean) for part in made.parts], -1)
+    wanted = parts[..., 0] if kind in ("itself", "with a set", "mixture of one") else None
+    if kind == "stacked":
+        wanted = torch.stack([light_of(part.mean) for part in made.parts], 1)
+    elif kind == "reshaped":
+        wanted = parts[..., 0].reshape(2, 2, *made.parts[0].event_shape)
+    elif kind in ("mixture", "tempered"):
+        weights = density.log_weights.exp() if kind == "tempered" else share(made.weights)
+        wanted = (parts * weights[:, None, None, None]).sum(-1)
+    assert found.shape == (*density.batch_shape, *density.event_shape)
+    assert wanted is not None or kind in ("mixture of a fold", "mixture of mixtures")
+    if wanted is not None:
+        close(found, wanted)
+
+
 @pytest.mark.parametrize("name, row", ROWS, ids=ids(ROWS))
 def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow) -> None:
     with torch.no_grad():
@@ -243,7 +263,9 @@ def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow
             shown_or_refused(made.parts[0], density)
             bounds(made, density, value)
             never_silently_exact(density, theirs[kind], value)
-            if row.target.kind != "class":
+            if row.target.kind == "image":
+                pictured(kind, made, density)
+            elif row.target.kind != "class":
                 here = marginal(density, 0)
                 assert tuple(here.event_shape) == (1,)
                 other = marginal(theirs[kind], 0)
@@ -428,6 +450,9 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
     """cdf, arc, normals, mahalanobis and moments of one number: as of the parts, or None as of them."""
     if made.target.kind == "class":
         return
+    if made.target.kind == "image":
+        moments(kind, made, density)
+        return
     one, at = marginal(density, 0), value[..., :1]
     if one is density and kind == "with a set":
         one = marginal(density.components, 0)  # that of a latent-variable density is of its mixture
@@ -471,21 +496,21 @@ def moments(kind: str, made: Made, density: Distribution) -> None:
         return
 
     def mixed(weights: Tensor, number: Tensor) -> Tensor:
-        return (share(weights).unsqueeze(-1) * number).sum(1)
+        return (share(weights).reshape(*weights.shape, *[1] * (number.dim() - 2)) * number).sum(1)
 
     def of(number: Tensor) -> Tensor:
         match kind:
             case "stacked":
                 return number
             case "reshaped":
-                return number[:, 0].reshape(2, 2, -1)
+                return number[:, 0].unflatten(0, (2, 2))
             case "mixture":
                 return mixed(made.weights, number)
             case "mixture of mixtures":
                 inner = torch.stack([mixed(made.weights, number), number[:, 1]], 1)
                 return mixed(made.weights[:, :2], inner)
             case "mixture of a fold":
-                return mixed(made.weights[:2, :2], number[:, 0].reshape(2, 2, -1))
+                return mixed(made.weights[:2, :2], number[:, 0].unflatten(0, (2, 2)))
         return number[:, 0]
 
     if kind != "tempered":  # a density of its own

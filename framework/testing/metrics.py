@@ -95,6 +95,11 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
     return Cardioid(take(density.location, index))
 
 
+def numbers_about(target: Target) -> int:
+    """How many numbers `density_about` reads."""
+    return len(target.names) if target.kind == "class" else math.prod(target.event_shape)
+
+
 def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) -> Distribution:
     """The simplest density of the target's kind about a place (*batch, number); for classes their logits.
 

@@ -1,7 +1,6 @@
 """The contract of an objective: one function a property, each reporting the worst case it saw."""
 
 import copy
-import math
 from collections.abc import Callable, Iterable, Iterator
 
 import torch
@@ -16,7 +15,7 @@ from framework.objective import Objective
 from framework.target import Target
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
-from framework.testing.metrics import density_about
+from framework.testing.metrics import density_about, numbers_about
 from framework.testing.rows import ObjectiveRow
 from framework.testing.wrappers import LENGTH
 
@@ -34,7 +33,7 @@ class Network(nn.Module):
         self.first = nn.Linear(LENGTH, 8)
         self.norm = nn.BatchNorm1d(8)
         self.dropout = nn.Dropout(0.2)
-        self.last = nn.Linear(8, math.prod(target.event_shape) if target.event_shape else len(target.names))
+        self.last = nn.Linear(8, numbers_about(target))
         self.gain = 1.0
         """Of the raw numbers, to make them extreme."""
 

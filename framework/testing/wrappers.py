@@ -13,7 +13,7 @@ from framework.target import Target
 from framework.testing.densities import integral, samples_follow_log_prob
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
-from framework.testing.metrics import density_about
+from framework.testing.metrics import density_about, numbers_about
 from framework.testing.rows import WrapperRow
 from framework.uncertainty import Uncertainty
 
@@ -28,7 +28,7 @@ class Plain(Predictor):
         super().__init__()
         self.target = target
         self.dropout = nn.Dropout(0.1)  # for wrappers that need one
-        self.layer = nn.Linear(LENGTH, len(target.names))
+        self.layer = nn.Linear(LENGTH, numbers_about(target))
 
     def forward(self, inputs: Tensor) -> Distribution:
         return density_about(self.target, self.layer(self.dropout(inputs)))
