@@ -59,6 +59,7 @@ class Canvas:
         crop: margin around the subject's box, pixels; None: all is computed.
         precision: of evaluation, where weights are float32.
         shuffle: the head answers for squares of this side at once.
+        residual: whether colours are the input's first channels and what the network adds to them.
     """
 
     colors: int
@@ -66,6 +67,7 @@ class Canvas:
     crop: int | None
     precision: Precision
     shuffle: int = 1
+    residual: bool = False
 
     def painted(
         self,
@@ -96,13 +98,15 @@ class Canvas:
             height, width = pictures.shape[2:]
             whole = functional.pad(pictures.to(kind), (0, -width % self.stride, 0, -height % self.stride))
             raw = convolved(maps(whole, iter(steps)), head_weight, head_bias)
-            return self._colored(functional.pixel_shuffle(raw, self.shuffle)[..., :height, :width].to(weight))
+            answers = functional.pixel_shuffle(raw, self.shuffle)[..., :height, :width].to(weight)
+            return self._colored(answers, pictures)
 
         if training or self.crop is None:
             return answer(pictures), None
         empty = functional.pixel_shuffle(head_bias[None, :, None, None], self.shuffle)
         boxes = tuple(subject(picture, self.stride, self.crop) for picture in pictures)
-        return self._in_boxes(pictures, boxes, answer, self._colored(empty.to(weight)))
+        ground = pictures.new_zeros(1, pictures.shape[1], *empty.shape[2:])
+        return self._in_boxes(pictures, boxes, answer, self._colored(empty.to(weight), ground))
 
     def _in_boxes(
         self, pictures: Tensor, boxes: tuple[Box | None, ...], answer: Step, empty: Tensor
@@ -125,8 +129,13 @@ class Canvas:
             left_out -= found[0].numel()
         return answers, Report(boxes, computed, left_out)
 
-    def _colored(self, raw: Tensor) -> Tensor:
-        colors = (WHITE + WHITE * raw[:, : self.colors]).sigmoid()
+    def _colored(self, raw: Tensor, pictures: Tensor) -> Tensor:
+        """Of raw numbers and of what they answer to, as differences from the empty ground."""
+        if self.residual:
+            # a little beyond [0, 1] at times: cut off, what should be darker than its input could not be told so
+            colors = 1 + pictures[:, : self.colors] + raw[:, : self.colors]
+        else:
+            colors = (WHITE + WHITE * raw[:, : self.colors]).sigmoid()
         return colors if raw.shape[1] == self.colors else torch.cat([colors, raw[:, self.colors :]], 1)
 
     def _kind(self, weight: Tensor) -> torch.dtype:
@@ -158,23 +167,38 @@ def subject(picture: Float[Tensor, "channels height width"], stride: int, margin
     return Box(*ends)
 
 
-def head(channels: int, size: int, colors: int, scales: int, places: int = 1) -> nn.Conv2d:
-    """From maps to colours and scales, each of so many places; to an empty picture it answers 0 before training."""
+def head(
+    channels: int, size: int, colors: int, scales: int, places: int = 1, *, residual: bool = False
+) -> nn.Conv2d:
+    """From maps to colours and scales, each of so many places; to an empty picture it answers 0 before training, and
+    where it is `residual` to any."""
     made = nn.Conv2d(channels, (colors + scales) * places, size)
     assert made.bias is not None
     nn.init.zeros_(made.bias)
+    if residual:
+        nn.init.zeros_(made.weight)
     return made
 
 
-def require_pictures(name: str, input_shape: tuple[int, ...], normalisation: str, crop: int | None) -> None:
+def require_pictures(
+    name: str, input_shape: tuple[int, ...], normalisation: str, crop: int | None, least: int = 1
+) -> None:
     """
+    Args:
+        least: channels that the input has at least.
+
     Raises:
-        ConfigError: the input is no image, or crop and normalisation exclude each other.
+        ConfigError: the input is no image, or has too few channels, or crop and normalisation exclude each other.
     """
     if len(input_shape) != 3 or min(input_shape) < 1:
         raise ConfigError(
             f"{name} reads images of shape (channels, height, width), one pixel at least; this input has the shape "
             f"{input_shape}. Choose another encoder for it, or put one before it that makes an image."
+        )
+    if input_shape[0] < least:
+        raise ConfigError(
+            f"encoder.{name}.residual adds to {least} colours of its input, which has {input_shape[0]} channels. Set "
+            "residual=false, or put an encoder before it that draws colours."
         )
     if normalisation == "group" and crop is not None:
         raise ConfigError(

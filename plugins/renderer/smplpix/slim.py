@@ -28,7 +28,7 @@ class Slim(Encoder):
         input_shape: (channels, height, width), any size; other sizes than this one are read too.
         widths: channels of each level. Processors compute 16 at once: 24 cost as much as 32.
         unshuffle: side of a square, pixels.
-        normalisation, colors, scales, crop, precision: as of `unet.UNet`.
+        normalisation, colors, scales, crop, precision, residual: as of `unet.UNet`.
 
     Attributes:
         report: what evaluation computed of the last batch; None after training, and without crop.
@@ -60,9 +60,10 @@ class Slim(Encoder):
         scales: Literal[0, 1, 3] = 0,
         crop: Annotated[int, Field(ge=0)] | None = 24,
         precision: Precision = "float32",
+        residual: bool = False,
     ) -> None:
         super().__init__()
-        require_pictures("slim", input_shape, normalisation, crop)
+        require_pictures("slim", input_shape, normalisation, crop, colors if residual else 1)
         self.unshuffle = unshuffle
         self.levels = len(widths)
         first, places = widths[0], unshuffle**2
@@ -72,8 +73,10 @@ class Slim(Encoder):
         shapes += [(lower, upper, 3) for upper, lower in reversed(list(pairwise(widths)))]
         shapes += [(first, first, 3)]
         self.layers = nn.ModuleList(Layer(*shape, normalisation) for shape in shapes)
-        self.head = head(first, 3, colors, scales, places)
-        self.canvas = Canvas(colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle)
+        self.head = head(first, 3, colors, scales, places, residual=residual)
+        self.canvas = Canvas(
+            colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle, residual=residual
+        )
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 

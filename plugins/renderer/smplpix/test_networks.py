@@ -291,3 +291,22 @@ def test_the_reference_has_the_published_size():
     ]
     assert len(made.layers) == 2 * 5 + 3 * 4
     assert sum(parameter.numel() for parameter in made.parameters()) == pytest.approx(8.64e6, rel=0.01)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_residual_network_answers_its_input_until_it_has_learnt(name):
+    """White where nothing is, cropped or not; then what it adds is what the head says."""
+    config = resolve("encoder", {"name": name, **SMALL[name], "residual": True, "scales": 1})
+    made = build("encoder", config, input_shape=(4, 21, 18))
+    picture = pictures(2, (4, 21, 18), (5, 12, 3, 9), (0, 0, 0, 0))
+    for training in (True, False):
+        made.train(training)
+        with torch.no_grad():
+            found = made(picture)
+        torch.testing.assert_close(found[:, :3], picture[:, :3], rtol=0, atol=1e-6)
+        assert not found[:, 3].any()
+    with torch.no_grad():
+        made.head.bias.fill_(-0.25)
+        torch.testing.assert_close(made(picture)[:, :3], picture[:, :3] - 0.25)
+    with pytest.raises(ConfigError, match=r"residual adds to 3 colours of its input, which has 2 channels"):
+        build("encoder", config, input_shape=(2, 21, 18))

@@ -30,6 +30,8 @@ class UNet(Encoder):
         scales: further outputs, any real number: logarithms of scales.
         crop: margin, pixels, around the subject's box to which evaluation keeps; None computes all.
         precision: of evaluation; `auto` is bfloat16 where the processor is made for it.
+        residual: the input's first `colors` channels are colours, to which the network adds: before training the answer
+            is the input. For rasterised meshes; colours may then lie a little beyond [0, 1].
 
     Attributes:
         report: what evaluation computed of the last batch; None after training, and without crop.
@@ -66,9 +68,10 @@ class UNet(Encoder):
         scales: Literal[0, 1, 3] = 0,
         crop: Annotated[int, Field(ge=0)] | None = 32,
         precision: Precision = "float32",
+        residual: bool = False,
     ) -> None:
         super().__init__()
-        require_pictures("unet", input_shape, normalisation, crop)
+        require_pictures("unet", input_shape, normalisation, crop, colors if residual else 1)
         self.levels = levels
         widths = [width * 2**level for level in range(levels)]
         sides: list[tuple[int, int]] = []
@@ -80,8 +83,8 @@ class UNet(Encoder):
             sides += [(before, after), (2 * after, after), (after, after)]
             before = after
         self.layers = nn.ModuleList(Layer(*pair, 3, normalisation) for pair in sides)
-        self.head = head(width, 1, colors, scales)
-        self.canvas = Canvas(colors, 2 ** (levels - 1), crop, precision)
+        self.head = head(width, 1, colors, scales, residual=residual)
+        self.canvas = Canvas(colors, 2 ** (levels - 1), crop, precision, residual=residual)
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
