@@ -69,6 +69,7 @@ class HumanScans(Data):
   title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
   author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
   booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
+  pages = {1810--1819},
   year = {2021}
 }
 @inproceedings{bregier2026anny,

@@ -45,9 +45,9 @@ class Rasterised(Encoder):
 
     fixed = True
     bibtex = """@inproceedings{kato2018neural,
-  title = {Neural {3D} Mesh Renderer},
   author = {Kato, Hiroharu and Ushiku, Yoshitaka and Harada, Tatsuya},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
+  title = {Neural {3D} mesh renderer},
+  booktitle = {Conference on Computer Vision and Pattern Recognition},
   year = {2018}
 }"""
     faces: Tensor

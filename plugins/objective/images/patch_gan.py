@@ -16,12 +16,12 @@ from plugins.objective.images.predicted import predicted_images
 
 
 class PatchGAN(Objective):
-    """Discriminators learn to tell predicted images from true ones, patch by patch and at several scales, and the
-    predictor learns to be taken for true: κ L_GAN + γ L_FM of thesis eq. 7.6, as in Wang et al. 2018, §3.2-3.3.
+    """Discriminators learn to tell predicted images from true ones, and the predictor to be taken for true.
 
-    Judgements are compared by least squares (Mao et al. 2017, eq. 9): the discriminators minimise
-    ½ E (D(y) - 1)² + ½ E D(x)², the predictor E (D(x) - 1)², and L_FM is the mean L1 distance of the discriminators'
-    features of x and y. The discriminators are a `Rival`; what is logged as "discriminator" is theirs.
+    The penalty is κ L_GAN + γ L_FM of thesis eq. 7.6, on patches, at several scales as in Wang et al. 2018, §3.2-3.3.
+    Judgements are compared by least squares (Mao et al. 2017, eq. 9): the discriminators minimise ½ E (D(y) - 1)² +
+    ½ E D(x)², the predictor E (D(x) - 1)², and L_FM is the mean L1 distance of the discriminators' features of x and y.
+    The discriminators are a `Rival`; what is logged as "discriminator" is theirs.
 
     Args:
         weight: κ, of which the discriminators' own loss is multiplied as well: their optimiser does not see it.

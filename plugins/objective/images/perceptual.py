@@ -132,8 +132,9 @@ class Perceptual(FeatureDistance):
 
 
 class RandomFeatures(FeatureDistance):
-    """Distance of features of a convolutional network with random weights: edges and textures of many scales, without
-    anything learned about images. It is no perceptual loss, and is never called one.
+    """Distance of features of a convolutional network with random weights: edges and textures of many scales.
+
+    Nothing in it was learned about images: it is no perceptual loss, and is never called one.
 
     Args:
         weight: factor.

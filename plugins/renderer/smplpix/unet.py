@@ -41,11 +41,11 @@ class UNet(Encoder):
     """
 
     bibtex = """@inproceedings{prokudin2021smplpix,
-  author    = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
-  title     = {{SMPLpix}: Neural Avatars from {3D} Human Models},
-  booktitle = {IEEE Winter Conference on Applications of Computer Vision (WACV)},
-  pages     = {1810--1819},
-  year      = {2021}
+  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
+  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
+  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
+  pages = {1810--1819},
+  year = {2021}
 }
 @inproceedings{ronneberger2015unet,
   author    = {Ronneberger, Olaf and Fischer, Philipp and Brox, Thomas},
