@@ -80,7 +80,8 @@ class Frozen:
             self._read(self.shape)
 
     def __call__(self, inputs: Any) -> np.ndarray:
-        """Of a model of classes their probabilities, (batch, class); else the point prediction, (batch, number).
+        """Of a model of classes their probabilities, (batch, class); of images their mean, (batch, height, width,
+        number), for no draws of a mixture of them show a picture; else the point prediction, (batch, number).
 
         Args:
             inputs: what `framework.load`'s model takes; of a predictor that was frozen by itself its inputs, with the
@@ -102,7 +103,7 @@ class Frozen:
             density = self._density(features, network)
             if density.has_enumerate_support and not density.event_shape:
                 return class_probabilities(density).to(self.dtype).numpy()
-            found = median(density, 1000)
+            found = density.mean if len(density.event_shape) == 3 else median(density, 1000)
             return (found if frame is None else frame.location + frame.scale * found).numpy()
 
     @torch.no_grad()  # not in inference mode: whoever asks the density later is outside of it

@@ -49,6 +49,8 @@ __all__ = [
 circular_entropy = entropy_of_one
 CHUNK = 2**20
 """Component densities evaluated at once without gradient, when one density is asked at many points."""
+LARGEST = 2**26
+"""Numbers of their values, likewise: an image has a hundred thousand."""
 
 CROSSED = 16
 """Most components of which every two are looked at together for the mode."""
@@ -98,7 +100,8 @@ class Mixture(Distribution):
         """Values (*sample, *batch, *event), split along the first dimension where all at once would fill the memory: a
         grid of angles on many samples of many components."""
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
-        rows = max(1, CHUNK // max(1, self.log_weights.numel()))
+        components = max(1, self.log_weights.numel())
+        rows = max(1, min(CHUNK // components, LARGEST // (components * max(1, self.event_shape.numel()))))
         if extra > 0 and value.shape[0] > rows and not torch.is_grad_enabled():
             return value.split(rows)
         return [value]
@@ -181,13 +184,18 @@ class Mixture(Distribution):
         if has_range(self):
             return entropy_of_one(self)
         each = max(2, 1024 // count)
-        drawn = self.components.sample(torch.Size((each,)))
-        values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
-        surprise = -self.log_prob(values).unflatten(0, (each, count)).movedim(
-            1, -1
-        ) + self.components.log_prob(drawn)
+        size = self.log_weights.numel() * self.event_shape.numel()
+        at_once = max(1, LARGEST // max(1, size))
+        surprise = torch.cat([self._surprise(min(at_once, each - done)) for done in range(0, each, at_once)])
         found = self.components.entropy() + surprise.mean(0)
         return (self.log_weights.exp() * found).sum(-1)
+
+    def _surprise(self, draws: int) -> Tensor:
+        """log p_k - log f at so many draws of each component, (draw, *batch, component)."""
+        drawn = self.components.sample(torch.Size((draws,)))
+        values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
+        mixed = self.log_prob(values).unflatten(0, (draws, self.log_weights.shape[-1])).movedim(1, -1)
+        return self.components.log_prob(drawn) - mixed
 
 
 def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:

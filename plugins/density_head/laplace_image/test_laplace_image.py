@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.distributions import Independent, Laplace
 
+from framework.distributions import density as density_module
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import images, median, pick
 from framework.distributions.tempering import temper
@@ -100,3 +101,26 @@ def test_other_targets_are_refused() -> None:
 def test_light_and_numbers_are_inverse() -> None:
     numbers = torch.linspace(0, 1, 1001, dtype=torch.float64)
     torch.testing.assert_close(encoded(light_of(numbers)), numbers, rtol=0, atol=1e-6)
+
+
+def test_the_entropy_of_members_of_large_images_is_drawn_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Never more numbers at once than the bound; far apart it is the mean entropy and that of the choice."""
+    members = LaplaceImage(
+        torch.tensor([0.0, 50.0]).double().reshape(1, 2, 1, 1, 1).expand(1, 2, 20, 20, 3),
+        torch.tensor(0.1).double(),
+    )
+    whole = Mixture(torch.zeros(1, 2).double(), members)
+    largest: list[int] = []
+    sample = LaplaceImage.sample
+
+    def counted(self: LaplaceImage, shape: torch.Size) -> torch.Tensor:
+        largest.append(shape.numel() * self.location.numel())
+        return sample(self, shape)
+
+    monkeypatch.setattr(LaplaceImage, "sample", counted)
+    monkeypatch.setattr(density_module, "LARGEST", 10_000)
+    with torch.no_grad():
+        found = whole.entropy()
+    assert len(largest) > 100
+    assert max(largest) <= 10_000
+    torch.testing.assert_close(found, members.entropy().mean(1) + torch.tensor(2.0).double().log())

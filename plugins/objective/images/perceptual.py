@@ -1,7 +1,7 @@
 """Distances of predicted and true images in the features of a network."""
 
 from abc import abstractmethod
-from collections import OrderedDict
+from hashlib import sha256
 from typing import Annotated
 
 import torch
@@ -34,7 +34,7 @@ class FeatureDistance(Objective):
         self.weight = weight
         self.network = network
         self.most = cache * 2**20
-        self.kept: OrderedDict[bytes, list[Tensor]] = OrderedDict()
+        self.kept: dict[bytes, list[Tensor]] = {}
         self.bytes = 0
 
     @property
@@ -61,14 +61,13 @@ class FeatureDistance(Objective):
     def _features(self, true: Float[Tensor, "batch height width number"]) -> list[Tensor]:
         if not self.most:
             return self.network(true.movedim(-1, 1))
-        names = [f"{image.dtype}".encode() + image.cpu().numpy().tobytes() for image in true]
-        keys = [hash(name).to_bytes(8, "little", signed=True) for name in names]
+        keys = [sha256(image.cpu().numpy().tobytes()).digest() for image in true]
         new = [row for row, key in enumerate(keys) if key not in self.kept]
         rows = {}
         if new:
             found = self.network(true[new].movedim(-1, 1))
             rows = {keys[row]: [level[place] for level in found] for place, row in enumerate(new)}
-        every = [rows[key] if key in rows else self._again(key) for key in keys]
+        every = [rows[key] if key in rows else self.kept[key] for key in keys]
         for key, features in rows.items():
             self._keep(key, features)
         return (
@@ -76,10 +75,6 @@ class FeatureDistance(Objective):
             if every
             else self.network(true.movedim(-1, 1))
         )
-
-    def _again(self, key: bytes) -> list[Tensor]:
-        self.kept.move_to_end(key)
-        return self.kept[key]
 
     def _keep(self, key: bytes, features: list[Tensor]) -> None:
         size = sum(level.nbytes for level in features)
