@@ -17,6 +17,20 @@ from framework.errors import DataError
 from framework.target import Target
 
 
+class Signal:
+    """Sends this process a signal at one of its training batches, unless a file says that it was sent already."""
+
+    def __init__(self, at: int | None, number: int, marker: str) -> None:
+        self.at, self.number, self.marker = at, number, Path(marker)
+        self.batches = 0
+
+    def count(self) -> None:
+        self.batches += 1
+        if self.batches == self.at and not self.marker.exists():
+            self.marker.touch()
+            os.kill(os.getpid(), self.number)
+
+
 class Dial(Data):
     """Two numbers, the noisy tip of a needle, from which its angle is to be read (synthetic)."""
 
@@ -36,11 +50,8 @@ class Dial(Data):
         self.samples = samples
         self.noise = noise
         self.bad_label = bad_label
-        self.signal_at = signal_at
-        self.signal_number = signal_number
-        self.signal_marker = Path(signal_marker)
+        self.signal = Signal(signal_at, signal_number, signal_marker)
         self.longest_file = longest_file
-        self.batches = 0
         self.target = Target("angle", ("needle",))
         self.input_shape = (2,)
         self.groups = ("dial",)
@@ -82,10 +93,7 @@ class Dial(Data):
 
     def augment(self, batch: Batch) -> Batch:
         """Unchanged; sends itself `signal_number` at training batch `signal_at`, unless the marker file is there."""
-        self.batches += 1
-        if self.batches == self.signal_at and not self.signal_marker.exists():
-            self.signal_marker.touch()
-            os.kill(os.getpid(), self.signal_number)
+        self.signal.count()
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:

@@ -1,6 +1,5 @@
 """A data set of images whose targets are images: squares of one colour, to be told from a faded picture (synthetic)."""
 
-import os
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +13,7 @@ from framework.data import Batch, Data, Splits
 from framework.errors import DataError
 from framework.geometry.light import light_of
 from framework.target import Target
+from stranger_package.data import Signal
 
 
 class Faded(Data):
@@ -31,10 +31,7 @@ class Faded(Data):
         signal_marker: str = "",
     ) -> None:
         self.samples = samples
-        self.signal_at = signal_at
-        self.signal_number = signal_number
-        self.signal_marker = Path(signal_marker)
-        self.batches = 0
+        self.signal = Signal(signal_at, signal_number, signal_marker)
         self.input_shape = (3, 16, 12)
         self.target = Target("image", ("red", "green", "blue"), size=(16, 12))
         self.groups = ("squares",)
@@ -72,10 +69,7 @@ class Faded(Data):
 
     def augment(self, batch: Batch) -> Batch:
         """Unchanged; sends itself `signal_number` at training batch `signal_at`, unless the marker file is there."""
-        self.batches += 1
-        if self.batches == self.signal_at and not self.signal_marker.exists():
-            self.signal_marker.touch()
-            os.kill(os.getpid(), self.signal_number)
+        self.signal.count()
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:
