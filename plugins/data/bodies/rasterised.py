@@ -1,5 +1,6 @@
 """Coloured vertices as the picture of their mesh: what a learned renderer is compared with, or what it starts from."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +21,33 @@ from plugins.data.bodies.people import chosen_body
 from plugins.data.bodies.topologies import Name, sheet, topology
 
 COLUMNS = (*XYZ, *COLOURS)
+Metres = Annotated[float, Field(gt=0, le=1e6)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """What is drawn.
+
+    Attributes:
+        height, width: pixels.
+        depth: whether there is a fourth channel, 0 at `nearest` and 1 at `farthest` and beyond.
+        nearest, farthest: metres.
+    """
+
+    height: Annotated[int, Field(ge=8, le=4096)] = 256
+    width: Annotated[int, Field(ge=8, le=4096)] = 192
+    depth: bool = False
+    nearest: Metres = 1.0
+    farthest: Metres = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registered:
+    """Which mesh the points are the vertices of: as the data's parameters of these names say."""
+
+    topology: Name = "7k"
+    root: str | None = None
+    body: str | None = None
 
 
 class Rasterised(Encoder):
@@ -27,16 +55,13 @@ class Rasterised(Encoder):
 
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
     averaged as light. Features are (3, height, width), numbers as files hold them, in the inputs' dtype; with `depth`
-    (4, height, width), the last 0 at `nearest` and 1 at `farthest` and beyond, as `encoder=projection` has it: what a
-    network may start from in place of points.
+    (4, height, width), as `encoder=projection` has it: what a network may start from in place of points.
 
     Args:
         input_shape: (points, columns).
         input_columns: names of the columns, where data give them.
         renderer: draws the mesh.
-        height, width, topology, root, body: those of the data.
-        depth: whether there is a fourth channel.
-        nearest, farthest: metres.
+        picture, mesh: what is drawn, and of what.
 
     Raises:
         ConfigError: an input that is no cloud of coloured points, or a renderer that lacks a channel.
@@ -58,14 +83,8 @@ class Rasterised(Encoder):
         input_columns: tuple[str, ...] = (),
         *,
         renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
-        height: Annotated[int, Field(ge=8, le=4096)] = 256,
-        width: Annotated[int, Field(ge=8, le=4096)] = 192,
-        topology: Name = "7k",
-        root: str | None = None,
-        body: str | None = None,
-        depth: bool = False,
-        nearest: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
-        farthest: Annotated[float, Field(gt=0, le=1e6)] = 5.0,
+        picture: Picture,
+        mesh: Registered,
     ) -> None:
         super().__init__()
         if len(input_shape) != 2 or input_shape[1] < len(COLUMNS) or input_columns[:6] not in ((), COLUMNS):
@@ -78,16 +97,17 @@ class Rasterised(Encoder):
                 f"encoder.rasterised.renderer = {type(renderer).__name__} draws no {' and '.join(sorted(missing))}; "
                 "choose another renderer."
             )
-        if not nearest < farthest:
+        if not picture.nearest < picture.farthest:
             raise ConfigError(
-                f"encoder rasterised got nearest={nearest:g} and farthest={farthest:g}; wanted nearest below farthest."
+                f"encoder rasterised got nearest={picture.nearest:g} and farthest={picture.farthest:g}; wanted nearest "
+                "below farthest, metres from the camera."
             )
         self.renderer = renderer
-        self.camera = canonical_camera(height, width)
-        self.depth = depth
-        self.limits = (nearest, farthest)
-        self.register_buffer("faces", faces_of(topology, root, body), persistent=False)
-        self.output_shape = (3 + depth, height, width)
+        self.camera = canonical_camera(picture.height, picture.width)
+        self.depth = picture.depth
+        self.limits = (picture.nearest, picture.farthest)
+        self.register_buffer("faces", faces_of(mesh), persistent=False)
+        self.output_shape = (3 + picture.depth, picture.height, picture.width)
 
     @torch.no_grad()
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
@@ -120,16 +140,16 @@ class Rasterised(Encoder):
         return found
 
 
-def faces_of(name: Name, root: str | None, body: str | None) -> Tensor:
+def faces_of(mesh: Registered) -> Tensor:
     """Triangles of a topology: of generated people's, or of the first registration in a folder.
 
     Raises:
         DataError: the body, or the folder's meshes, cannot be had.
     """
-    if root is None:
-        chosen, _ = chosen_body(body)
-        return torch.from_numpy(topology(chosen, sheet(chosen), name).faces.copy()).int()
-    folder = Path(root).expanduser()
+    if mesh.root is None:
+        chosen, _ = chosen_body(mesh.body)
+        return torch.from_numpy(topology(chosen, sheet(chosen), mesh.topology).faces.copy()).int()
+    folder = Path(mesh.root).expanduser()
     subject = scan_layout.read_splits(folder)["train"][0]
-    file = folder / "subjects" / subject / f"registration_{name}.ply"
+    file = folder / "subjects" / subject / f"registration_{mesh.topology}.ply"
     return scan_layout.read_registration(file).faces.int()
