@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.utils.data import default_collate
 
 import framework as package
+from framework.configuration.assembly import build_data, build_predictor, resolve_all
+from framework.configuration.composition import plain
 from framework.deployment.served import _load_pyfunc
+from framework.encoder import Encoder
 from framework.geometry.light import eight_bit, light_of
 from plugins.data.bodies.rows import body_file, colored_meshes
 from tests.conftest import Done, Framework
+from tests.test_composition import composed
 
 SQUARES = (
     "data=faded",
@@ -186,6 +191,28 @@ def test_wrappers_and_objectives_work_on_images(framework: Framework, wrapped: t
     assert {name: again[name] for name in ("psnr_db", "log_likelihood")} == {
         name: results[name] for name in ("psnr_db", "log_likelihood")
     }
+
+
+@pytest.mark.parametrize("way", ["quick", "hybrid"])
+def test_the_ground_of_a_photograph_is_white_to_the_bit_and_is_not_computed(tmp_path: Path, way: str) -> None:
+    """Losses weigh figures by it, networks leave it out."""
+    _, *settings = people(tmp_path)
+    resolved = resolve_all(plain(composed(f"experiment=smplpix/{way}", *settings, "encoder.slim.crop=2")))
+    data = build_data(resolved)
+    data.prepare()
+    batch = default_collate([data.splits().train[index] for index in range(3)])
+    ground = (batch["target"] == 1).all(-1)
+    assert 0.5 < ground.float().mean() < 1
+    assert not (ground & batch["mask"]).any()
+    predictor = build_predictor(resolved, data.target, data.input_shape, 0, data.columns).eval()
+    *drawn, painted = [module for module in predictor.modules() if isinstance(module, Encoder)]
+    with torch.no_grad():
+        picture = drawn[0](batch["input"])
+        painted(picture)
+    seen = (picture != 1).any(1)
+    assert 0 < seen.float().mean() < 0.5
+    assert painted.report is not None
+    assert painted.report.computed < ground.numel()
 
 
 def test_what_does_not_fit_an_image_gets_a_sentence(framework: Framework) -> None:

@@ -1,9 +1,10 @@
 """Light of stored numbers, against kornia's."""
 
 import kornia
+import pytest
 import torch
 
-from framework.geometry.light import eight_bit, linear
+from framework.geometry.light import eight_bit, encoded, light_of, linear
 
 
 def test_light_is_that_of_another_library_and_comes_back() -> None:
@@ -13,3 +14,16 @@ def test_light_is_that_of_another_library_and_comes_back() -> None:
     assert (light - theirs).abs().max() < 1e-6
     assert torch.equal(eight_bit(light), stored)
     assert eight_bit(torch.tensor([-1.0, 0.0, 2.0])).tolist() == [0, 0, 255]
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_white_and_black_are_exact_and_numbers_rise_with_light(kind: torch.dtype) -> None:
+    """What is white is told from what is not, as ground from figure."""
+    ends = torch.tensor([0.0, 1.0], dtype=kind)
+    assert torch.equal(encoded(ends), ends)
+    assert torch.equal(light_of(ends), ends)
+    light = torch.linspace(0, 1, 100_001, dtype=kind)
+    # the standard's own constants leave a step of 3e-8 between line and curve
+    assert (encoded(light).diff() > -1e-7).all()
+    assert (encoded(light[:-1]) < 1).all()
+    torch.testing.assert_close(light_of(encoded(light)), light, rtol=0, atol=1e-6)

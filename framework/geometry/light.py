@@ -24,4 +24,6 @@ def eight_bit(light: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
 def encoded(light: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """The same before they are rounded, in [0, 1]; with a gradient where light is inside of [0, 1]."""
     light = light.clamp(0, 1)
-    return torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+    # 1.055 x - 0.055, written so that white is 1 to the bit: what is white is told from what is not
+    curve = 1 + 1.055 * (light.clamp(min=1e-8) ** (1 / 2.4) - 1)
+    return torch.where(light <= 0.0031308, light * 12.92, curve)

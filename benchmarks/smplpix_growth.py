@@ -1,0 +1,129 @@
+"""How a picture's time grows with its mesh: rasterised, and painted by networks over projected vertices; written beside
+this file: `python benchmarks/smplpix_growth.py`."""
+
+import math
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.machine import machine
+from benchmarks.rasterizer_growth import milliseconds, slope
+from framework.configuration.schema import build, resolve
+from framework.encoder import Encoder
+from plugins.data.bodies.human_scans import in_front
+from plugins.data.bodies.people import chosen_body
+from plugins.data.bodies.topologies import sheet, topology
+
+SIZE = (410, 308)
+TOPOLOGIES = ("7k", "27k", "110k")
+ROUNDS = 3
+
+
+def person(name: str) -> Tensor:
+    """(points, 6): the default body at rest in a topology, coloured by place, before the canonical camera."""
+    body, _ = chosen_body(None)
+    whole = sheet(body)
+    rows = topology(body, whole, name).rows
+    vertices = torch.from_numpy(whole.carried(body.template.astype(np.float64))[rows]).float()
+    low, high = vertices.min(0).values, vertices.max(0).values
+    return torch.cat([in_front(vertices, *SIZE).canonical(vertices), (vertices - low) / (high - low)], 1)[
+        None
+    ]
+
+
+def encoder(name: str, shape: tuple[int, ...], **config: object) -> Encoder:
+    torch.manual_seed(0)
+    return build(
+        "encoder", resolve("encoder", {"name": name, **config}), input_shape=shape, input_columns=()
+    ).eval()
+
+
+def ways(shape: tuple[int, ...], name: str) -> dict[str, Callable[[Tensor], Tensor]]:
+    """A picture from coloured points, by how it is drawn."""
+    height, width = SIZE
+    size = {"height": height, "width": width}
+    projection = encoder("projection", shape, **size)
+
+    def meshed(samples: int, **more: object) -> Encoder:
+        drawing = {"name": "rasterizer", "supersampling": samples}
+        return encoder("rasterised", shape, topology=name, renderer=drawing, **size, **more)
+
+    networks = {
+        precision: encoder("slim", (4, *SIZE), precision=precision) for precision in ("float32", "bfloat16")
+    }
+    with_depth = meshed(1, depth=True)
+    return {
+        "rasterised, 1 sample a pixel": meshed(1),
+        "rasterised, 4 × 4 samples": meshed(4),
+        "projection alone": projection,
+        "SMPLpix (slim, float32)": lambda points: networks["float32"](projection(points)),
+        "SMPLpix (slim, bfloat16)": lambda points: networks["bfloat16"](projection(points)),
+        "slim over the mesh (bfloat16)": lambda points: networks["bfloat16"](with_depth(points)),
+    }
+
+
+@torch.inference_mode()
+def report(picture: Path) -> str:
+    from matplotlib.figure import Figure
+
+    torch.set_num_threads(1)
+    people = {name: person(name) for name in TOPOLOGIES}
+    calls = {name: ways(tuple(points.shape[1:]), name) for name, points in people.items()}
+    covered = float((calls["7k"]["rasterised, 1 sample a pixel"](people["7k"]) < 1).any(1).float().mean())
+    found = {way: [math.inf] * len(TOPOLOGIES) for way in calls["7k"]}
+    for _ in range(ROUNDS):
+        for way, times in found.items():
+            for place, name in enumerate(TOPOLOGIES):
+                took = milliseconds(partial(calls[name][way], people[name]))
+                times[place] = min(times[place], took)
+    counts = [points.shape[1] for points in people.values()]
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for way, times in found.items():
+        axes.loglog(counts, times, "o--" if way == "projection alone" else "o-", label=way, markersize=4)
+    axes.set_xticks(counts, [f"{count:,}" for count in counts])
+    axes.minorticks_off()
+    axes.set_xlabel("vertices")
+    axes.set_ylabel("milliseconds a picture, one core")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.suptitle(
+        f"A body of more and more vertices, {SIZE[0]} × {SIZE[1]} pixels (synthetic)", fontsize="medium"
+    )
+    figure.savefig(picture, dpi=150)
+    rows = [
+        f"| {way} | {' | '.join(f'{each:.2f}' for each in times)} | {times[-1] / times[0]:.1f} | "
+        f"{slope([float(count) for count in counts], times):.2f} |"
+        for way, times in found.items()
+    ]
+    return "\n".join(
+        [
+            "# Time of a picture against the vertices of its mesh",
+            "",
+            f"The default body (synthetic colours), {SIZE[0]} × {SIZE[1]} pixels, of which it covers {covered:.0%}; "
+            f"one thread; processor time, the lowest of {ROUNDS} medians, all in turn, ms. Networks compute the "
+            "subject's box alone; their weights are drawn, which changes no time. Slope: on double logarithmic axes, "
+            "over the last two.",
+            "",
+            f"| vertices | {' | '.join(f'{count:,}' for count in counts)} | last over first | slope |",
+            f"|---|{'---|' * (len(counts) + 2)}",
+            *rows,
+            "",
+            f"![Milliseconds against vertices]({picture.name})",
+            "",
+            f"{machine('torch', 'numpy')} Command: `python benchmarks/smplpix_growth.py`.",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    place = Path(__file__).with_suffix(".md")
+    text = report(place.with_suffix(".png"))
+    place.write_text(text + "\n", encoding="utf-8")
+    sys.stdout.write(text + "\n")
