@@ -59,6 +59,9 @@ class HumanScans(Data):
         topology: which of the registered meshes; generated are 7k (6,890 vertices) and 27k (27,578).
         counts, drawing: of generated people.
         data_seed: of their draws, whatever the seed of the run.
+        mirrored: whether half of the pictures to train on are seen in a mirror, points and photograph.
+        recoloured: share of them whose red, green and blue change places, in points and photograph alike: light that is
+            white knows no colour, and people wear any.
 
     Raises:
         DataError: a file is missing or damaged, images differ in size, meshes in their number of vertices.
@@ -81,7 +84,6 @@ class HumanScans(Data):
 }"""
     suffixes = tuple(READERS)
     columns = (*XYZ, *COLOURS)
-    varies = False
 
     def __init__(
         self,
@@ -92,6 +94,8 @@ class HumanScans(Data):
         counts: Counts,
         drawing: Drawing,
         data_seed: Seed = 0,
+        mirrored: bool = True,
+        recoloured: Annotated[float, Field(ge=0, le=1)] = 0.5,
     ) -> None:
         if "color" not in renderer.channels:
             raise ConfigError(
@@ -103,6 +107,8 @@ class HumanScans(Data):
         self.counts = asdict(counts)
         self.drawing = drawing
         self.data_seed = data_seed
+        self.mirrored, self.recoloured = mirrored, recoloured
+        self.varies = mirrored or recoloured > 0
         self.size = (drawing.height, drawing.width)
 
     def prepare(self) -> None:
@@ -165,7 +171,21 @@ class HumanScans(Data):
         self.size = (int(state["height"]), int(state["width"]))
 
     def augment(self, batch: Batch) -> Batch:
-        return batch
+        """Seen in a mirror, and with other colours, as drawn for each sample."""
+        count = len(batch["input"])
+        mirrored = torch.rand(count) < (0.5 if self.mirrored else 0.0)
+        orders = torch.rand(count, 3).argsort(1)
+        orders[torch.rand(count) >= self.recoloured] = torch.arange(3)
+        found = dict(batch)
+        for name in ("target", "color", "mask"):
+            if name in batch:
+                found[name] = _turned(batch[name], mirrored)
+                if name != "mask":
+                    found[name] = _reordered(found[name], orders)
+        points = batch["input"].clone()
+        points[mirrored.to(points.device), :, 0] *= -1  # the canonical camera looks through the middle
+        points[..., 3:6] = _reordered(points[..., 3:6], orders)
+        return found | {"input": points}
 
     def fingerprint(self) -> Mapping[str, str]:
         return {
@@ -235,6 +255,18 @@ def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> 
     ahead = torch.tensor([0.0, 0.0, max(away, 1e-3)])
     one = canonical_camera(height, width)
     return Camera(rotation, ahead - rotation @ middle, one.focal, one.principal, height, width)
+
+
+def _turned(images: Tensor, which: Tensor) -> Tensor:
+    """Some of (image, height, width, ...) with left and right exchanged."""
+    chosen = which.to(images.device).view(-1, *[1] * (images.dim() - 1))
+    return torch.where(chosen, images.flip(2), images)
+
+
+def _reordered(colors: Float[Tensor, "batch ... 3"], orders: Tensor) -> Tensor:
+    """Each sample's three colours in its order."""
+    places = orders.to(colors.device).view(-1, *[1] * (colors.dim() - 2), 3)
+    return colors.gather(-1, places.expand(colors.shape))
 
 
 def _input(vertices: Tensor, colors: Tensor, camera: Camera) -> Float[Tensor, "points 6"]:

@@ -1,10 +1,12 @@
 import json
 import shutil
+from itertools import permutations
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.utils.data import default_collate
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
@@ -219,3 +221,40 @@ def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
         assert (given[:, 2] > 0).all() and (pixel > 0).all() and (pixel < torch.tensor([29.0, 39.0])).all()
     beside = whole / "subjects/ann"
     assert unprepared.inputs(beside / "registration_7k.ply").shape == (2, 40, 6)
+
+
+@pytest.mark.parametrize(("mirrored", "recoloured"), [(True, 0.0), (False, 1.0), (True, 0.5), (False, 0.0)])
+def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(whole, mirrored, recoloured):
+    """Mesh and photograph change alike: of each sample one of twelve ways, and no way but those chosen."""
+    prepared = data(whole, mirrored=mirrored, recoloured=recoloured)
+    prepared.prepare()
+    train = prepared.splits().train
+    batch = default_collate([train[number % len(train)] for number in range(120)])
+    torch.manual_seed(0)
+    found = prepared.augment(batch)
+    height, width = prepared.size
+    ways = set()
+    for row in range(120):
+        sign = found["input"][row, :, 0] / batch["input"][row, :, 0]
+        assert torch.equal(sign, sign[:1].expand(len(sign))) and abs(float(sign[0])) == 1
+        order = next(
+            order
+            for order in permutations(range(3))
+            if torch.equal(
+                batch["color"][row][..., list(order)].flip(1 if sign[0] < 0 else ()), found["color"][row]
+            )
+        )
+        ways.add((float(sign[0]), order))
+        assert torch.equal(found["input"][row, :, 3:], batch["input"][row, :, 3:][:, list(order)])
+        turned = {
+            key: batch[key][row].flip(1) if sign[0] < 0 else batch[key][row] for key in ("target", "mask")
+        }
+        assert torch.equal(found["target"][row], turned["target"][..., list(order)])
+        assert torch.equal(found["mask"][row], turned["mask"])
+        # where the canonical camera sees the points, mirrored about its middle column
+        pixel = height * found["input"][row, :, 0] / found["input"][row, :, 2] + (width - 1) / 2
+        before = height * batch["input"][row, :, 0] / batch["input"][row, :, 2] + (width - 1) / 2
+        torch.testing.assert_close(pixel, before if sign[0] > 0 else width - 1 - before)
+        assert torch.equal(found["input"][row, :, 1:3], batch["input"][row, :, 1:3])
+    assert len(ways) == (2 if mirrored else 1) * (6 if recoloured else 1)
+    assert prepared.varies == (mirrored or recoloured > 0)
