@@ -38,6 +38,7 @@ ROWS = {
         ObjectiveRow("narrow", IMAGES, {"width": 4}, limits=KINKS),
         ObjectiveRow("nothing kept", IMAGES, {"width": 4, "depth": 1, "cache": 0}, limits=KINKS),
     ),
+    "squared_error": (ObjectiveRow("images", IMAGES),),
     "patch_gan": (
         ObjectiveRow("two scales", IMAGES, {"width": 4}),
         ObjectiveRow("no features", IMAGES, {"width": 4, "scales": 1, "layers": 1, "feature_matching": 0.0}),

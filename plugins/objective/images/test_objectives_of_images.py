@@ -6,11 +6,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
+from torch.nn.functional import mse_loss
 
 from framework.errors import CheckpointError, ConfigError
 from framework.model import Predictor
 from plugins.objective.images.patch_gan import PatchGAN
 from plugins.objective.images.perceptual import Perceptual, RandomFeatures
+from plugins.objective.images.squared_error import SquaredError
 from plugins.objective.images.vgg import CONVOLUTIONS, TAPS, WIDTHS, Depth, layers_of
 
 
@@ -183,3 +185,20 @@ def test_targets_that_are_no_images_are_refused() -> None:
     predictor = Given(torch.rand(3, 4, 4, 2))
     with pytest.raises(ConfigError, match=r"\(4, 4, 2\); wanted images of three colours"):
         RandomFeatures()(predictor, {"input": torch.arange(3), "target": torch.rand(3, 4, 4, 2)})
+
+
+def test_the_squared_error_is_torchs_and_each_member_has_its_own() -> None:
+    predictor, batch = pair(6, 5)
+    objective = SquaredError(weight=3.0)
+    wanted = mse_loss(predictor.images, batch["target"])
+    torch.testing.assert_close(objective(predictor, batch), 3 * wanted)
+    torch.testing.assert_close(objective.told["squared_error"], wanted.detach())
+    members = Given(torch.rand(3, 2, 6, 5, 3))
+    found = objective(members, batch)
+    slope = torch.autograd.grad(found, members.images)[0]
+    for member in range(2):
+        alone = Given(members.images[:, member].detach().clone())
+        own = torch.autograd.grad(objective(alone, batch), alone.images)[0]
+        torch.testing.assert_close(slope[:, member], own)
+    empty = {name: values[:0] for name, values in batch.items()}
+    assert objective(Given(torch.rand(0, 6, 5, 3)), empty).item() == 0
