@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import final
 
@@ -91,7 +91,7 @@ class Model(Predictor):
                 "Append an encoder that flattens, such as `mlp`."
             )
         self.head = head
-        self.remembered: list[Tensor] | None = None
+        self.kept = Kept()
 
     def forward(self, inputs: Tensor) -> Distribution:
         return self.head(self.raw(inputs))
@@ -104,18 +104,27 @@ class Model(Predictor):
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
         """What the head reads."""
-        if self.remembered and self.remembered[0] is inputs:
-            return self.remembered[1]
-        found = self.projection(self.encoders(inputs))
-        if self.remembered is not None:
-            self.remembered = [inputs, found]
-        return found
+        return self.kept.of(inputs, lambda given: self.projection(self.encoders(given)))
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
         pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
         raws, targets = zip(*pairs, strict=True)
         self.head.calibrate(torch.cat(raws), torch.cat(targets))
+
+
+class Kept:
+    """What was last computed, and of which tensor, while `one_pass` asks for it."""
+
+    last: tuple[Tensor, ...] | None = None
+
+    def of(self, inputs: Tensor, compute: Callable[[Tensor], Tensor]) -> Tensor:
+        if self.last and self.last[0] is inputs:
+            return self.last[1]
+        found = compute(inputs)
+        if self.last is not None:
+            self.last = (inputs, found)
+        return found
 
 
 @final
@@ -129,10 +138,11 @@ class FrozenFrontEnd(Predictor):
         super().__init__()
         self.encoders = nn.Sequential(*encoders)
         self.predictor = predictor
+        self.kept = Kept()
 
     def features(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
         """What the predictor reads."""
-        return self.encoders(inputs)
+        return self.kept.of(inputs, self.encoders)
 
     def forward(self, inputs: Tensor) -> Distribution:
         return self.predictor(self.features(inputs))
@@ -150,18 +160,23 @@ class FrozenFrontEnd(Predictor):
 
 @contextmanager
 def one_pass(predictor: Predictor) -> Iterator[None]:
-    """Temporarily computes the raw numbers of one tensor of inputs once, however often loss and densities are asked.
+    """Temporarily computes some numbers of one tensor of inputs once, however often loss and densities are asked.
 
-    Of models with a direct head alone: their encoders give images, which an objective compares as the loss does.
+    These are features that are fixed, and the raw numbers of direct heads: their encoders give images, which an
+    objective compares as the loss does.
     """
-    models = [module for module in predictor.modules() if isinstance(module, Model) and module.head.direct]
-    for model in models:
-        model.remembered = []
+    parts = [
+        module.kept
+        for module in predictor.modules()
+        if isinstance(module, FrozenFrontEnd) or (isinstance(module, Model) and module.head.direct)
+    ]
+    for kept in parts:
+        kept.last = ()
     try:
         yield
     finally:
-        for model in models:
-            model.remembered = None
+        for kept in parts:
+            kept.last = None
 
 
 def fitted_models(predictor: Predictor) -> list[Model]:

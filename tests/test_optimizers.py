@@ -15,7 +15,7 @@ from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from framework.model import Model, Predictor, one_pass
+from framework.model import FrozenFrontEnd, Model, Predictor, one_pass
 from framework.objective import Objective, Rival
 from framework.target import Target
 from framework.testing.wrappers import LENGTH, Plain
@@ -116,6 +116,16 @@ class Picture(Encoder):
         return self.gain * inputs
 
 
+class Flat(Encoder):
+    """Numbers in a row."""
+
+    bibtex = ""
+    output_shape = (12,)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        return inputs.flatten(1)
+
+
 class Whole(DensityHead):
     """Laplace's place is the image itself."""
 
@@ -152,3 +162,32 @@ def test_a_direct_head_reads_what_the_encoder_gives_once_a_step() -> None:
     assert encoder.calls == 4
     with pytest.raises(ConfigError, match=r"gives 3×2×2 numbers, but Odd reads 13 as they are"):
         Model([encoder], type("Odd", (Whole,), {"size": 13})())
+
+
+@pytest.mark.parametrize("wrapper", [None, "ensemble"])
+@pytest.mark.parametrize("direct", [True, False])
+def test_fixed_features_are_computed_once_a_step(direct: bool, wrapper: str | None) -> None:
+    """Whatever stands behind them."""
+    reals = Target("real", ("x",))
+
+    def inner() -> Predictor:
+        if direct:
+            return Model([Picture()], Whole())
+        head: DensityHead = build("density_head", resolve("density_head", "gaussian"), target=reals)
+        return Model([build("encoder", resolve("encoder", "mlp"), input_shape=(12,), input_columns=())], head)
+
+    made = inner()
+    if wrapper is not None:
+        made = build("uncertainty", resolve("uncertainty", wrapper), model=inner, target=reals)
+    first = Picture()
+    front = FrozenFrontEnd([first] if direct else [first, Flat()], made)
+    inputs = torch.rand(5, 3, 2, 2)
+    with one_pass(front):
+        front.loss(inputs, inputs.movedim(1, -1) if direct else torch.rand(5, 1))
+        front.training_densities(inputs)
+        assert first.calls == 1
+        front(inputs.clone())
+        assert first.calls == 2
+    front(inputs)
+    front(inputs)
+    assert first.calls == 4
