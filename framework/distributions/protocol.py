@@ -228,6 +228,22 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
 
 @singledispatch
+def each_cdf(density: Distribution, value: Tensor) -> Tensor | None:
+    """P(X_i ≤ y_i) of each number i by itself, whatever the others; `value` (*sample, *batch, *event), float64, shaped
+    like it; None: not known.
+
+    Default: of a few reals `cdf` of each `marginal`, of an image None. One over images registers its own, since nobody
+    can ask for a hundred thousand marginals.
+    """
+    if len(density.event_shape) != 1:
+        return None
+    here = range(density.event_shape[0])
+    parts = [cdf(marginal(density, index), value[..., index : index + 1]) for index in here]
+    known = [part for part in parts if part is not None]
+    return torch.stack(known, -1) if len(known) == len(parts) else None
+
+
+@singledispatch
 def arc(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
     """Mass of the arc from `start` counter-clockwise to `end` of a density of one angle, float64; None: not known.
 

@@ -32,6 +32,9 @@ class LaplaceImageHead(DensityHead):
         scale: "fixed": one b for all images and pixels, 1 in training, fitted to the validation split; "pixel": one
             predicted for each pixel, "number": for each number, trained by likelihood and multiplied by one factor
             that is fitted to the validation split.
+        floor: added to every predicted scale. Files hold steps of 8 bits, and where a picture is exactly white the
+            likelihood would be the higher the narrower, until one wrong pixel outweighs a whole picture: half a step,
+            0.002, ends that.
         foreground: how much more a pixel counts in the loss where the true image is not white (1 in all channels):
             most of a picture of a person is background, and white everywhere is a good first answer.
     """
@@ -52,6 +55,7 @@ class LaplaceImageHead(DensityHead):
         target: Target,
         *,
         scale: Literal["fixed", "pixel", "number"] = "fixed",
+        floor: Annotated[float, Field(ge=0, le=1)] = 0.0,
         foreground: Annotated[float, Field(ge=1, le=1e3)] = 1.0,
     ) -> None:
         super().__init__()
@@ -60,6 +64,7 @@ class LaplaceImageHead(DensityHead):
         self.scales = {"fixed": 0, "pixel": 1, "number": self.numbers}[scale]
         self.shape = (self.numbers + self.scales, *target.size)
         self.size = math.prod(self.shape)
+        self.floor = floor
         self.foreground = foreground
         self.register_buffer("factor", torch.ones((), dtype=torch.float64))
 
@@ -95,4 +100,4 @@ class LaplaceImageHead(DensityHead):
         if not self.scales:
             return location, location.new_ones(())
         log_scale = hardtanh(image[..., self.numbers :], math.log(SMALLEST_SCALE), math.log(LARGEST_SCALE))
-        return location, log_scale.exp()
+        return location, log_scale.exp() + self.floor
