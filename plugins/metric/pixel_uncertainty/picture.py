@@ -31,7 +31,7 @@ def sheet(
     tall = [min(WIDTH * one.shape[0] / one.shape[1], 2 * WIDTH) for one in panels.values()]
     below = 3.2
     figure = titled_figure((4 * WIDTH + 1.2, sum(tall) + below + 0.9), title, synthetic)
-    top, bottom = figure.subfigures(2, 1, height_ratios=[max(sum(tall), 0.1), below])
+    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[max(sum(tall), 0.1), below]).flat
     if panels:
         _images(top, panels, tall)
     axes = bottom.subplots()
