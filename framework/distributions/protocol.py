@@ -55,7 +55,8 @@ def median(density: Distribution, samples: int) -> Tensor:
     """The point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
 
     Default: of classes the mode, since a label is right or wrong and nothing lies between; otherwise the median of
-    `samples` draws (eq. 3.24), of angles on the circle. Who knows it in closed form registers it and draws nothing.
+    `samples` draws (eq. 3.24), of angles on the circle. Who knows it in closed form registers it and draws nothing. Of
+    several components over an image the mean stands for it.
     """
     if density.has_enumerate_support:
         return density.mode
