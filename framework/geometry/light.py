@@ -24,4 +24,6 @@ def eight_bit(light: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
 def encoded(light: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """The same before they are rounded, in [0, 1]; with a gradient where light is inside of [0, 1]."""
     light = light.clamp(0, 1)
-    return torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+    found = torch.where(light <= 0.0031308, light * 12.92, 1.055 * light.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+    # 1.055 - 0.055 is rounded to 0.99999994: white ground, which is told by being 1, stays 1; with the curve's slope
+    return torch.where(light == 1, 1 + (light - 1) * (1.055 / 2.4), found)

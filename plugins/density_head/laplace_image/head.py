@@ -20,7 +20,7 @@ FURTHEST = 1e6
 SMALLEST_SCALE, LARGEST_SCALE = 1e-4, 1e6
 """A step of 8 bits is 4e-3: no scale below a fortieth of it says anything about a stored picture."""
 WHITE = 1 - 0.5 / 255
-"""What lies above is stored as 1, and light of 1 is 0.99999994 in float32 when it is encoded again."""
+"""What lies above is stored as 1: no bit that is lost between light and numbers makes white ground a foreground."""
 
 
 class LaplaceImageHead(DensityHead):

@@ -31,8 +31,9 @@ class PixelUncertainty(Metric, Pictured):
 
     - `pixel_coverage_90`: share of numbers between their 5 % and 95 % quantiles.
     - `pixel_coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
-    - `spearman`: rank correlation of the pixels' mean |error| and their root mean variance, exact, within an image, so
-      that no image counts for being harder than another; NaN where one scale stands for all pixels.
+    - `spearman`: rank correlation of the pixels' mean |error|, of the point prediction rounded as files are, and their
+      root mean variance; exact, within an image, so that no image counts for being harder than another; NaN where one
+      scale stands for all pixels.
     - `pixel_scale`: mean over pixels of that root mean variance.
 
     Each is over the frame and, with `_masked`, over the pixels of the true mask. **Read those inside.** Background that
@@ -101,6 +102,8 @@ class PixelUncertainty(Metric, Pictured):
         refuse_nan(
             (found.low + found.high).sum((1, 2, 3)) + scale.sum((1, 2)), "images' transforms and scales"
         )
+        if self.steps:  # as a file would hold it: no error is smaller than what rounding hides
+            point = (point.clamp(0, 1) * self.steps).round() / self.steps
         error = (point - true).abs().mean(-1)
         everywhere = torch.ones_like(true[..., 0], dtype=torch.bool)
         places = [everywhere, prediction.true_image("mask")] if len(self.regions) > 1 else [everywhere]
