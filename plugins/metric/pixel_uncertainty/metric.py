@@ -26,8 +26,9 @@ KEPT = 8
 
 
 class PixelUncertainty(Metric, Pictured):
-    """Of each image how many of its numbers lie in their own central intervals, and whether its widest pixels are its
-    most wrong; then means over images, with standard errors.
+    """Whether the pixels of images lie in their intervals, and whether the widest are the most wrong.
+
+    Each image is judged by itself; then means over images, with standard errors:
 
     - `pixel_coverage_90`: share of numbers between their 5 % and 95 % quantiles.
     - `pixel_coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
