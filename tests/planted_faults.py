@@ -6,11 +6,11 @@ import torch
 from torch.distributions import constraints
 
 from framework.distributions.circular import circular, wrap
-from framework.distributions.protocol import arc, cdf, marginal
+from framework.distributions.protocol import arc, cdf, each_cdf, marginal
 from plugins.density_head.gaussian.density import Gaussian
 from plugins.density_head.von_mises.density import VonMises
 from tests import planted_answers as wrong
-from tests.planted_heads import CLASSES, HEIGHT, NO_CASES, ONE, PLACE, THREE, TWO, Fault, Halved
+from tests.planted_heads import CLASSES, GREY, HEIGHT, IMAGE, NO_CASES, ONE, PLACE, THREE, TWO, Fault, Halved
 
 ALL_FAULTS = (
     # one angle
@@ -314,6 +314,21 @@ ALL_FAULTS = (
         PLACE,
         {"log_prob": wrong.off(3e-6, wrong.everywhere), "entropy": wrong.fitting_entropy},
         "integral",
+    ),
+    # images
+    Fault(
+        "image 0.1 nat off, with the entropy that fits",
+        IMAGE,
+        {"log_prob": lambda d, v: d.log_prob(v) + 0.1, "entropy": lambda d: d.entropy() - 0.1},
+        "integral by draws",
+        {"scale": "number"},
+    ),
+    Fault(
+        "each number of an image at half its scale",
+        GREY,
+        {"each_cdf": lambda d, v: each_cdf(d, d.location + 2 * (v - d.location))},
+        "cdf",
+        {"scale": "number"},
     ),
     # classes
     Fault("probabilities that do not add up", CLASSES, {"log_prob": wrong.smoothed}),

@@ -1,6 +1,6 @@
 """A shipped density head of which single answers are replaced, so that it is wrong in one thing only."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.density_head import DensityHead
-from framework.distributions.protocol import arc, cdf, estimate, exactly, marginal, median
+from framework.distributions.protocol import arc, cdf, each_cdf, estimate, exactly, images, marginal, median
 from framework.target import Target
 from framework.testing.densities import CHECKS, examine_densities
 from framework.testing.finding import Finding
@@ -17,6 +17,7 @@ from framework.testing.heads import HeadSubject, examine_head
 from framework.testing.rows import HeadRow
 from plugins.density_head.categorical.head import CategoricalHead
 from plugins.density_head.gaussian.head import GaussianHead
+from plugins.density_head.laplace_image.head import LaplaceImageHead
 from plugins.density_head.von_mises.head import VonMisesHead
 from plugins.density_head.von_mises.rows import predicted
 
@@ -25,6 +26,7 @@ Parts = Mapping[str, Callable[..., Any]]
 ONE, TWO, THREE = (Target("angle", ("azimuth", "elevation", "tilt")[:count]) for count in (1, 2, 3))
 HEIGHT, PLACE = Target("real", ("height",)), Target("real", ("x", "y"))
 CLASSES = Target("class", ("a", "b", "c"))
+IMAGE, GREY = Target("image", ("red", "green", "blue"), size=(2, 3)), Target("image", ("grey",), size=(1, 1))
 NO_CASES = {"floor": 1e-9}
 """Parameters for which no reference is given."""
 
@@ -96,6 +98,16 @@ def _(density: Changed, value: Tensor) -> Tensor | None:
     return density.parts.get("cdf", cdf)(density.density, value)
 
 
+@each_cdf.register
+def _(density: Changed, value: Tensor) -> Tensor | None:
+    return density.parts.get("each_cdf", each_cdf)(density.density, value)
+
+
+@images.register
+def _(density: Changed, channels: Collection[str]) -> dict[str, Tensor]:
+    return images(density.density, channels)
+
+
 @arc.register
 def _(density: Changed, start: Tensor, end: Tensor) -> Tensor | None:
     return density.parts.get("arc", arc)(density.density, start, end)
@@ -152,7 +164,12 @@ class Fault:
 
     def findings(self) -> Iterator[Finding]:
         """Every finding; those of densities first where they are to find it, since nobody need ask further."""
-        kinds = {"angle": VonMisesHead, "real": GaussianHead, "class": CategoricalHead}
+        kinds = {
+            "angle": VonMisesHead,
+            "real": GaussianHead,
+            "class": CategoricalHead,
+            "image": LaplaceImageHead,
+        }
 
         def build() -> DensityHead:
             return Faulty(kinds[self.target.kind](self.target, **self.config), self.parts)

@@ -27,6 +27,7 @@ from framework.distributions.protocol import (
     about,
     arc,
     cdf,
+    each_cdf,
     estimate,
     images,
     mahalanobis,
@@ -385,6 +386,8 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
         assert torch.equal(found, torch.stack([median(part, 20) for part in made.parts], 1))
     elif kind == "reshaped":
         assert torch.equal(found, median(made.parts[0], 20).reshape(found.shape))
+    elif made.target.kind == "image":  # of several nothing is drawn
+        assert torch.equal(found, density.mean)
     else:
         assert torch.equal(found, median.dispatch(Distribution)(density, 20))
     # the last batch dimension read as components: 300 draws of each
@@ -452,7 +455,9 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         return
     if made.target.kind == "image":
         moments(kind, made, density)
+        each_number(kind, made, density, value)
         return
+    each_number(kind, made, density, value)
     one, at = marginal(density, 0), value[..., :1]
     if one is density and kind == "with a set":
         one = marginal(density.components, 0)  # that of a latent-variable density is of its mixture
@@ -485,6 +490,20 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         close(found[seen.resolved], by_series[seen.resolved], 1e-6)
 
 
+def each_number(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
+    """each_cdf: of an image of the parts' by plain sums, of a few numbers that of each marginal; or None as of them."""
+    found = each_cdf(density, value)
+    if made.target.kind == "image":
+        parts = torch.stack([each_cdf(part, made.value) for part in made.parts], 1)
+        assert found is not None and found.shape == value.shape and found.dtype == torch.float64
+        if kind not in ("tempered", "mixture of a fold"):  # densities, or at values, of their own
+            close(found, combined(kind, made, parts))
+        return
+    parts = [cdf(marginal(density, index), value[..., index : index + 1]) for index in event(made)]
+    assert (found is None) == any(part is None for part in parts)
+    agree(found, None if found is None else torch.stack(parts, -1))
+
+
 def moments(kind: str, made: Made, density: Distribution) -> None:
     """mean and variance where the parts have them: by plain sums of the parts' first two moments."""
     try:
@@ -495,27 +514,31 @@ def moments(kind: str, made: Made, density: Distribution) -> None:
             density.mean  # noqa: B018
         return
 
+    if kind != "tempered":  # a density of its own
+        mean = combined(kind, made, means)
+        close(density.mean, mean)
+        close(density.variance, combined(kind, made, squares) - mean.square())
+
+
+def combined(kind: str, made: Made, number: Tensor) -> Tensor:
+    """What a structure has of a number that mixtures average, from that of each part, (item, part, *event)."""
+
     def mixed(weights: Tensor, number: Tensor) -> Tensor:
         return (share(weights).reshape(*weights.shape, *[1] * (number.dim() - 2)) * number).sum(1)
 
-    def of(number: Tensor) -> Tensor:
-        match kind:
-            case "stacked":
-                return number
-            case "reshaped":
-                return number[:, 0].unflatten(0, (2, 2))
-            case "mixture":
-                return mixed(made.weights, number)
-            case "mixture of mixtures":
-                inner = torch.stack([mixed(made.weights, number), number[:, 1]], 1)
-                return mixed(made.weights[:, :2], inner)
-            case "mixture of a fold":
-                return mixed(made.weights[:2, :2], number[:, 0].unflatten(0, (2, 2)))
-        return number[:, 0]
-
-    if kind != "tempered":  # a density of its own
-        close(density.mean, of(means))
-        close(density.variance, of(squares) - of(means).square())
+    match kind:
+        case "stacked":
+            return number
+        case "reshaped":
+            return number[:, 0].unflatten(0, (2, 2))
+        case "mixture":
+            return mixed(made.weights, number)
+        case "mixture of mixtures":
+            inner = torch.stack([mixed(made.weights, number), number[:, 1]], 1)
+            return mixed(made.weights[:, :2], inner)
+        case "mixture of a fold":
+            return mixed(made.weights[:2, :2], number[:, 0].unflatten(0, (2, 2)))
+    return number[:, 0]
 
 
 def mass_of(kind: str, made: Made, mass) -> Tensor | None:

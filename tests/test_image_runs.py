@@ -181,16 +181,16 @@ def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: 
     ids=["ensemble", "temperature", "scales"],
 )
 def test_wrappers_and_objectives_work_on_images(framework: Framework, wrapped: tuple[str, ...]) -> None:
-    done = trained(framework, *wrapped, *RIVALS, "metric=[psnr,log_likelihood]", folder="wrapped")
+    done = trained(
+        framework, *wrapped, *RIVALS, "metric=[psnr,log_likelihood,pixel_uncertainty]", folder="wrapped"
+    )
     results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
-    assert np.isfinite(results["psnr_db"])
-    assert np.isfinite(results["log_likelihood"])
+    names = ("psnr_db", "log_likelihood", "pixel_coverage_90", "pixel_coverage_90_masked")
+    assert np.isfinite([results[name] for name in names]).all()
     tested = framework("mode=test", f"checkpoint={done.folder}", "logger=none", folder="tested")
     assert tested.code == 0, tested.out
     again = json.loads((tested.folder / "results.json").read_text(encoding="utf-8"))
-    assert {name: again[name] for name in ("psnr_db", "log_likelihood")} == {
-        name: results[name] for name in ("psnr_db", "log_likelihood")
-    }
+    assert {name: again[name] for name in names} == {name: results[name] for name in names}
 
 
 @pytest.mark.parametrize("way", ["quick", "hybrid"])

@@ -27,3 +27,9 @@ def test_white_and_black_are_exact_and_numbers_rise_with_light(kind: torch.dtype
     assert (encoded(light).diff() > -1e-7).all()
     assert (encoded(light[:-1]) < 1).all()
     torch.testing.assert_close(light_of(encoded(light)), light, rtol=0, atol=1e-6)
+    # ends included, with the curve's slope
+    given = torch.tensor([1.0, 2.0, 1 - 1e-6], dtype=kind, requires_grad=True)
+    (slope,) = torch.autograd.grad(encoded(given).sum(), given)
+    torch.testing.assert_close(
+        slope, torch.tensor([1.055 / 2.4, 0.0, 1.055 / 2.4], dtype=kind), rtol=1e-5, atol=0
+    )

@@ -14,7 +14,7 @@ from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.rows import ROWS
 from plugins.density_head.von_mises.density import VonMises
 from tests.planted_faults import ALL_FAULTS
-from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE, THREE, TWO, Fault
+from tests.planted_heads import CLASSES, HEIGHT, IMAGE, ONE, PLACE, THREE, TWO, Fault
 
 ALONE = {fault.only for fault in ALL_FAULTS}
 
@@ -29,7 +29,7 @@ def test_the_fault_is_found(fault: Fault) -> None:
 
 
 @pytest.mark.parametrize(
-    "target", [ONE, TWO, THREE, HEIGHT, PLACE, CLASSES], ids=lambda target: str(target.names)
+    "target", [ONE, TWO, THREE, HEIGHT, PLACE, CLASSES, IMAGE], ids=lambda target: str(target.names)
 )
 def test_the_sound_head_passes_and_every_property_has_a_fault_of_its_own(target: Target) -> None:
     findings = list(Fault("none", target, {}).findings())

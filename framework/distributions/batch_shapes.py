@@ -14,6 +14,7 @@ from framework.distributions.protocol import (
     about,
     arc,
     cdf,
+    each_cdf,
     estimate,
     images,
     mahalanobis,
@@ -205,6 +206,19 @@ def _(density: Reshaped, value: Tensor) -> Tensor | None:
     return _folded(cdf(density.density, flat), shape)
 
 
+@each_cdf.register
+def _(density: Stacked, value: Tensor) -> Tensor | None:
+    return _stacked(
+        [each_cdf(one, part) for one, part in density.apart(value)], -1 - len(density.event_shape)
+    )
+
+
+@each_cdf.register
+def _(density: Reshaped, value: Tensor) -> Tensor | None:
+    flat, shape = density.inner(value)
+    return _folded(each_cdf(density.density, flat), shape + density.event_shape)
+
+
 @arc.register
 def _(density: Stacked, start: Tensor, end: Tensor) -> Tensor | None:
     both = zip(density.apart(start), density.apart(end), strict=True)
@@ -325,9 +339,9 @@ def _(density: Reshaped, index: tuple[Tensor, ...], place: Tensor) -> Distributi
     return about(inner, torch.unravel_index(item, inner.batch_shape), place)
 
 
-def _stacked(parts: list[Tensor | None]) -> Tensor | None:
+def _stacked(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:
     known = [part for part in parts if part is not None]
-    return torch.stack(known, -1) if len(known) == len(parts) else None
+    return torch.stack(known, axis) if len(known) == len(parts) else None
 
 
 def _folded(found: Tensor | None, shape: torch.Size) -> Tensor | None:

@@ -13,6 +13,7 @@ from framework.distributions.protocol import (
     Normals,
     Slope,
     about,
+    each_cdf,
     estimate,
     exactly,
     images,
@@ -59,6 +60,14 @@ def _(density: Independent, index: int) -> Distribution:
     here = slice(index, index + 1)
     base = Normal(density.base_dist.loc[..., here], density.base_dist.scale[..., here], validate_args=False)
     return Independent(base, 1, validate_args=False)
+
+
+@each_cdf.register
+def _(density: Independent, value: Tensor) -> Tensor | None:
+    base = density.base_dist
+    if not isinstance(base, Normal | torchs.Laplace):
+        return None if len(density.event_shape) == 3 else each_cdf.dispatch(Distribution)(density, value)
+    return type(base)(base.loc.double(), base.scale.double(), validate_args=False).cdf(value.double())
 
 
 @marginal.register

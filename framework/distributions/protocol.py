@@ -55,7 +55,8 @@ def median(density: Distribution, samples: int) -> Tensor:
     """The point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
 
     Default: of classes the mode, since a label is right or wrong and nothing lies between; otherwise the median of
-    `samples` draws (eq. 3.24), of angles on the circle. Who knows it in closed form registers it and draws nothing.
+    `samples` draws (eq. 3.24), of angles on the circle. Who knows it in closed form registers it and draws nothing. Of
+    several components over an image the mean stands for it.
     """
     if density.has_enumerate_support:
         return density.mode
@@ -225,6 +226,22 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
     weights = found.log_weights.exp()
     below = torch.where(weights > 0, weights * torch.special.ndtr(standard), 0.0)
     return below.sum(-1).clamp(max=1)
+
+
+@singledispatch
+def each_cdf(density: Distribution, value: Tensor) -> Tensor | None:
+    """P(X_i ≤ y_i) of each number i by itself, whatever the others; `value` (*sample, *batch, *event), float64, shaped
+    like it; None: not known.
+
+    Default: of a few reals `cdf` of each `marginal`, of an image None. One over images registers its own, since nobody
+    can ask for a hundred thousand marginals.
+    """
+    if len(density.event_shape) != 1:
+        return None
+    here = range(density.event_shape[0])
+    parts = [cdf(marginal(density, index), value[..., index : index + 1]) for index in here]
+    known = [part for part in parts if part is not None]
+    return torch.stack(known, -1) if len(known) == len(parts) else None
 
 
 @singledispatch

@@ -14,6 +14,7 @@ from framework.distributions.protocol import arc, cdf, marginal, median
 from framework.errors import UserError
 from framework.testing.adaptive import boxes
 from framework.testing.finding import SEED, Finding, Worst, seed
+from framework.testing.flattened import flattened
 from framework.testing.heads import PATIENCE, HeadSubject
 from framework.testing.quadrature import cells, counted, density_at, side
 
@@ -58,7 +59,7 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
         head = subject.make().double()
         head.requires_grad_(False)
         names = [f"raw numbers of size {scale:g}, batch row {row}" for row, scale in enumerate(scales)]
-        return head(raw), names
+        return flattened(head(raw)), names
 
     for name, limit, check, batch in CHECKS:
         if name in subject.row.leave_out or not applies(name, subject, draws):
@@ -85,10 +86,11 @@ def _numbers(subject: HeadSubject) -> int:
 def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
     """Whether a property can be asked of the row's target."""
     kind, numbers = subject.row.target.kind, _numbers(subject)
+    kind = "real" if kind == "image" else kind
     wanted = {
-        "integral": numbers <= 3 and kind != "image",
+        "integral": numbers <= 3,
         "integral by draws": kind in ("angle", "real") and numbers >= 3 and not draws,
-        "samples follow log_prob": numbers <= 3 and kind != "image",
+        "samples follow log_prob": numbers <= 3,
         "samples follow marginals": kind in ("angle", "real") and numbers == 2 and not draws,
         "2π-periodic": kind == "angle",
         "median": kind in ("angle", "real") and numbers == 1,

@@ -156,7 +156,9 @@ def _predictions(row: MetricRow, count: int, reads: Collection[str]) -> Slices:
         fields = {**ball(_place(row, target), row.size), **fields}
     generator = torch.Generator().manual_seed(SEED)
     location = (
-        torch.randn(target.shape, generator=generator) if row.target.kind != "class" else torch.zeros(())
+        torch.randn(target.flatten(1).shape, generator=generator)
+        if row.target.kind != "class"
+        else torch.zeros(())
     )
     logits = torch.randn(count, len(row.target.names), generator=generator)
     breadth = 1 + 2 * torch.rand(count, generator=generator)
@@ -184,7 +186,7 @@ def _place(row: MetricRow, target: Tensor) -> Tensor:
     return (
         3.0 * torch.nn.functional.one_hot(target, len(row.target.names))
         if row.target.kind == "class"
-        else target
+        else target.flatten(1)
     )
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.protocol import (
+    each_cdf,
     estimate,
     exactly,
     images,
@@ -80,6 +81,13 @@ estimate.register(LaplaceImage, exactly)
 def _(density: LaplaceImage, samples: int) -> Tensor:
     # each number is symmetric about its location
     return density.location
+
+
+@each_cdf.register
+def _(density: LaplaceImage, value: Tensor) -> Tensor:
+    away = (value.double() - density.location.double()) / density.scale.double()
+    tail = (-away.abs()).exp() / 2
+    return torch.where(away < 0, tail, 1 - tail)
 
 
 @pick.register

@@ -41,6 +41,12 @@ ROWS = {
         # differences of raw numbers of size 1000 step over the kink of |d| at a draw
         HeadRow("one grey pixel", GREY, {"scale": "number"}, cases=laplace, limits={"loss gradient": 0.1}),
         HeadRow(
+            "balanced, fitted to intervals",
+            SMALL,
+            {"scale": "pixel", "balance": 1.0, "cover": 0.9, "floor": 0.002},
+            leave_out={"loss gradient": "it is weighed by the scale, while the loss is not"},
+        ),
+        HeadRow(
             "foreground",
             SMALL,
             {"scale": "pixel", "foreground": 5.0},

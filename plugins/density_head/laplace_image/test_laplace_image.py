@@ -6,7 +6,7 @@ from torch.distributions import Independent, Laplace
 
 from framework.distributions import density as density_module
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import images, median, pick
+from framework.distributions.protocol import each_cdf, images, median, pick
 from framework.distributions.tempering import temper
 from framework.errors import ConfigError, UserError
 from framework.geometry.light import encoded, light_of
@@ -63,9 +63,11 @@ def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean(
         images(members, {"depth"})
 
 
-def test_the_loss_is_the_distance_a_number_and_the_foreground_counts_more() -> None:
+@pytest.mark.parametrize("white", [1.0, 1 - 2**-24])
+def test_the_loss_is_the_distance_a_number_and_the_foreground_counts_more(white: float) -> None:
+    """Also where white has lost a bit on its way through light: 0.99999994."""
     raw = torch.rand(2, 60)
-    target = torch.ones(2, 4, 5, 3)
+    target = torch.full((2, 4, 5, 3), white)
     target[:, :2] = 0.25
     image = raw.reshape(2, 3, 4, 5).movedim(1, -1)
     distance = (image - target).abs()
@@ -91,6 +93,41 @@ def test_calibration_takes_the_most_likely_factor_and_leaves_the_loss(scale: str
         head.factor /= other
     with pytest.raises(ValueError, match="got none of it"):
         head.calibrate(raw[:0], target[:0])
+
+
+def test_balanced_locations_are_learned_as_by_the_distance_and_scales_as_by_likelihood() -> None:
+    torch.manual_seed(0)
+    target = torch.rand(2, 4, 5, 3).double()
+    gradients = []
+    for balance in (0.0, 1.0):
+        raw = torch.randn(2, 80, generator=torch.Generator().manual_seed(1)).double().requires_grad_()
+        loss = LaplaceImageHead(TARGET, scale="pixel", balance=balance).loss(raw, target)
+        loss.sum().backward()
+        gradients.append((loss.detach(), raw.grad.reshape(2, 4, 4, 5), raw.detach().reshape(2, 4, 4, 5)))
+    (plain, by_likelihood, raw), (loss, found, _) = gradients
+    torch.testing.assert_close(loss, plain)
+    torch.testing.assert_close(found[:, :3], (raw[:, :3] - target.movedim(-1, 1)).sign() / 60)
+    torch.testing.assert_close(found[:, 3], by_likelihood[:, 3] * raw[:, 3].exp())
+
+
+@pytest.mark.parametrize("mass", [0.5, 0.9])
+def test_intervals_are_fitted_to_what_is_not_background(mass: float) -> None:
+    """A background that is right to a thousandth of its scale: the likeliest factor forgets the others."""
+    torch.manual_seed(0)
+    target = torch.full((6, 4, 5, 3), 1 - 2**-24)
+    target[:, 0] = torch.rand(6, 5, 3) / 2
+    raw = torch.cat([target.movedim(-1, 1) + 1e-3 * torch.randn(6, 3, 4, 5), torch.zeros(6, 1, 4, 5)], 1)
+    raw[:, :3, 0] += torch.randn(6, 3, 5) * 3
+
+    def covered(head: LaplaceImageHead) -> float:
+        head.calibrate(raw.flatten(1), target)
+        found = each_cdf(head(raw.flatten(1)), target)[:, 0]
+        return ((2 * found - 1).abs() <= mass + 1e-6).double().mean().item()
+
+    assert covered(LaplaceImageHead(TARGET, scale="pixel", cover=mass)) == pytest.approx(mass, abs=0.02)
+    assert covered(LaplaceImageHead(TARGET, scale="pixel")) < mass - 0.15
+    with pytest.raises(ValueError, match="pixels that are not white"):
+        LaplaceImageHead(TARGET, cover=mass).calibrate(torch.zeros(2, 60), torch.ones(2, 4, 5, 3))
 
 
 def test_other_targets_are_refused() -> None:

@@ -18,6 +18,9 @@ Precision = Literal["auto", "float32", "bfloat16"]
 WHITE = 6.0
 """Colours are sigmoid(WHITE (1 + raw)): a raw 0 is white but for 0.6 of 255, -1 is grey, -2 black. An empty picture is
 white so from the start, also where training sees nothing far from a subject, and leaves it in steps of usual size."""
+EMPTY_LOG_SCALE = -5.0
+"""What logarithms of scales start from: 0.007, near the error of that white. For the same reason: beyond the subject's
+box evaluation answers with the bias alone, which training hardly moves, and exp(0) would be the whole range."""
 
 
 class Box(NamedTuple):
@@ -170,11 +173,12 @@ def subject(picture: Float[Tensor, "channels height width"], stride: int, margin
 def head(
     channels: int, size: int, colors: int, scales: int, places: int = 1, *, residual: bool = False
 ) -> nn.Conv2d:
-    """From maps to colours and scales, each of so many places; to an empty picture it answers 0 before training, and
-    where it is `residual` to any."""
+    """From maps to colours and scales, each of so many places; to an empty picture it answers 0, of scales
+    EMPTY_LOG_SCALE, before training, and where it is `residual` to any."""
     made = nn.Conv2d(channels, (colors + scales) * places, size)
     assert made.bias is not None
     nn.init.zeros_(made.bias)
+    nn.init.constant_(made.bias[colors * places :], EMPTY_LOG_SCALE)
     if residual:
         nn.init.zeros_(made.weight)
     return made

@@ -1,0 +1,65 @@
+"""An image as one vector of its numbers, so that what is asked of vectors is asked of images too."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.protocol import cdf, each_cdf, median
+
+
+def flattened(density: Distribution) -> Distribution:
+    """The density itself unless it is over images."""
+    return Flattened(density) if len(density.event_shape) == 3 else density
+
+
+class Flattened(Distribution):
+    """A density over images (height, width, number), of event_shape (height · width · number,)."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, density: Distribution) -> None:
+        self.density = density
+        numbers = torch.Size((density.event_shape.numel(),))
+        super().__init__(density.batch_shape, numbers, validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.real_vector
+
+    def image(self, value: Tensor) -> Tensor:
+        return value.unflatten(-1, self.density.event_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.density.log_prob(self.image(value))
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        return self.density.sample(torch.Size(sample_shape)).flatten(-3)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.density.mode.flatten(-3)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.density.mean.flatten(-3)
+
+    @property
+    def variance(self) -> Tensor:
+        return self.density.variance.flatten(-3)
+
+    def entropy(self) -> Tensor:
+        return self.density.entropy()
+
+
+@median.register
+def _(density: Flattened, samples: int) -> Tensor:
+    return median(density.density, samples).flatten(-3)
+
+
+@cdf.register
+def _(density: Flattened, value: Tensor) -> Tensor | None:
+    """Of one number."""
+    found = each_cdf(density.density, density.image(value))
+    return None if found is None else found[..., 0, 0, 0]

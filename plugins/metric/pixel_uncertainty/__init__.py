@@ -1,0 +1,1 @@
+"""Whether predicted images say how far off each pixel may be."""
