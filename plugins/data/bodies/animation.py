@@ -19,7 +19,7 @@ from plugins.data.bodies.dressed import Scan
 from plugins.data.bodies.photographs import photographed
 from plugins.data.bodies.scan_generator import Crowd
 from plugins.data.bodies.scan_layout import Registration
-from plugins.data.bodies.topologies import Name, topology
+from plugins.data.bodies.topologies import Name
 
 LOOK_DOWN = math.radians(8)
 FREE = 0.92
@@ -65,7 +65,7 @@ class Generated:
         random = copy.deepcopy(self._random)
         scan, seen = self.wardrobe.scanned(self._bare, self.worn, random)
         self._registered = self.wardrobe.registered(self._bare, scan, seen, random)
-        mesh = topology(crowd.body, self.wardrobe.sheet, name)
+        mesh = crowd.meshes[name]
         self._rows = mesh.rows
         self.registration = Registration(
             torch.from_numpy(self._registered.vertices[mesh.rows]).float(),

@@ -64,8 +64,11 @@ def read(file: Path) -> Motion:
     """
     with guarded(file, "a motion file (BVH)"):
         words = iter(read_bytes(file).decode("utf-8").split())
-        names, parents, offsets, channels = _hierarchy(words)
-        count, seconds = _header(words)
+        try:
+            names, parents, offsets, channels = _hierarchy(words)
+            count, seconds = _header(words)
+        except StopIteration:
+            raise ValueError("it ends before its motion") from None
         numbers = np.array([float(word) for word in words])
         wanted = (count, sum(map(len, channels)))
         if numbers.size != wanted[0] * wanted[1] or not np.isfinite(numbers).all():
@@ -111,7 +114,7 @@ def _hierarchy(words: Iterator[str]) -> _Hierarchy:
             return found
         else:
             raise ValueError(f"the word {word!r} in its hierarchy")
-    raise ValueError("it ends within its hierarchy")
+    raise StopIteration
 
 
 def _header(words: Iterator[str]) -> tuple[int, float]:

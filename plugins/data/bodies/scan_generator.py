@@ -25,7 +25,7 @@ from plugins.data.bodies.dressed import Wardrobe
 from plugins.data.bodies.people import adults, chosen_body
 from plugins.data.bodies.photographs import photographed, rig, texture
 from plugins.data.bodies.scan_layout import Registration
-from plugins.data.bodies.topologies import Name, topology
+from plugins.data.bodies.topologies import Name, Topology, topology
 
 VERSION = 1
 """Of what is drawn; a change takes a new number."""
@@ -107,10 +107,11 @@ class Crowd:
     def wardrobe(self) -> Wardrobe:
         return Wardrobe(self.body)
 
+    @cached_property
+    def meshes(self) -> dict[Name, Topology]:
+        return {name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies}
+
     def write(self, root: Path) -> None:
-        self.meshes = {
-            name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies
-        }
         everyone = [(split, number) for split in SPLITS for number in range(self.counts[split])]
         scan_layout.write_splits(
             root, {split: [_name(split, number) for number in range(self.counts[split])] for split in SPLITS}
