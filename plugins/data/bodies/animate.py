@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> None:
         default=Path("outputs/animation.gif"),
         help=f"file: {', '.join(KINDS)}; default: %(default)s",
     )
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
     if given.out.suffix.lower() not in KINDS or given.frames < 1:
         raise ConfigError(
             f"--out {given.out} --frames {given.frames}: wanted a {', '.join(KINDS)} and 1 frame or more."

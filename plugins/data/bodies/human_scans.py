@@ -93,9 +93,9 @@ class HumanScans(Data):
         drawing: Drawing,
         data_seed: Seed = 0,
     ) -> None:
-        if "color" not in renderer.channels:
+        if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} draws no color; choose another renderer."
+                f"data.renderer = {type(renderer).__name__} draws no color on black; choose another renderer."
             )
         self.renderer = renderer
         self.root = root

@@ -12,11 +12,16 @@ from scipy.spatial.transform import Rotation
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
+from framework.geometry.light import eight_bit
+from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.renderer import Scene
+from framework.target import Target
+from framework.testing import trained
 from framework.testing.scenes import sphere
 from plugins.data.bodies import animate, animation, flow, motion, scan_layout
 from plugins.data.bodies.body import BodyModel
 from plugins.data.bodies.body_files import read
+from plugins.data.bodies.human_scans import photograph
 from plugins.data.bodies.poses import skeleton
 from plugins.data.bodies.rows import DOLL, SMALL, colored
 from plugins.data.bodies.scan_generator import Crowd
@@ -211,6 +216,50 @@ def test_a_generated_person_is_the_data_sets_and_moves(data, person, tmp_path):
     np.testing.assert_array_equal(again.scan.colors, person.first().scan.colors)
     assert (other.vertices - written.vertices).norm(dim=1).max() > 0.05
     assert other.vertices[:, 1].min() == pytest.approx(float(written.vertices[:, 1].min()), abs=1e-5)
+
+
+def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person, tmp_path):
+    Crowd(data.renderer, data.counts, data.drawing, data.data_seed)._write_person(tmp_path, "test", 0)
+    view = scan_layout.read_subject(tmp_path, "test_0000", data.topology).views[1]
+    written = eight_bit(photograph(view)[0]).numpy()
+    found = animation.photograph(data.renderer, person.first().scan, view.camera)
+    assert (
+        np.abs(found.astype(int) - written).max() <= 1
+    )  # the file's colours are rounded before they are on white
+    scene = animation.actor(person.registration).scene(person.first(), view.camera)
+    drawn = animation.on_white(RENDERER, scene)
+    seen = RENDERER(scene, ("mask", "color"))
+    assert (drawn[~seen["mask"]] == 255).all()
+    assert torch.equal(torch.from_numpy(drawn)[seen["mask"]], eight_bit(seen["color"])[seen["mask"]])
+
+
+@pytest.mark.parametrize("walks", [False, True])
+def test_a_run_and_a_motion_become_pictures_side_by_side(data, person, tmp_path, walks, capsys):
+    points, target = len(person.registration.vertices), Target("image", COLOURS, size=SIZE)
+    parts = {
+        "data": {
+            "name": "human_scans",
+            **{key: value for key, value in SMALL.items() if key != "root"},
+            **DOLL,
+        },
+        "density_head": "laplace_image",
+        "encoder": [
+            {"name": "projection", "height": SIZE[0], "width": SIZE[1]},
+            {"name": "slim", "widths": [8, 8]},
+        ],
+    }
+    state = {"height": SIZE[0], "width": SIZE[1]}
+    run = trained.checkpoint(tmp_path / "model.ckpt", parts, target, (points, 6), (*XYZ, *COLOURS), state)
+    (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS, {}]))
+    asked = [run, "--frames", "3", "--out", str(tmp_path / "new/film.gif")]
+    animate.main([*asked, *(["test_0001", "--motion", str(tmp_path / "walk.bvh")] if walks else [])])
+    assert "film.gif" in capsys.readouterr().out
+    with Image.open(tmp_path / "new/film.gif") as film:
+        assert film.n_frames == 3 and film.size == (3 * SIZE[1], SIZE[0] + animation.CAPTION)
+        first, second = (
+            np.asarray(film.convert("RGB")).astype(int) for _ in range(2) if film.seek(_) is None
+        )
+    assert np.abs(first - second).max() > 50  # somebody moves
 
 
 def test_cameras_see_all_of_somebody_from_everywhere(person):

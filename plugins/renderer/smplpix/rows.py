@@ -5,20 +5,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
-
-from framework.configuration.assembly import build_predictor
-from framework.configuration.description import Description
-from framework.configuration.loading import PREFIX
-from framework.configuration.schema import resolve
-from framework.storage import checkpoints
 from framework.target import Target
+from framework.testing import trained
 from framework.testing.rows import CloudRow, EncoderRow, RendererRow
 from plugins.renderer.smplpix.projection import COLUMNS
 
 FOLDER = TemporaryDirectory()
 
-NEAR = {"nearest": 0.1, "farthest": 20.0}
+NEAR: dict[str, Any] = {"nearest": 0.1, "farthest": 20.0}
 UNET = {"width": 6, "levels": 3}
 SLIM = {"widths": [8, 12, 16]}
 LESS_PRECISE = {"rows of a batch apart": 1e-2}  # as far as two bfloat16 are apart
@@ -36,30 +30,18 @@ def checkpoint(
     size: tuple[int, int],
     points: int = 50,
     names: tuple[str, ...] = COLUMNS[3:],
-    **parts: Any,
+    uncertainty: Sequence[dict[str, Any]] = (),
 ) -> str:
-    """What training leaves behind, of a model with drawn weights; its path."""
-    config = {
-        "data": resolve("data", {"name": "human_scans", "height": size[0], "width": size[1]}),
-        "density_head": resolve("density_head", "laplace_image"),
-        "encoder": [resolve("encoder", one) for one in encoders],
-        "uncertainty": [],
-        "objective": [],
-        "metric": [],
-        "outliers": None,
-        **parts,
+    """What a run of people would leave behind, with drawn weights; its path."""
+    state = {"height": size[0], "width": size[1]}
+    parts = {
+        "data": {"name": "human_scans", **state},
+        "density_head": "laplace_image",
+        "encoder": encoders,
+        "uncertainty": uncertainty,
     }
-    target, shape = Target("image", names, size=size), (points, len(COLUMNS))
-    made = build_predictor(config, target, shape, 0, COLUMNS)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.add_(0.02 * torch.randn_like(parameter))
-    described = Description(
-        config, target, shape, COLUMNS, True, data_state={"height": size[0], "width": size[1]}
-    )
-    weights = {PREFIX + key: value for key, value in made.state_dict().items()}
-    checkpoints.write({"framework": described.stored(), "state_dict": weights}, file)
-    return str(file)
+    target = Target("image", names, size=size)
+    return trained.checkpoint(file, parts, target, (points, len(COLUMNS)), COLUMNS, state)
 
 
 POINTS_ARE_DRAWN = {

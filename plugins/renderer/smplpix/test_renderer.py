@@ -64,11 +64,7 @@ def given(scene):
 @pytest.mark.parametrize("size", [SIZE, OTHER])
 @pytest.mark.parametrize("members", [1, 3])
 def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path):
-    wrapped = (
-        {"uncertainty": [resolve("uncertainty", {"name": "ensemble", "members": members})]}
-        if members > 1
-        else {}
-    )
+    wrapped = {"uncertainty": [{"name": "ensemble", "members": members}]} if members > 1 else {}
     points = len(MESH.vertices)
     drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, points, **wrapped))
     sized = [{**encoders[0], "height": size[0], "width": size[1]}, encoders[1]]
@@ -148,13 +144,11 @@ def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
 
 
 def test_a_run_that_paints_no_people_is_refused(tmp_path):
-    parts = {"density_head": resolve("density_head", {"name": "laplace_image"})}
     grey = checkpoint(
         tmp_path / "grey.ckpt",
         [seeing(SIZE, **NEAR), {"name": "slim", **SLIM, "colors": 1}],
         SIZE,
         names=("grey",),
-        **parts,
     )
     with pytest.raises(ConfigError, match=r"predicts grey from x, y, z.*red, green and blue"):
         renderer(grey)
