@@ -9,14 +9,15 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from framework.configuration.description import Description
+from framework.configuration.loading import stored
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
 from framework.geometry.light import eight_bit
-from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.renderer import Scene
 from framework.target import Target
-from framework.testing import trained
+from framework.testing.contract import contract
 from framework.testing.scenes import sphere
 from plugins.data.bodies import animate, animation, flow, motion, scan_layout
 from plugins.data.bodies.body import BodyModel
@@ -234,31 +235,21 @@ def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person
 
 
 @pytest.mark.parametrize("walks", [False, True])
-def test_a_run_and_a_motion_become_pictures_side_by_side(data, person, tmp_path, walks, capsys):
-    points, target = len(person.registration.vertices), Target("image", COLOURS, size=SIZE)
-    parts = {
-        "data": {
-            "name": "human_scans",
-            **{key: value for key, value in SMALL.items() if key != "root"},
-            **DOLL,
-        },
-        "density_head": "laplace_image",
-        "encoder": [
-            {"name": "projection", "height": SIZE[0], "width": SIZE[1]},
-            {"name": "slim", "widths": [8, 8]},
-        ],
-    }
-    state = {"height": SIZE[0], "width": SIZE[1]}
-    run = trained.checkpoint(tmp_path / "model.ckpt", parts, target, (points, 6), (*XYZ, *COLOURS), state)
+def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, capsys, monkeypatch):
+    run = contract("renderer", "smplpix").rows[0].config["checkpoint"]
+    description, _ = stored(run)
+    height, width = animate.data_of(description).size
+    # of a doll: the run's own data needs the default body
+    monkeypatch.setattr(animate, "data_of", lambda description: data)
     (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS, {}]))
     asked = [run, "--frames", "3", "--out", str(tmp_path / "new/film.gif")]
     animate.main([*asked, *(["test_0001", "--motion", str(tmp_path / "walk.bvh")] if walks else [])])
     assert "film.gif" in capsys.readouterr().out
     with Image.open(tmp_path / "new/film.gif") as film:
-        assert film.n_frames == 3 and film.size == (3 * SIZE[1], SIZE[0] + animation.CAPTION)
-        first, second = (
-            np.asarray(film.convert("RGB")).astype(int) for _ in range(2) if film.seek(_) is None
-        )
+        assert film.n_frames == 3 and film.size == (3 * width, height + animation.CAPTION)
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(1)
+        second = np.asarray(film.convert("RGB")).astype(int)
     assert np.abs(first - second).max() > 50  # somebody moves
 
 
@@ -296,6 +287,9 @@ def test_a_film_needs_its_program_and_people_who_are_there(data, tmp_path, monke
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(DataError, match="ffmpeg"):
         animate.write(tmp_path / "film.mp4", frames(2))
+    other = Description({"data": {"name": "moons"}}, Target("class", ("a",)), (2,), (), True, path="a.ckpt")
+    with pytest.raises(ConfigError, match=r"a\.ckpt was trained on data 'moons'"):
+        animate.data_of(other)
     with pytest.raises(DataError, match="Did you mean 'test_000"):
         animate.cast(data, "test_000", None, 2)
     mesh = tmp_path / "own.ply"

@@ -5,8 +5,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import torch
+
+from framework.configuration.assembly import Resolved, build_predictor
+from framework.configuration.description import Description
+from framework.configuration.loading import PREFIX
+from framework.configuration.schema import resolve
+from framework.storage import checkpoints
 from framework.target import Target
-from framework.testing import trained
 from framework.testing.rows import CloudRow, EncoderRow, RendererRow
 from plugins.renderer.smplpix.projection import COLUMNS
 
@@ -33,15 +39,25 @@ def checkpoint(
     uncertainty: Sequence[dict[str, Any]] = (),
 ) -> str:
     """What a run of people would leave behind, with drawn weights; its path."""
-    state = {"height": size[0], "width": size[1]}
-    parts = {
-        "data": {"name": "human_scans", **state},
-        "density_head": "laplace_image",
-        "encoder": encoders,
-        "uncertainty": uncertainty,
+    state, target = {"height": size[0], "width": size[1]}, Target("image", names, size=size)
+    config: Resolved = {
+        "data": resolve("data", {"name": "human_scans", **state}),
+        "density_head": resolve("density_head", "laplace_image"),
+        "encoder": [resolve("encoder", part) for part in encoders],
+        "uncertainty": [resolve("uncertainty", part) for part in uncertainty],
+        "objective": [],
+        "metric": [],
+        "outliers": None,
     }
-    target = Target("image", names, size=size)
-    return trained.checkpoint(file, parts, target, (points, len(COLUMNS)), COLUMNS, state)
+    shape = (points, len(COLUMNS))
+    made = build_predictor(config, target, shape, 0, COLUMNS)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    described = Description(config, target, shape, COLUMNS, True, data_state=state)
+    weights = {PREFIX + key: value for key, value in made.state_dict().items()}
+    checkpoints.write({"framework": described.stored(), "state_dict": weights}, file)
+    return str(file)
 
 
 POINTS_ARE_DRAWN = {
