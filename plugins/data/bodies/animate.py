@@ -31,6 +31,7 @@ from plugins.data.bodies.scan_layout import read_registration, read_splits
 KINDS = (".gif", ".webp", ".mp4")
 SPEED = 20
 """Pictures a second."""
+NEARLY_WHITE = 248  # of 255: is the ground in a GIF's palette
 
 
 def main(arguments: list[str]) -> None:
@@ -170,10 +171,10 @@ def write(file: Path, frames: Sequence[Image.Image]) -> None:
     if kind == ".gif":  # one palette for all and no dithering, or the ground would flicker
         some = frames[:: max(len(frames) // 8, 1)]
         every = np.concatenate([np.asarray(frame) for frame in some])
-        palette = Image.fromarray(every).quantize(255)
-        palette.putpalette(
-            [255, 255, 255, *(palette.getpalette() or [])[: 3 * 255]]
-        )  # the ground stays white
+        palette = Image.fromarray(every).quantize(256)
+        colors = np.array(palette.getpalette()).reshape(-1, 3)
+        colors[colors.min(1) >= NEARLY_WHITE] = 255
+        palette.putpalette(colors.ravel().tolist())
         frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     first, *rest = frames
     first.save(file, save_all=True, append_images=rest, duration=1000 // SPEED, loop=0, quality=90)
