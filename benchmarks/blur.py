@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
+from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build
 from framework.datasets.images import blurred, picture
 from framework.distributions.density import circular_grid
 from framework.distributions.protocol import marginal
 from framework.model import Predictor
 from framework.reports.table import aggregate, csv, markdown
-from framework.runs.loading import load_with_description
 
 METHODS = ("fixed_kappa", "von_mises", "mixture", "cvae", "scvae")
 DEVIATIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)

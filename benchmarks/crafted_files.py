@@ -16,7 +16,7 @@ import h5py
 import torch
 from PIL import Image
 
-from framework.training.checkpoint import _MARK
+from framework.storage.checkpoints import MARK
 
 BOMB = 2**27 + 2**20
 """Bytes that a compressed file of a thousandth unfolds to; more than `framework.storage.reading.room` allows."""
@@ -341,7 +341,7 @@ def checkpoints(whole: bytes, signed: Callable[[bytes], bytes]) -> Iterator[byte
 
 def sha(content: bytes) -> bytes:
     """A file with a checkpoint's checksum."""
-    return content + _MARK + hashlib.sha256(content).digest()
+    return content + MARK + hashlib.sha256(content).digest()
 
 
 TEXTS = [

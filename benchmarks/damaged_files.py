@@ -19,14 +19,15 @@ from PIL import Image
 from scipy import sparse
 
 from benchmarks.damage import Damage, spoilt
+from framework.configuration import loading
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
-from framework.runs import loading
+from framework.storage.checkpoints import MARK, TRAILER
 from framework.target import Target
 from framework.testing import sample_files
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import RunInfo, Sidecar
-from framework.training.checkpoint import _MARK, _TRAILER, WholeCheckpoints
+from framework.training.checkpoint import WholeCheckpoints
 from plugins.data.head_pose import idiap_labels, roots
 
 RANDOM = np.random.default_rng(0)
@@ -90,15 +91,15 @@ def signed(inner: Damage) -> Damage:
     """A checkpoint whose content is damaged and whose checksum is right."""
 
     def damage(content: bytes, random: np.random.Generator) -> bytes:
-        made = inner(content[:-_TRAILER], random)
-        return made + _MARK + hashlib.sha256(made).digest()
+        made = inner(content[:-TRAILER], random)
+        return made + MARK + hashlib.sha256(made).digest()
 
     return damage
 
 
 def in_values(content: bytes, random: np.random.Generator) -> bytes:
     """A checkpoint written anew with a value less, or another one."""
-    values = torch.load(io.BytesIO(content[:-_TRAILER]), weights_only=True)
+    values = torch.load(io.BytesIO(content[:-TRAILER]), weights_only=True)
     odd = (None, -1, 10**12, 0.5, "x" * 5000, [], {}, [[]], {"name": "mlp"}, torch.zeros(2, 3), True, [10**9])
     for _ in range(int(random.integers(1, 3))):
         place: Any = values
@@ -120,7 +121,7 @@ def in_values(content: bytes, random: np.random.Generator) -> bytes:
             place[key] = odd[int(random.integers(len(odd)))]
     packed = io.BytesIO()
     torch.save(values, packed)
-    return packed.getvalue() + _MARK + hashlib.sha256(packed.getvalue()).digest()
+    return packed.getvalue() + MARK + hashlib.sha256(packed.getvalue()).digest()
 
 
 # ---- whole files --------------------------------------------------------------------------------------------------

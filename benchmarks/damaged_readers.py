@@ -26,11 +26,11 @@ from benchmarks.damaged_files import (
     written,
 )
 from framework import modes
+from framework.configuration import loading
 from framework.configuration.config import Config
 from framework.datasets.csv_columns import mostly_numbers, numbers, read_columns
 from framework.datasets.images import Crop
 from framework.geometry import meshes
-from framework.runs import loading
 from framework.storage.generated import read_mark
 from framework.storage.weights import read_weights
 from framework.sweeps import jobs

@@ -18,9 +18,9 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
 from framework.configuration.assembly import build_data
+from framework.configuration.loading import load_with_description
 from framework.evaluation.splits import cost
 from framework.reports.table import aggregate, markdown
-from framework.runs.loading import load_with_description
 from framework.training.batches import Batches
 
 METHODS = ("fixed_kappa", "von_mises", "mixture", "cvae", "scvae")

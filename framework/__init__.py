@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import ModuleType
 
+    from framework.configuration.loading import load as load
     from framework.deployment.frozen import freeze as freeze
-    from framework.runs.loading import load as load
 
 __all__ = ["freeze", "load"]
 __version__ = "0.1.0"
 
-_LAZY = {"load": "framework.runs.loading", "freeze": "framework.deployment.frozen"}
+_LAZY = {"load": "framework.configuration.loading", "freeze": "framework.deployment.frozen"}
 
 
 def __getattr__(name: str) -> object:
@@ -59,6 +59,8 @@ class _Moved(MetaPathFinder, Loader):
             "raw_numbers": "heads.parameters",
             "rearranged": "distributions.batch_shapes",
             "rotation": "geometry.rotation",
+            "runs.description": "configuration.description",
+            "runs.loading": "configuration.loading",
             "temper": "distributions.tempering",
             "validation": "calibration.validation",
         }.items()

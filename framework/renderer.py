@@ -157,12 +157,15 @@ class Renderer(ABC):
     """What to cite, as BibTeX."""
     channels: ClassVar[frozenset[str]]
     """What it can draw, each (height, width) or, with a number behind it here, (height, width, number): "color" of as
-    many as the scene's, float32 in [0, 1], background 0; "depth", float32, metres along the optical axis, background
+    many as the scene's, float32 in [0, 1]; "depth", float32, metres along the optical axis, background
     inf; "face", int32, index of the visible face, background -1; "mask", bool; "normal" 3, float32, of the visible
     face, of length 1, in world axes, to the side from which its corners run counter-clockwise; "barycentric" 3,
     float32, weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping, 0
     where it has none; the background of the last three is 0. One that does not draw "uv" refuses "color" of a scene
     with a texture."""
+
+    background: ClassVar[float] = 0.0
+    """What "color" is where nothing is seen, in every channel: 0, or 1 of one that paints on white."""
 
     differentiable: frozenset[str] = frozenset()
     """In what "color" has a gradient, that of pictures of areas and not of single points, of: "vertices", "colors",

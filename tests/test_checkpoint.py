@@ -17,8 +17,9 @@ import torch
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError
+from framework.storage.checkpoints import latest_good, read, verify
 from framework.storage.weights import describe_mismatch
-from framework.training.checkpoint import WholeCheckpoints, latest_good, read, verify
+from framework.training.checkpoint import WholeCheckpoints
 
 CONTENTS: dict[str, Any] = {
     "state_dict": {f"layer{i}.weight": torch.linspace(-1, 1, 35 + i).reshape(-1, 1) for i in range(6)},

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 import framework
 from framework.configuration.assembly import build_predictor
+from framework.configuration.loading import PREFIX
 from framework.configuration.schema import build, resolve
 from framework.deployment.frozen import frozen
 from framework.deployment.frozen_network import affine_logits, connected, read, softmax
 from framework.encoder import Encoder
 from framework.errors import CheckpointError
 from framework.model import FrozenFrontEnd, Model, Predictor
-from framework.runs.loading import PREFIX
 from framework.target import Target
 from framework.training.checkpoint import WholeCheckpoints
 

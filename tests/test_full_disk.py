@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.training.checkpoint import read
+from framework.storage.checkpoints import read
 from tests.conftest import TINY, Done, Framework, listed
 
 STEPS = ("trainer.checkpoint_every_steps=2", "trainer.max_epochs=2", "optimizer=adam")

@@ -6,16 +6,17 @@ from typing import Any
 import pytest
 import torch
 
+from framework.configuration import loading
+from framework.configuration.description import Description
 from framework.configuration.registry import installed, load
 from framework.configuration.schema import build, resolve
 from framework.density_head import Fitted
 from framework.errors import CheckpointError, UserError
 from framework.model import Model
-from framework.runs import loading
-from framework.runs.description import Description
 from framework.runs.session import require_fit
+from framework.storage.checkpoints import read
 from framework.target import Target
-from framework.training.checkpoint import WholeCheckpoints, read
+from framework.training.checkpoint import WholeCheckpoints
 
 OF_PICTURES = {"fit_pose"}
 """Fitted to no features of theirs; their own tests say that a checkpoint holds them."""

@@ -26,10 +26,10 @@ from pandas import DataFrame
 from werkzeug.serving import make_server
 
 from framework.configuration.assembly import build_data, build_predictor, resolve_all
+from framework.configuration.description import Description
+from framework.configuration.loading import PREFIX, load
 from framework.configuration.settings import Settings
 from framework.errors import CheckpointError, ConfigError, DataError, UserError
-from framework.runs.description import Description
-from framework.runs.loading import PREFIX, load
 from framework.tracking import sender, store_process
 from framework.tracking import tracker as tracking
 from framework.tracking.ended import mark_dead, sync

@@ -10,11 +10,11 @@ import torch
 
 import framework as package
 from framework.configuration.assembly import build_outliers, resolve_all
+from framework.configuration.description import Description
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.modes.combine import common, found, wrapping
-from framework.runs.description import Description
 from framework.target import Target
 from tests.conftest import Done, Framework
 

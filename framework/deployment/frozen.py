@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
+from framework.configuration.loading import load_with_description, reader
 from framework.data import Data, Frame
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
@@ -23,7 +24,6 @@ from framework.distributions.moved import Moved
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor
-from framework.runs.loading import load_with_description, reader
 
 
 def freeze(run_or_checkpoint: str | Path, *, uri: str | None = None) -> "Frozen":

@@ -15,6 +15,8 @@ import numpy as np
 import pandas as pd
 import torch
 
+from framework.configuration.description import Description
+from framework.configuration.loading import asked_of, load_with_description, reader
 from framework.data import Batch, Data
 from framework.datasets.png import png
 from framework.distributions.noise import Draw
@@ -22,8 +24,6 @@ from framework.errors import DataError, UserError
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
 from framework.prediction import answers, named
-from framework.runs.description import Description
-from framework.runs.loading import asked_of, load_with_description, reader
 
 CONTENT, NAME = "base64", "name"
 """Columns of a request with files: their bytes, and (if their kind hangs on that) their names."""

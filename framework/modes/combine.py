@@ -9,14 +9,14 @@ import torch
 
 from framework.configuration.assembly import build_predictor
 from framework.configuration.config import Config, Options
+from framework.configuration.description import Description
+from framework.configuration.loading import load_with_description
 from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
-from framework.runs.description import Description
-from framework.runs.loading import load_with_description
 from framework.runs.run import opened
 from framework.runs.session import around, begin, calibrate, tested
 from framework.uncertainty import Joining

@@ -8,15 +8,16 @@ from pytorch_lightning.callbacks import EarlyStopping
 from rich.console import Console
 from torch import distributed as dist
 
+from framework.configuration.loading import fill, weights
 from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
-from framework.runs.loading import fill, weights
 from framework.runs.run import Run
 from framework.runs.session import Session
+from framework.storage.checkpoints import latest_good, read
 from framework.storage.first_rank import first_rank
 from framework.training.cached_features import CachedFeatures, fits
-from framework.training.checkpoint import WholeCheckpoints, latest_good, read
+from framework.training.checkpoint import WholeCheckpoints
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
 from framework.training.progress import Progress

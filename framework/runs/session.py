@@ -23,6 +23,15 @@ from framework.configuration.assembly import (
     require_outliers,
 )
 from framework.configuration.config import Config
+from framework.configuration.description import Description
+from framework.configuration.loading import (
+    PREFIX,
+    fill,
+    find_checkpoint,
+    load_with_description,
+    reader,
+    weights,
+)
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
@@ -34,15 +43,14 @@ from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
-from framework.runs.description import Description
-from framework.runs.loading import PREFIX, fill, find_checkpoint, load_with_description, reader, weights
 from framework.runs.run import Run
+from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, told
-from framework.training.checkpoint import WholeCheckpoints, read
+from framework.training.checkpoint import WholeCheckpoints
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 

@@ -56,6 +56,7 @@ def texture(renderer: Renderer, worst: Worst) -> None:
             try:
                 renderer(scene, ("color",))
             except ValueError:
+                worst.count(False, "refused")
                 continue
             worst.count(
                 True, "a scene with a texture was drawn as if it had none, wanted it drawn or a ValueError"

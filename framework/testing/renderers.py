@@ -25,6 +25,7 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "what it cannot draw is refused": (0.0, _refusals),
         "same scene, same bits": (0.0, _repeatable),
         "nothing seen is background": (0.0, _background),
+        "no faces, nothing seen": (0.0, _no_faces),
         "bad triangles are left out": (0.0, _bad_triangles),
         "lower face wins": (0.0, _ties),
         "no holes": (0.0, _no_holes),
@@ -101,11 +102,15 @@ def _repeatable(renderer: Renderer, worst: Worst) -> None:
         worst.same_bits(name, again, first[name])
 
 
+def _no_faces(renderer: Renderer, worst: Worst) -> None:
+    """Of one that draws sets of points a row leaves this out."""
+    _is_background(renderer, empty(sphere()), "no faces", worst)
+
+
 def _background(renderer: Renderer, worst: Worst) -> None:
     scene = sphere()
     away = torch.tensor([1e3, 1e3, 1e3])
     scenes = {
-        "no faces": empty(scene),
         "no vertices": replace(empty(scene), vertices=torch.zeros(0, 3), colors=torch.zeros(0, 3)),
         "behind the camera": square(-3.0),
         "out of view": replace(scene, vertices=scene.vertices + away),
@@ -141,10 +146,13 @@ def _bad_triangles(renderer: Renderer, worst: Worst) -> None:
 
 def _is_background(renderer: Renderer, scene: Scene, what: str, worst: Worst) -> None:
     drawn = renderer(scene, sorted(renderer.channels))
-    background: dict[str, float] = {"color": 0.0, "depth": math.inf, "face": -1, "mask": 0}
+    background: dict[str, float] = {"depth": math.inf, "face": -1, "mask": 0}
     background |= {"normal": 0.0, "barycentric": 0.0, "uv": 0.0}
     for name, value in drawn.items():
-        if name in background:
+        if name == "color":
+            off = (value - renderer.background).abs()
+            worst.see(off, f"color of a scene {what}: {value.flatten()[int(off.argmax())].item():.6g}")
+        elif name in background:
             worst.count(value != background[name], f"{name} of a scene {what}")
 
 

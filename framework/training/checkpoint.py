@@ -1,216 +1,27 @@
-"""Checkpoints that are whole or absent: written aside, synced, renamed; verified before they are read."""
+"""Lightning's door to checkpoints that are whole or absent (framework.storage.checkpoints)."""
 
-import hashlib
-import os
-import shutil
-import zipfile
-from collections.abc import Collection, Mapping
 from pathlib import Path
-from pickle import UnpicklingError
-from typing import Any, BinaryIO, cast, final
+from typing import Any, final
 
-import torch
 from pytorch_lightning.plugins.io import CheckpointIO
-from torch import Tensor
-from torch.serialization import get_unsafe_globals_in_checkpoint
 
-from framework.errors import CheckpointError, shown
-from framework.storage.files import full, remove_leftovers, replacing
-from framework.storage.plain_values import require_flat
-
-# A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
-# all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
-# bit can make torch 2.13 return uninitialised memory for a tensor.
-_MARK = b"\nsha256 of above:"
-_TRAILER = len(_MARK) + hashlib.sha256().digest_size
+from framework.storage import checkpoints
 
 
 @final
 class WholeCheckpoints(CheckpointIO):
-    """Saves so that the file under the final name is the new checkpoint or the old one, never a part of one.
-
-    Holds across SIGKILL and power loss: the bytes are on disk before the name points at them.
-    """
+    """Saves so that the file under the final name is the new checkpoint or the old one, never a part of one."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
     ) -> None:
-        """Write `checkpoint`, a tree of dicts, lists, tuples, plain values and tensors.
-
-        Raises:
-            CheckpointError: the disk has no room (nothing was written), or the contents are not plain values;
-                the file that was there before is untouched.
-        """
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(path.parent)
-        needed = _bytes_needed(checkpoint)
-        if shutil.disk_usage(path.parent).free < needed:
-            raise _no_room(path, needed)
-        try:
-            with replacing(path) as partial:
-                with partial.open("wb") as file:
-                    hashed = _Hashed(file)
-                    torch.save(checkpoint, cast(BinaryIO, hashed))
-                    file.write(_MARK + hashed.digest.digest())
-                _require_plain(partial, path)
-        except (OSError, RuntimeError) as error:
-            # torch fails once more when it closes a file that took no more
-            fault = error if isinstance(error, OSError) else error.__context__
-            if isinstance(fault, OSError) and full(fault):
-                raise _no_room(path, needed) from fault
-            raise
+        checkpoints.write(checkpoint, Path(path))
 
     def load_checkpoint(
         self, path: str | Path, map_location: object = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
         """`read(path)`: on the CPU and plain values only, whatever Lightning asks for."""
-        return read(Path(path))
+        return checkpoints.read(Path(path))
 
     def remove_checkpoint(self, path: str | Path) -> None:
         Path(path).unlink(missing_ok=True)
-
-
-def read(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint, on the CPU, after all its bytes passed the checksum.
-
-    Raises:
-        CheckpointError: missing, empty, cut, damaged, or holding anything but plain values. The message names
-            the newest whole checkpoint beside it, where there is one.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"There is no checkpoint {path}. {_remedy(path)}")
-    with path.open("rb") as file:
-        fault = _fault(file)
-        if fault is not None:
-            raise CheckpointError(f"The checkpoint {path} cannot be used: {fault}. {_remedy(path)}")
-        file.seek(0)
-        try:
-            _require_unfolded(file)
-            content = torch.load(file, weights_only=True, map_location="cpu")
-            if not isinstance(content, dict):
-                raise ValueError(f"it holds {type(content).__name__}")
-            return content
-        except UnpicklingError:
-            raise CheckpointError(
-                f"The checkpoint {path} holds more than dicts, lists, numbers, strings and tensors, which "
-                "could run code. This framework did not write it: do not use it."
-            ) from None
-        except Exception as error:  # its checksum is right and its content is not: torch raises a dozen kinds
-            raise CheckpointError(
-                f"The checkpoint {path} cannot be used: {shown(error)}. {_remedy(path)}"
-            ) from error
-
-
-def _require_unfolded(file: BinaryIO) -> None:
-    """Refuse what torch does not write and a small file could take any memory or time by."""
-    with zipfile.ZipFile(file) as archive:
-        parts = archive.infolist()
-        size = os.fstat(file.fileno()).st_size
-        if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
-            raise ValueError("its parts unfold to more than the file")
-        for part in parts:
-            if part.filename.endswith("data.pkl"):
-                require_flat(archive.read(part))
-    file.seek(0)
-
-
-def verify(path: Path) -> str | None:
-    """What is wrong with a checkpoint file, as a clause, or None. Reads it once and unpickles nothing."""
-    with path.open("rb") as file:
-        return _fault(file)
-
-
-def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | None:
-    """The most recently written checkpoint of a folder that verifies; of these `names` only, where given."""
-    files = [
-        path for path in folder.glob("*.ckpt") if path.is_file() and (names is None or path.name in names)
-    ]
-    files.sort(key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
-    return next((path for path in files if verify(path) is None), None)
-
-
-class _Hashed:
-    """The part of a file that `torch.save` writes to, and the checksum of what it wrote."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file = file
-        self.digest = hashlib.sha256()
-
-    def write(self, data: bytes | memoryview) -> int:
-        self.digest.update(data)
-        return self.file.write(data)
-
-    def flush(self) -> None:
-        self.file.flush()
-
-
-def _fault(file: BinaryIO) -> str | None:
-    size = os.fstat(file.fileno()).st_size
-    if size == 0:
-        return "it is empty"
-    file.seek(max(0, size - _TRAILER))
-    mark, wanted = file.read(len(_MARK)), file.read()
-    if mark != _MARK:
-        return "it is cut short, or not a checkpoint of this framework"
-    file.seek(0)
-    digest = hashlib.sha256()
-    rest = size - _TRAILER
-    while rest > 0 and (data := file.read(min(rest, 1 << 20))):
-        digest.update(data)
-        rest -= len(data)
-    return None if digest.digest() == wanted else "it is damaged, its contents fail their checksum"
-
-
-def _remedy(path: Path) -> str:
-    good = latest_good(path.parent)
-    return (
-        f"Use {good}, the newest whole one beside it." if good else "No whole one is beside it: train anew."
-    )
-
-
-def _require_plain(partial: Path, path: Path) -> None:
-    names = get_unsafe_globals_in_checkpoint(partial)
-    if names:
-        raise CheckpointError(
-            f"The checkpoint {path} was not written: it would hold {', '.join(names)}, and only dicts, "
-            "lists, tuples, numbers, strings and tensors are read. Convert these where the state is made."
-        )
-
-
-def _no_room(path: Path, needed: int) -> CheckpointError:
-    free = shutil.disk_usage(path.parent).free
-    return CheckpointError(
-        f"The checkpoint {path} needs {needed / 1e6:.3g} MB and its disk has {free / 1e6:.3g} MB free. "
-        "It was not written; earlier ones are untouched. Free some space and resume the run."
-    )
-
-
-def _bytes_needed(checkpoint: object) -> int:
-    """An upper estimate of the file's size: each storage and text once, and what pickle and zip add."""
-    needed = 8192
-    seen: set[int] = set()
-    stack: list[Any] = [checkpoint]
-    while stack:
-        item = stack.pop()
-        needed += 10
-        if not isinstance(item, Tensor | Mapping | list | tuple | set | str | bytes):
-            continue
-        if isinstance(item, Tensor) and item.layout is not torch.strided:
-            continue  # has no storage of its own to ask; a disk that fills up is met when it does
-        identity = item.untyped_storage().data_ptr() if isinstance(item, Tensor) else id(item)
-        if identity in seen:
-            needed += 128
-            continue
-        seen.add(identity)
-        if isinstance(item, Tensor):
-            needed += item.untyped_storage().nbytes() + 512
-        elif isinstance(item, Mapping):
-            stack.extend([*item.keys(), *item.values()])
-        elif isinstance(item, str):
-            needed += len(item.encode("utf-8", "surrogatepass"))
-        elif isinstance(item, bytes):
-            needed += 2 * len(item) + 64  # pickled as text
-        else:
-            stack.extend(item)
-    return needed

@@ -194,7 +194,7 @@ class KeepCheckpoints(pl.Callback):
 
     Training goes on from the first two; `best` holds weights alone, with Adam a third of the size. `last` is saved at
     the end of every epoch that was validated, of the last one, and every `every_steps` steps; `best` whenever the
-    validation loss is lower than ever. Each write is whole or absent (framework.training.checkpoint).
+    validation loss is lower than ever. Each write is whole or absent (framework.storage.checkpoints).
 
     Attributes:
         kept_loss: validation loss of the weights that will be tested, nats.

@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 from PIL import Image
 
+from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.errors import ConfigError, UserError
 from framework.geometry.clouds import denormalised, sizes
-from framework.runs.loading import load_with_description
 from plugins.data.bodies.data import Registration
 from plugins.data.bodies.people import chosen_body
 from plugins.data.bodies.result import picture, write_ply

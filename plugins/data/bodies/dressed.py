@@ -5,10 +5,11 @@ smoothly towards the scan, with the colours of the scan's nearest points: what a
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.random import Generator
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
@@ -18,8 +19,8 @@ from plugins.data.bodies import skins
 from plugins.data.bodies.anatomy import Anatomy, anatomy
 from plugins.data.bodies.body import Body, BodyModel
 from plugins.data.bodies.fabrics import noise
-from plugins.data.bodies.garments import outfit
-from plugins.data.bodies.hair import Piece, hair, tied
+from plugins.data.bodies.garments import Skirt, outfit
+from plugins.data.bodies.hair import Hair, Piece, hair, tied
 from plugins.data.bodies.hanging import hung
 from plugins.data.bodies.topologies import Sheet, edges, sheet
 
@@ -50,6 +51,17 @@ class Registered:
 
     vertices: Float[np.ndarray, "sheet 3"]
     colors: UInt8[np.ndarray, "sheet 3"]
+
+
+class Clothes(NamedTuple):
+    """What somebody wears, whatever the pose: on each vertex of the sheet linear colours, how far cloth and hair stand
+    off, metres, and how much of the body cloth hides; and what hangs beside it."""
+
+    colors: Float[np.ndarray, "sheet 3"]
+    raised: Float[np.ndarray, "sheet"]
+    cover: Float[np.ndarray, "sheet"]
+    skirt: Skirt | None
+    hair: Hair
 
 
 class Wardrobe:
@@ -83,6 +95,11 @@ class Wardrobe:
         random: Generator,
     ) -> tuple[Scan, Registered]:
         """Clothes, hair and skin drawn for a posed body; `skin` is a picture of one in the body's texture layout."""
+        scan, seen = self.scanned(posed, self.clothes(skin, random), random)
+        return scan, self.registered(posed, scan, seen, random)
+
+    def clothes(self, skin: UInt8[np.ndarray, "height width 3"] | None, random: Generator) -> Clothes:
+        """What of it does not depend on the pose."""
         where = self.anatomy
         worn = outfit(where, random)
         grown = hair(where, random)
@@ -99,9 +116,16 @@ class Wardrobe:
             raised = raised + garment.raised()
             cover = np.maximum(cover, (garment.inside / 0.03).clip(0, 1))
         colors = colors + grown.share[:, None] * (grown.colors - colors)
-        draped = self.sheet.carried(self._smoothed(posed, cover[: self.vertices]))
-        vertices = draped + (raised + grown.raised)[:, None] * self.normals(draped)
-        pieces = [Piece(vertices, self.faces, colors)]
+        return Clothes(colors, raised + grown.raised, cover, worn.skirt, grown)
+
+    def scanned(
+        self, posed: Float[np.ndarray, "vertices 3"], worn: Clothes, random: Generator
+    ) -> tuple[Scan, Bool[np.ndarray, "points"]]:
+        """The scan of somebody who stands like this, and which of its points a scanner sees."""
+        where = self.anatomy
+        draped = self.sheet.carried(self._smoothed(posed, worn.cover[: self.vertices]))
+        vertices = draped + worn.raised[:, None] * self.normals(draped)
+        pieces = [Piece(vertices, self.faces, worn.colors)]
         hidden = np.zeros(len(vertices), bool)
         if worn.skirt is not None:
             held = np.flatnonzero(where.arms[: self.vertices] < 0.3)
@@ -111,7 +135,7 @@ class Wardrobe:
             pieces.append(piece)
             low, high = piece.vertices[:, 1].min() + 0.01, piece.vertices[:, 1].max() - 0.01
             hidden = (where.arms < 0.3) & (vertices[:, 1] > low) & (vertices[:, 1] < high)
-        locks = tied(grown.style, grown.color, *self._head(posed), random)
+        locks = tied(worn.hair.style, worn.hair.color, *self._head(posed), random)
         if locks is not None:
             pieces.append(locks)
         light = Light(random)
@@ -126,13 +150,13 @@ class Wardrobe:
             np.concatenate(lit).clip(0, 1),
         )
         seen = np.concatenate([~hidden, *(np.ones(len(piece.vertices), bool) for piece in pieces[1:])])
-        return scan, self._registered(posed, scan, seen, random)
+        return scan, seen
 
     def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
         """Unit normals of the sheet's vertices, outwards, means over their faces by area."""
         return _unit(self._spread @ _cross(vertices, self.faces))
 
-    def _registered(self, posed: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator) -> Registered:
+    def registered(self, posed: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator) -> Registered:
         """The body, drawn towards the nearest points of the scan as registrations are, with their colours.
 
         Vertices move along their normals, no further than FURTHEST, and each as its neighbours do: what is thinner than
@@ -140,7 +164,7 @@ class Wardrobe:
         """
         points = scan.vertices[seen]
         tree = KDTree(points, balanced_tree=False, compact_nodes=False)
-        outwards = _unit(self._own_spread @ _cross(posed, self.body.faces))
+        outwards = self._outwards(posed)
         moved = np.zeros(len(posed))
         for _ in range(STEPS):
             now = posed + moved[:, None] * outwards
@@ -151,6 +175,19 @@ class Wardrobe:
         vertices = self.sheet.carried(posed + off[:, None] * outwards)
         nearest = np.flatnonzero(seen)[tree.query(vertices)[1]]
         return Registered(vertices, eight_bit(torch.from_numpy(scan.colors[nearest])).numpy())
+
+    def reposed(
+        self,
+        registration: Float[np.ndarray, "sheet 3"],
+        stood: Float[np.ndarray, "vertices 3"],
+        posed: Float[np.ndarray, "vertices 3"],
+    ) -> Float[np.ndarray, "sheet 3"]:
+        """A registration of somebody who stood like this, in another pose: as far off the body along its normals."""
+        off = ((registration[: self.vertices] - stood) * self._outwards(stood)).sum(1)
+        return self.sheet.carried(posed + off[:, None] * self._outwards(posed))
+
+    def _outwards(self, posed: np.ndarray) -> Float[np.ndarray, "vertices 3"]:
+        return _unit(self._own_spread @ _cross(posed, self.body.faces))
 
     def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
         """Without what cloth hides: each step blurs, and undoes the shrinking that comes of it (Taubin 1995)."""

@@ -97,9 +97,9 @@ class HumanScans(Data):
         mirrored: bool = True,
         recoloured: Annotated[float, Field(ge=0, le=1)] = 0.5,
     ) -> None:
-        if "color" not in renderer.channels:
+        if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} draws no color; choose another renderer."
+                f"data.renderer = {type(renderer).__name__} draws no color on black; choose another renderer."
             )
         self.renderer = renderer
         self.root = root

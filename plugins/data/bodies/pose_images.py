@@ -99,9 +99,9 @@ class PoseFromImage(Data):
         body: str | None = None,
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
     ) -> None:
-        if "color" not in renderer.channels:
+        if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} draws no color; choose another renderer."
+                f"data.renderer = {type(renderer).__name__} draws no color on black; choose another renderer."
             )
         self.renderer = renderer
         self.counts = asdict(counts)

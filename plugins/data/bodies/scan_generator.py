@@ -3,15 +3,17 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy.random import Generator
 from PIL import Image
 from pydantic import Field
+from torch import Tensor
 
 from framework.errors import ConfigError
 from framework.geometry.light import linear
@@ -23,7 +25,7 @@ from plugins.data.bodies.dressed import Wardrobe
 from plugins.data.bodies.people import adults, chosen_body
 from plugins.data.bodies.photographs import photographed, rig, texture
 from plugins.data.bodies.scan_layout import Registration
-from plugins.data.bodies.topologies import Name, topology
+from plugins.data.bodies.topologies import Name, Topology, topology
 
 VERSION = 1
 """Of what is drawn; a change takes a new number."""
@@ -71,6 +73,15 @@ def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, 
     return generated(root, crowd.mark, crowd.write)
 
 
+class Person(NamedTuple):
+    """Shape coefficients, pose, a picture of skin where there are some, and where further draws come from."""
+
+    shape: Float[Tensor, "1 shape"]
+    pose: Float[Tensor, "1 joint 3"]
+    skin: UInt8[np.ndarray, "height width 3"] | None
+    random: Generator
+
+
 class Crowd:
     """All people of a data set: each is a function of the seed, the split and its number there."""
 
@@ -92,11 +103,15 @@ class Crowd:
         }
         self.digest = _hash(repr(sorted(self.mark.items())).encode())
 
+    @cached_property
+    def wardrobe(self) -> Wardrobe:
+        return Wardrobe(self.body)
+
+    @cached_property
+    def meshes(self) -> dict[Name, Topology]:
+        return {name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies}
+
     def write(self, root: Path) -> None:
-        self.wardrobe = Wardrobe(self.body)
-        self.meshes = {
-            name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies
-        }
         everyone = [(split, number) for split in SPLITS for number in range(self.counts[split])]
         scan_layout.write_splits(
             root, {split: [_name(split, number) for number in range(self.counts[split])] for split in SPLITS}
@@ -110,11 +125,8 @@ class Crowd:
 
     def _write_person(self, root: Path, split: str, number: int) -> None:
         folder = root / "subjects" / _name(split, number)
-        random = np.random.default_rng([self.seed, SPLITS.index(split), number])
-        skin = None
-        if some := self.skins[SPLITS.index(split)]:
-            skin = skins.read(some[int(random.integers(len(some)))])
-        scan, registered = self.wardrobe.dress(self._posed(split, random), skin, random)
+        shape, pose, skin, random = self.person(split, number)
+        scan, registered = self.wardrobe.dress(self.posed(shape, pose), skin, random)
         views = rig(scan.vertices, self.drawing.views, (self.drawing.height, self.drawing.width), random)
         for name, mesh in self.meshes.items():
             scan_layout.write_registration(
@@ -138,9 +150,12 @@ class Crowd:
             pixels = texture(self.renderer, self.wardrobe.uv, faces, colors, self.drawing.texture_side)
             Image.fromarray(pixels).save(folder / "texture.png")
 
-    @torch.no_grad()
-    def _posed(self, split: str, random: Generator) -> Float[np.ndarray, "vertices 3"]:
-        """The bare body of a random person as it stands."""
+    def person(self, split: str, number: int) -> Person:
+        """Who it is, before anything is worn."""
+        random = np.random.default_rng([self.seed, SPLITS.index(split), number])
+        skin = None
+        if some := self.skins[SPLITS.index(split)]:
+            skin = skins.read(some[int(random.integers(len(some)))])
         if self.traits is None:
             shape = torch.from_numpy(random.normal(0, 1, (1, min(10, self.body.shapes.shape[2]))))
         else:
@@ -148,8 +163,15 @@ class Crowd:
         anyhow = split == "test" and random.random() < self.drawing.posed
         movements = poses.draw(1, random) if anyhow else a_pose(random)
         pose = poses.rotations(self.body, poses.skeleton(self.body), movements)
+        return Person(shape, torch.from_numpy(pose), skin, random)
+
+    @torch.no_grad()
+    def posed(
+        self, shape: Float[Tensor, "1 shape"], pose: Float[Tensor, "1 joint 3"]
+    ) -> Float[np.ndarray, "vertices 3"]:
+        """The bare body as it stands."""
         kind = self.wardrobe.model.template.dtype
-        return self.wardrobe.model(shape.to(kind), torch.from_numpy(pose).to(kind))[0].numpy()
+        return self.wardrobe.model(shape.to(kind), pose.to(kind))[0].numpy()
 
 
 def a_pose(random: Generator) -> Float[np.ndarray, "1 movement"]:

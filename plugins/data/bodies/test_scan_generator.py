@@ -13,10 +13,11 @@ from framework.renderer import Scene, Texture
 from framework.storage import cache
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
-from plugins.data.bodies import photographs, scan_generator, scan_layout, skins
+from plugins.data.bodies import photographs, pose_images, scan_generator, scan_layout, skins
 from plugins.data.bodies.dressed import ERROR, FURTHEST, Wardrobe
-from plugins.data.bodies.human_scans import photograph
+from plugins.data.bodies.human_scans import Counts, HumanScans, photograph
 from plugins.data.bodies.people import chosen_body
+from plugins.data.bodies.pose_images import PoseFromImage
 from plugins.data.bodies.rows import DOLL, SMALL
 
 RENDERER = build("renderer", resolve("renderer", {"name": "rasterizer"}))
@@ -259,3 +260,17 @@ def test_supersampling_keeps_the_camera():
     points = torch.tensor([[0.1, -0.1, 1.0], [0.0, 0.02, 2.0]])
     pixel, _ = camera.projected(points)
     torch.testing.assert_close(finer.projected(points)[0], 4 * pixel + 1.5)
+
+
+def test_photographs_want_a_renderer_that_tells_the_subject_from_the_ground():
+    class OnWhite(type(RENDERER)):
+        background = 1.0
+
+    class Colourless(type(RENDERER)):
+        channels = frozenset({"depth"})
+
+    for renderer in (OnWhite(), Colourless()):
+        with pytest.raises(ConfigError, match=f"{type(renderer).__name__} draws no color on black"):
+            HumanScans(renderer=renderer, counts=Counts(), drawing=scan_generator.Drawing())
+        with pytest.raises(ConfigError, match=f"{type(renderer).__name__} draws no color on black"):
+            PoseFromImage(renderer=renderer, counts=pose_images.Counts(), apart=pose_images.Apart())

@@ -1,13 +1,91 @@
 """Rows of the contract: one level and several, sizes even and odd, every normalisation, with and without crop."""
 
-from framework.testing.rows import CloudRow, EncoderRow
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
-NEAR = {"nearest": 0.1, "farthest": 20.0}
+import torch
+
+from framework.configuration.assembly import Resolved, build_predictor
+from framework.configuration.description import Description
+from framework.configuration.loading import PREFIX
+from framework.configuration.schema import resolve
+from framework.storage import checkpoints
+from framework.target import Target
+from framework.testing.rows import CloudRow, EncoderRow, RendererRow
+from plugins.renderer.smplpix.projection import COLUMNS
+
+FOLDER = TemporaryDirectory()
+
+NEAR: dict[str, Any] = {"nearest": 0.1, "farthest": 20.0}
 UNET = {"width": 6, "levels": 3}
 SLIM = {"widths": [8, 12, 16]}
 LESS_PRECISE = {"rows of a batch apart": 1e-2}  # as far as two bfloat16 are apart
 AT_FIRST = {"gradients reach every parameter": "the last layer's weights are 0 until the first step"}
+
+
+def seeing(size: tuple[int, int], name: str = "projection", **config: Any) -> dict[str, Any]:
+    """An encoder that makes pictures of points, of (height, width)."""
+    return {"name": name, "height": size[0], "width": size[1], **config}
+
+
+def checkpoint(
+    file: Path,
+    encoders: Sequence[dict[str, Any]],
+    size: tuple[int, int],
+    points: int = 50,
+    names: tuple[str, ...] = COLUMNS[3:],
+    uncertainty: Sequence[dict[str, Any]] = (),
+) -> str:
+    """What a run of people would leave behind, with drawn weights; its path."""
+    state, target = {"height": size[0], "width": size[1]}, Target("image", names, size=size)
+    config: Resolved = {
+        "data": resolve("data", {"name": "human_scans", **state}),
+        "density_head": resolve("density_head", "laplace_image"),
+        "encoder": [resolve("encoder", part) for part in encoders],
+        "uncertainty": [resolve("uncertainty", part) for part in uncertainty],
+        "objective": [],
+        "metric": [],
+        "outliers": None,
+    }
+    shape = (points, len(COLUMNS))
+    made = build_predictor(config, target, shape, 0, COLUMNS)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    described = Description(config, target, shape, COLUMNS, True, data_state=state)
+    weights = {PREFIX + key: value for key, value in made.state_dict().items()}
+    checkpoints.write({"framework": described.stored(), "state_dict": weights}, file)
+    return str(file)
+
+
+POINTS_ARE_DRAWN = {
+    "no faces, nothing seen": "it draws vertices, of a set of points too",
+    "bad triangles are left out": "it draws vertices: those of a triangle without area too",
+}
+WHITE = {"nothing seen is background": 0.05}  # the drawn weights' answer to an empty picture
+SLIM_RUN, UNET_RUN = (
+    checkpoint(
+        Path(FOLDER.name) / f"{network['name']}.ckpt",
+        [seeing(size, levels=levels, **NEAR), network],
+        size,
+    )
+    for network, size, levels in (
+        ({"name": "slim", **SLIM}, (48, 64), 1),
+        ({"name": "unet", **UNET}, (24, 20), 2),
+    )
+)
 ROWS = {
+    "smplpix": (
+        RendererRow("slim", {"checkpoint": SLIM_RUN}, WHITE, POINTS_ARE_DRAWN),
+        RendererRow(
+            "unet of another size, bfloat16, whole frame",
+            {"checkpoint": UNET_RUN, "precision": "bfloat16", "crop": "whole"},
+            WHITE,
+            POINTS_ARE_DRAWN,
+        ),
+    ),
     "projection": (
         CloudRow("the thesis's size", (40, 6), config=NEAR),
         CloudRow("four levels", (300, 8), config={**NEAR, "height": 21, "width": 34, "levels": 4}),

@@ -11,16 +11,16 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
+from framework.configuration.description import Description
 from framework.configuration.schema import resolve
 from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
 from framework.distributions.moved import Moved
 from framework.errors import CheckpointError
 from framework.model import Predictor
-from framework.runs.description import Description
+from framework.storage.checkpoints import latest_good, read
 from framework.storage.reading import guarded
 from framework.storage.weights import describe_mismatch
-from framework.training.checkpoint import latest_good, read
 
 FOREIGN = "This framework did not write it: do not use it."
 PREFIX = "predictor."
@@ -85,18 +85,35 @@ def load_with_description(
     run_or_checkpoint: str | Path, *, uri: str | None = None
 ) -> tuple[Predictor, Description]:
     """The trained predictor, as `load`, with what the checkpoint says of itself."""
+    description, state = stored(run_or_checkpoint, uri=uri)
+    return rebuilt(description, state), description
+
+
+def stored(
+    run_or_checkpoint: str | Path, *, uri: str | None = None
+) -> tuple[Description, dict[str, torch.Tensor]]:
+    """What a checkpoint says of its model, and the model's weights; as `load`."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
     with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
-        description = Description.read(content, str(path))
+        return Description.read(content, str(path)), weights(content)
+
+
+def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:
+    """The predictor that is described, with these weights, in evaluation mode.
+
+    Raises:
+        CheckpointError: they are of another model.
+    """
+    with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         parts = description.config
         for part in parts["encoder"]:
             # the checkpoint holds the weights now; the file they were started from may be gone
             part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
         shape, columns = description.input_shape, description.columns
         predictor = build_predictor(parts, description.target, shape, 0, columns)
-        fill(predictor, weights(content), str(path))
-    return predictor.eval(), description
+        fill(predictor, state, description.path)
+    return predictor.eval()
 
 
 def weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:

@@ -1,0 +1,182 @@
+"""A generated person in many poses, cameras that go around, and what is drawn of both side by side."""
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from framework.geometry.camera import Camera, canonical_camera
+from framework.geometry.light import eight_bit, linear
+from framework.renderer import Renderer, Scene
+from plugins.data.bodies.dressed import Scan
+from plugins.data.bodies.photographs import photographed
+from plugins.data.bodies.scan_generator import Crowd
+from plugins.data.bodies.scan_layout import Registration
+from plugins.data.bodies.topologies import Name
+
+LOOK_DOWN = math.radians(8)
+FREE = 0.92
+"""Share of an image's height or width that a person fills at most."""
+CAPTION = 16  # pixels
+SAYS = "synthetic"
+
+
+class Moment(NamedTuple):
+    """A person at one time: the registration's vertices, metres, and the scan, where it is known."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    scan: Scan | None
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Somebody who is drawn again and again: triangles and light of each vertex."""
+
+    faces: Int[Tensor, "faces 3"]
+    colors: Float[Tensor, "vertices 3"]
+
+    def scene(self, moment: Moment, camera: Camera) -> Scene:
+        return Scene(moment.vertices, self.faces, self.colors, camera)
+
+
+class Generated:
+    """A person of a generated data set, who can take any pose.
+
+    The registration is that to the scan in the first pose, reposed: as far off the body everywhere, its colours as they
+    were. The scan is generated anew in each pose: the same clothes, hair and light, with the shading of the pose.
+
+    Attributes:
+        stood: the pose that photographs of the data set show.
+        registration: on the topology, as the data set has it.
+    """
+
+    def __init__(self, crowd: Crowd, split: str, number: int, name: Name) -> None:
+        self.crowd, self.wardrobe = crowd, crowd.wardrobe
+        self.shape, self.stood, skin, self._random = crowd.person(split, number)
+        self._bare = crowd.posed(self.shape, self.stood)
+        self.worn = self.wardrobe.clothes(skin, self._random)
+        random = copy.deepcopy(self._random)
+        scan, seen = self.wardrobe.scanned(self._bare, self.worn, random)
+        self._registered = self.wardrobe.registered(self._bare, scan, seen, random)
+        mesh = crowd.meshes[name]
+        self._rows = mesh.rows
+        self.registration = Registration(
+            torch.from_numpy(self._registered.vertices[mesh.rows]).float(),
+            torch.from_numpy(self._registered.colors[mesh.rows]),
+            torch.from_numpy(mesh.faces),
+        )
+        self._first = Moment(self.registration.vertices, scan)
+        self._floor = float(self.registration.vertices[:, 1].min())
+
+    def first(self) -> Moment:
+        """As the data set shows them."""
+        return self._first
+
+    def at(self, pose: Float[np.ndarray, "joint 3"]) -> Moment:
+        """In a pose, on the floor."""
+        bare = self.crowd.posed(self.shape, torch.from_numpy(pose)[None])
+        scan, _ = self.wardrobe.scanned(bare, self.worn, copy.deepcopy(self._random))
+        vertices = self.wardrobe.reposed(self._registered.vertices, self._bare, bare)[self._rows]
+        up = np.array([0.0, self._floor - vertices[:, 1].min(), 0.0])
+        moved = Scan(scan.vertices + up, scan.faces, scan.colors)
+        return Moment(torch.from_numpy(vertices + up).float(), moved)
+
+
+def actor(registration: Registration) -> Actor:
+    return Actor(registration.faces, linear(registration.colors))
+
+
+def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int, int]) -> list[Camera]:
+    """Cameras that look at the middle of all moments, from the one distance at which each sees all of them whole.
+
+    Args:
+        azimuths: radians; 0 is in front (z), more goes to the subject's left (x).
+        size: (height, width), pixels.
+    """
+    every = torch.cat(
+        [found.vertices for found in {id(one.vertices): one for one in moments}.values()]
+    ).double()
+    middle = (every.amin(0) + every.amax(0)) / 2
+    plain = canonical_camera(*size)
+    # a point is whole in view where focal |x| / (z + distance) is at most half the free width
+    steep = torch.tensor(plain.focal, dtype=torch.float64) * 2 / FREE / torch.tensor(size[::-1])
+    rotations = [_towards(azimuth) for azimuth in azimuths]
+    away = 0.0
+    for rotation in {tuple(one.flatten().tolist()): one for one in rotations}.values():
+        seen = (every - middle) @ rotation.T
+        away = max(away, float((steep * seen[:, :2].abs() - seen[:, 2:]).max()))
+    ahead = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
+    return [
+        Camera(turn.float(), (ahead - turn @ middle).float(), plain.focal, plain.principal, *size)
+        for turn in rotations
+    ]
+
+
+def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
+    """World to camera: x right, y down, z forward; the camera looks down by LOOK_DOWN."""
+    sine, cosine = math.sin(azimuth), math.cos(azimuth)
+    level = math.cos(LOOK_DOWN)
+    back = torch.tensor([level * sine, math.sin(LOOK_DOWN), level * cosine], dtype=torch.float64)
+    right = torch.tensor([cosine, 0.0, -sine], dtype=torch.float64)
+    return torch.stack([right, torch.linalg.cross(right, back), -back])
+
+
+def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height width 3"]:
+    """A picture as a file holds it, whatever ground the renderer paints on."""
+    if renderer.background == 1:
+        return eight_bit(renderer(scene)["color"]).numpy()
+    assert scene.colors is not None
+    cover = torch.ones(len(scene.vertices), 1)  # a fourth channel: how much of a pixel is the subject
+    drawn = renderer(Scene(scene.vertices, scene.faces, torch.cat([scene.colors, cover], 1), scene.camera))[
+        "color"
+    ]
+    return eight_bit(drawn[..., :3] + 1 - drawn[..., 3:]).numpy()
+
+
+def photograph(renderer: Renderer, scan: Scan, camera: Camera) -> UInt8[np.ndarray, "height width 3"]:
+    """What photographs of the data set show, on white."""
+    scene = Scene(
+        torch.from_numpy(scan.vertices).float(),
+        torch.from_numpy(scan.faces),
+        torch.from_numpy(scan.colors).float(),
+        camera,
+    )
+    pixels, mask = photographed(renderer, scene, [camera])[0]
+    cover = torch.from_numpy(mask).float()[..., None] / 255
+    return eight_bit(linear(torch.from_numpy(pixels)) * cover + 1 - cover).numpy()
+
+
+def columns(
+    actor: Actor,
+    moments: Sequence[Moment],
+    cameras: Sequence[Camera],
+    renderers: Mapping[str, Renderer],
+    camera_of_truth: Renderer,
+) -> Iterator[dict[str, UInt8[np.ndarray, "height width 3"]]]:
+    """Frame by frame what each renderer draws, by its name, and "photograph" where the scan is known."""
+    for moment, camera in zip(moments, cameras, strict=True):
+        scene = actor.scene(moment, camera)
+        found = {name: on_white(renderer, scene) for name, renderer in renderers.items()}
+        if moment.scan is not None:
+            found["photograph"] = photograph(camera_of_truth, moment.scan, camera)
+        yield found
+
+
+def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:
+    """With their names below, and said beside the first what is synthetic."""
+    height, width = next(iter(pictures.values())).shape[:2]
+    sheet = Image.new("RGB", (width * len(pictures), height + CAPTION), "white")
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(11)
+    for number, (name, pixels) in enumerate(pictures.items()):
+        sheet.paste(Image.fromarray(pixels), (number * width, 0))
+        pen.text((number * width + 5, height + 1), name, "black", font)
+    if synthetic:
+        pen.text((sheet.width - 5, height + 1), SAYS, (150, 0, 0), font, anchor="ra")
+    return sheet

@@ -1,0 +1,77 @@
+"""Where each point of a moving mesh was a picture before: flow known exactly, and pictures brought along by it."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d
+
+from framework.renderer import Scene
+
+CHANNELS = ("face", "barycentric", "depth")
+"""What a renderer has to draw of each scene."""
+STEEPEST = 2.0
+"""Depths of neighbouring pixels of one surface differ by this many widths of a pixel there, at most."""
+
+Drawn = Mapping[str, Tensor]
+
+
+def flow(
+    before: Scene, after: Scene, drawn_before: Drawn, drawn_after: Drawn
+) -> tuple[Float[Tensor, "height width 2"], Bool[Tensor, "height width"]]:
+    """Of each pixel of the second picture the place (column, row) in the first of the same point of the mesh, float64,
+    and whether it is seen in both.
+
+    A point is seen in a picture where the pixels around it show the mesh, at its depth: not at an outline, and not
+    where something hides it. The place of what is not seen means nothing.
+
+    Args:
+        before, after: of one mesh, with the same faces.
+        drawn_before, drawn_after: `CHANNELS` of each.
+    """
+    face = drawn_after["face"].long()
+    corners = before.vertices.double()[after.faces.long()[face.clamp(min=0)]]
+    weights = drawn_after["barycentric"].double()
+    place, depth = before.camera.projected((weights[..., None] * corners).sum(-2))
+    there = drawn_before["depth"].double()
+    height, width = there.shape
+    low = place.nan_to_num(-1.0).clamp(-1, max(height, width)).floor().long()
+    depth_after = drawn_after["depth"].double()
+    seen = _inside(depth_after, STEEPEST * depth_after / _focal(after))
+    slack = STEEPEST * depth / _focal(before)
+    for right in (0, 1):
+        for down in (0, 1):
+            column, row = low[..., 0] + right, low[..., 1] + down
+            within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            near = there[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+            seen &= within & ((near - depth).abs() < slack)
+    return place, seen
+
+
+def _focal(scene: Scene) -> float:
+    return min(map(float, scene.camera.focal))
+
+
+def _inside(
+    depth: Float[Tensor, "height width"], slack: Float[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Pixels whose neighbours, all of them, show the same surface; none at the border."""
+    far = torch.nn.functional.pad(depth, (1, 1, 1, 1), value=torch.inf)[None]
+    highest, lowest = (sign * max_pool2d(sign * far, 3, 1)[0] for sign in (1, -1))
+    return depth.isfinite() & ((highest - lowest) < 2 * slack)
+
+
+def warped(
+    picture: Float[Tensor, "height width channels"], place: Float[Tensor, "height width 2"]
+) -> Float[Tensor, "height width channels"]:
+    """The first picture at these places, interpolated between pixel centres."""
+    height, width = picture.shape[:2]
+    share = 2 * place / (torch.tensor([width, height]) - 1).clamp(min=1) - 1
+    found = grid_sample(
+        picture.movedim(-1, 0)[None].double(),
+        share[None].nan_to_num(-2.0),
+        padding_mode="border",
+        align_corners=True,
+    )
+    return found[0].movedim(0, -1).to(picture.dtype)

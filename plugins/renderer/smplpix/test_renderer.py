@@ -1,0 +1,154 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+import framework
+from framework.configuration.schema import build, resolve
+from framework.distributions.protocol import images
+from framework.errors import CheckpointError, ConfigError
+from framework.geometry.camera import canonical_camera, look_from
+from framework.geometry.light import encoded, light_of
+from framework.renderer import Scene
+from framework.testing.scenes import sphere
+from plugins.renderer.smplpix.rows import NEAR, SLIM, UNET, checkpoint, seeing
+
+SIZE, OTHER = (40, 32), (27, 50)
+MESH = sphere(rings=12)
+ENCODERS = {
+    "projection, slim": [seeing(SIZE, **NEAR), {"name": "slim", **SLIM}],
+    "projection, unet": [seeing(SIZE, levels=2, **NEAR), {"name": "unet", **UNET}],
+    "rasterised, slim": [seeing(SIZE, "rasterised", depth=True), {"name": "slim", **SLIM, "residual": True}],
+}
+
+
+def renderer(run, **config):
+    return build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": str(run), **config}))
+
+
+def seen_from(size, azimuth=0.4):
+    """A camera of unequal focal lengths, off the middle, far from any canonical one."""
+    camera = look_from(azimuth, 0.3, -0.2, distance=3.5, field_of_view=0.8, size=size)
+    return replace(camera, focal=(camera.focal[0], 1.1 * camera.focal[1]), principal=(17.0, 15.5))
+
+
+@pytest.fixture(scope="module", params=ENCODERS)
+def encoders(request, tmp_path_factory):
+    found = [dict(part) for part in ENCODERS[request.param]]
+    if found[0]["name"] == "rasterised":
+        found[0]["root"] = str(root(tmp_path_factory.mktemp("root")))
+    return found
+
+
+def root(folder):
+    """The sphere as the registration of everybody, in the layout that `rasterised` reads its triangles from."""
+    for split in ("train", "validation", "test"):
+        (folder / f"{split}.txt").write_text(f"{split}\n")
+    file = folder / "subjects/train/registration_7k.ply"
+    file.parent.mkdir(parents=True)
+    numbers = ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")
+    head = ["ply", "format ascii 1.0", f"element vertex {len(MESH.vertices)}"]
+    head += [*(f"property {number}" for number in numbers), f"element face {len(MESH.faces)}"]
+    lines = [" ".join([*map(str, place), "9 9 9"]) for place in MESH.vertices.tolist()]
+    lines += [" ".join(map(str, (3, *corners))) for corners in MESH.faces.tolist()]
+    file.write_text("\n".join([*head, "property list uchar int vertex_indices", "end_header", *lines, ""]))
+    return folder
+
+
+def given(scene):
+    """What a user of the loaded run hands over."""
+    assert scene.colors is not None
+    return torch.cat([scene.camera.canonical(scene.vertices), encoded(scene.colors)], 1)[None]
+
+
+@pytest.mark.parametrize("size", [SIZE, OTHER])
+@pytest.mark.parametrize("members", [1, 3])
+def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path):
+    wrapped = {"uncertainty": [{"name": "ensemble", "members": members}]} if members > 1 else {}
+    points = len(MESH.vertices)
+    drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, points, **wrapped))
+    sized = [{**encoders[0], "height": size[0], "width": size[1]}, encoders[1]]
+    loaded = framework.load(checkpoint(tmp_path / "sized.ckpt", sized, size, points, **wrapped))
+    for azimuth in (0.4, 2.0):
+        scene = replace(MESH, camera=seen_from(size, azimuth))
+        before = torch.random.get_rng_state()
+        found = drawn(scene)["color"]
+        assert torch.equal(torch.random.get_rng_state(), before)
+        with torch.no_grad():
+            density = loaded(given(scene))
+        assert torch.equal(found, images(density, ("color",))["color"][0])
+        if members == 1:
+            assert torch.equal(found, light_of(density.mean[0]))  # the numbers of the file, as light
+        assert found.max() - found.min() > 0.01 and found.shape == (*size, 3)
+
+
+def test_a_camera_anywhere_sees_what_the_canonical_one_sees(tmp_path):
+    drawn = renderer(checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
+    scene = replace(MESH, vertices=MESH.vertices.double(), camera=seen_from(SIZE))
+    pixels, depth = scene.camera.projected(scene.vertices)
+    clear = ((pixels + 0.5) - (pixels + 0.5).round()).abs().amin(1) > 1e-3  # rounding decides no pixel
+    plain = canonical_camera(*SIZE)
+    across = (pixels - torch.tensor(plain.principal)) / torch.tensor(plain.focal)
+    moved = torch.cat([across, torch.ones(len(pixels), 1)], 1) * depth[:, None]
+    some = {"faces": MESH.faces[:0], "colors": MESH.colors[clear]}
+    one = drawn(replace(scene, vertices=scene.vertices[clear], **some))["color"]
+    other = drawn(replace(scene, vertices=moved[clear], camera=plain, **some))["color"]
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+
+
+def test_what_must_not_be_seen_is_not(tmp_path):
+    drawn = renderer(checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
+    scene = replace(MESH, camera=replace(seen_from(SIZE), near=3.0))
+    assert scene.colors is not None
+    _, depth = scene.camera.projected(scene.vertices)
+    vertices, bad = scene.vertices.clone(), torch.arange(len(depth)) % 7 == 0
+    vertices[bad] = torch.tensor([torch.nan, torch.inf, 0.0])
+    good = (depth >= 3.0) & ~bad
+    assert 0 < good.sum() < len(depth)
+    alone = Scene(vertices[good], MESH.faces[:0], scene.colors[good], scene.camera)
+    assert torch.equal(drawn(replace(scene, vertices=vertices))["color"], drawn(alone)["color"])
+
+
+def test_the_box_and_the_precision_can_be_chosen(tmp_path):
+    run = checkpoint(
+        tmp_path / "run.ckpt", [ENCODERS["projection, slim"][0], {"name": "slim", **SLIM, "crop": 0}], SIZE
+    )
+    scene = replace(MESH, camera=seen_from(SIZE))
+    pictures = [
+        renderer(run, **config)(scene)["color"]
+        for config in ({}, {"crop": 0}, {"crop": "whole"}, {"precision": "bfloat16"})
+    ]
+    assert torch.equal(pictures[0], pictures[1])
+    for other in pictures[2:]:
+        assert 0 < (other - pictures[0]).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("run, kind, message", [
+    (None, ConfigError, "experiment=smplpix/quick"),
+    ("/nowhere/at/all", CheckpointError, "neither a file"),
+])  # fmt: skip
+def test_without_a_run_it_says_what_to_do(run, kind, message):
+    with pytest.raises(kind, match=message):
+        build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": run}))
+
+
+def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
+    drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices)))
+    scene = replace(MESH, camera=seen_from(SIZE))
+    assert scene.colors is not None
+    with pytest.raises(ValueError, match="red, green and blue"):
+        drawn(replace(scene, colors=scene.colors[:, :1]))
+    if encoders[0]["name"] == "rasterised":
+        with pytest.raises(ValueError, match="topology"):
+            drawn(replace(scene, vertices=MESH.vertices[:9], colors=scene.colors[:9], faces=MESH.faces[:0]))
+
+
+def test_a_run_that_paints_no_people_is_refused(tmp_path):
+    grey = checkpoint(
+        tmp_path / "grey.ckpt",
+        [seeing(SIZE, **NEAR), {"name": "slim", **SLIM, "colors": 1}],
+        SIZE,
+        names=("grey",),
+    )
+    with pytest.raises(ConfigError, match=r"predicts grey from x, y, z.*red, green and blue"):
+        renderer(grey)
