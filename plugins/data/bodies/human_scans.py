@@ -25,7 +25,7 @@ from framework.renderer import Renderer
 from framework.storage.generated import read_mark
 from framework.target import Target
 from plugins.data.bodies import scan_layout
-from plugins.data.bodies.scan_generator import Drawing, scans_root
+from plugins.data.bodies.scan_generator import Crowd, Drawing, scans_root
 from plugins.data.bodies.scan_layout import Subject, View
 
 VERSION = 1
@@ -105,6 +105,13 @@ class HumanScans(Data):
         self.data_seed = data_seed
         self.size = (drawing.height, drawing.width)
 
+    @property
+    def place(self) -> Path:
+        """The folder, which need not be there. Raises as `prepare`."""
+        if self.root is not None:
+            return Path(self.root).expanduser()
+        return Crowd(self.renderer, self.counts, self.drawing, self.data_seed).root
+
     def prepare(self) -> None:
         if self.root is None:
             if self.topology not in self.drawing.topologies:
@@ -114,7 +121,7 @@ class HumanScans(Data):
                 )
             root = scans_root(self.renderer, self.counts, self.drawing, self.data_seed)
         else:
-            root = Path(self.root).expanduser()
+            root = self.place
         self.folder = root
         self.groups = ("people",)
         self.synthetic = read_mark(root) is not None
