@@ -85,7 +85,6 @@ class Rasterised(Encoder):
   booktitle = {Conference on Computer Vision and Pattern Recognition},
   year = {2018}
 }"""
-    faces: Tensor
 
     def __init__(
         self,
@@ -123,7 +122,7 @@ class Rasterised(Encoder):
         self.camera = canonical_camera(picture.height, picture.width)
         self.depth = picture.depth
         self.limits = (picture.nearest, picture.farthest)
-        self.register_buffer("faces", faces_of(mesh), persistent=False)
+        self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU wherever the model is
         self.output_shape = (3 + picture.depth, picture.height, picture.width)
 
     @torch.no_grad()

@@ -148,6 +148,11 @@ def test_everybody_wears_their_own_texture_however_lists_are_ordered(root):
     assert torch.equal(encoder(root)(inputs[[4, 1]].double()), before[[4, 1]].double())
 
 
+@pytest.mark.parametrize("kind", [{}, {"textures": None}], ids=["texture", "colours"])
+def test_meshes_are_drawn_on_the_cpu_wherever_the_model_is(root, kind):
+    assert torch.equal(encoder(root, **kind).to("meta")(seen(2)), encoder(root, **kind)(seen(2)))
+
+
 def test_a_stranger_is_refused_by_the_row(root):
     inputs = seen(3)
     inputs[2, 7, 4] = (inputs[2, 7, 4] + 1 / 255) % 1
