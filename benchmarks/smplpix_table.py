@@ -50,7 +50,8 @@ SWEEPS = {
 METRICS = ("psnr", "ssim", "ms_ssim", "lpips")
 NAMES = {"rasterised": "mesh, vertex colours", "textured": "mesh, texture", "quick": "SMPLpix"}
 """Of rows, by the experiments' names; any other stands for itself."""
-ROW_KEYS = ("experiment", "data.topology", "seed")
+SAID = ("experiment", "data.topology", "seed", "metric", "pictures", "logger", "threads", "workers")
+"""Arguments that a row says already, or that change no picture."""
 RIVAL = "rasterised"
 COLUMNS = {
     "psnr_db": ("PSNR, dB", 2),
@@ -202,7 +203,7 @@ def grouped(results: Sequence[dict[str, Any]]) -> dict[Row, list[dict[str, Any]]
     told = [set(result["overrides"]) for result in results]
     for result in results:
         given = [word for word in result["overrides"] if not all(word in words for words in told)]
-        own = [word for word in given if word.partition("=")[0] not in ROW_KEYS]
+        own = [word for word in given if word.partition("=")[0] not in SAID]
         _, description = load_with_description(result["folder"])
         change = ", ".join(
             word.partition("=")[0].rpartition(".")[2] + " " + word.partition("=")[2] for word in own
