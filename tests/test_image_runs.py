@@ -18,8 +18,10 @@ from framework.configuration.assembly import build_data, build_predictor, resolv
 from framework.configuration.composition import plain
 from framework.deployment.served import _load_pyfunc
 from framework.encoder import Encoder
+from framework.errors import DataError
 from framework.geometry.light import eight_bit, light_of
-from plugins.data.bodies.rows import body_file, colored_meshes
+from plugins.data.bodies.rows import body_file, colored, colored_meshes, scanned
+from plugins.data.bodies.scan_layout import write_registration
 from tests.conftest import Done, Framework
 from tests.test_composition import composed
 
@@ -169,6 +171,36 @@ def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: 
     refused = framework("experiment=smplpix/rasterised", *run, "objective=[random_features]", folder="no")
     assert refused.code == 2
     assert "Nothing in this model learns by gradient" in refused.out
+
+
+def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(
+    framework: Framework, tmp_path: Path
+) -> None:
+    """Loaded and frozen alike; a mesh of somebody else, and a folder that is gone, get a sentence."""
+    scans = tmp_path / "scans"
+    run = (
+        "threads=1",
+        "logger=none",
+        "pictures=false",
+        "metric=[psnr]",
+        f"data.root={scanned(scans)['root']}",
+        "data.height=12",
+        "data.width=9",
+    )
+    done = framework("experiment=smplpix/textured", *run, folder="drawn")
+    assert done.code == 0, done.out
+    models = package.load(done.folder), package.freeze(done.folder).density
+    mesh, *_ = colored_meshes(tmp_path)  # who has the colours of the first subject
+    assert torch.equal(models[0](mesh).mean, models[1](mesh).mean)
+    write_registration(mesh, colored(9))
+    for model in models:
+        with pytest.raises(DataError, match="has the vertex colours of no subject in"):
+            model(mesh)
+    models = package.load(done.folder), package.freeze(done.folder)
+    scans.rename(tmp_path / "moved")
+    for model in models:
+        with pytest.raises(DataError, match="no such folder; wanted that of the subjects"):
+            model(mesh)
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,9 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         return build(row.input_shape).eval()
 
     def inputs(count: int) -> Tensor:
-        """Images in [0, 1], or normal vectors."""
+        """The row's own, or images in [0, 1], or normal vectors."""
+        if row.inputs is not None:
+            return row.inputs(count)
         generator = torch.Generator().manual_seed(SEED)
         if len(row.input_shape) == 3:
             return torch.rand(count, *row.input_shape, generator=generator)

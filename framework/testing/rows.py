@@ -66,6 +66,7 @@ class EncoderRow:
         input_shape: of one sample.
         config, limits, leave_out: as in HeadRow.
         columns: names of its last dimension, as `Data.columns`.
+        inputs: number of samples → inputs, where it does not read any numbers.
     """
 
     name: str
@@ -74,6 +75,7 @@ class EncoderRow:
     limits: Mapping[str, float] = field(default_factory=dict)
     leave_out: Mapping[str, str] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
+    inputs: Callable[[int], Tensor] | None = None
 
 
 @dataclass(frozen=True)

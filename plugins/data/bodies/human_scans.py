@@ -25,7 +25,7 @@ from framework.renderer import Renderer
 from framework.storage.generated import read_mark
 from framework.target import Target
 from plugins.data.bodies import scan_layout
-from plugins.data.bodies.scan_generator import Drawing, scans_root
+from plugins.data.bodies.scan_generator import Crowd, Drawing, scans_root
 from plugins.data.bodies.scan_layout import Subject, View
 
 VERSION = 1
@@ -111,6 +111,13 @@ class HumanScans(Data):
         self.varies = mirrored or recoloured > 0
         self.size = (drawing.height, drawing.width)
 
+    @property
+    def place(self) -> Path:
+        """The folder, which need not be there. Raises as `prepare`."""
+        if self.root is not None:
+            return Path(self.root).expanduser()
+        return Crowd(self.renderer, self.counts, self.drawing, self.data_seed).root
+
     def prepare(self) -> None:
         if self.root is None:
             if self.topology not in self.drawing.topologies:
@@ -120,7 +127,7 @@ class HumanScans(Data):
                 )
             root = scans_root(self.renderer, self.counts, self.drawing, self.data_seed)
         else:
-            root = Path(self.root).expanduser()
+            root = self.place
         self.folder = root
         self.groups = ("people",)
         self.synthetic = read_mark(root) is not None

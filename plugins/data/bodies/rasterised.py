@@ -1,4 +1,4 @@
-"""Coloured vertices as the picture of their mesh: what a learned renderer is compared with, or what it starts from."""
+"""Registered vertices as the picture of their mesh: what a learned renderer is compared with, or starts from."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from framework.data import Data
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
@@ -17,11 +18,16 @@ from framework.geometry.light import encoded, light_of
 from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.renderer import Renderer, Scene
 from plugins.data.bodies import scan_layout
+from plugins.data.bodies.human_scans import HumanScans
 from plugins.data.bodies.people import chosen_body
+from plugins.data.bodies.textures import Textures
 from plugins.data.bodies.topologies import Name, sheet, topology
 
 COLUMNS = (*XYZ, *COLOURS)
 Metres = Annotated[float, Field(gt=0, le=1e6)]
+TEXELS = 4
+"""Along a side of a texture, at most, for each pixel of the picture's longer side; finer ones are averaged. Of the
+default body some 6 × 6 texels lie in a pixel then: with `supersampling` 4 no sample passes over one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,21 +57,25 @@ class Registered:
 
 
 class Rasterised(Encoder):
-    """The mesh of a registered body with its vertices' colours, on white, as the canonical camera of its size sees it.
+    """The mesh of a registered body with its vertices' colours or its texture, on white, as the canonical camera of its
+    size sees it.
 
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
-    averaged as light. Features are (3, height, width), numbers as files hold them, in the inputs' dtype; with `depth`
-    (4, height, width), as `encoder=projection` has it: what a network may start from in place of points.
+    averaged as light. Textures lie in the folder of the data and are read when first drawn. Features are (3, height,
+    width), numbers as files hold them, in the inputs' dtype; with `depth` (4, height, width), as `encoder=projection`
+    has it: what a network may start from in place of points.
 
     Args:
         input_shape: (points, columns).
         input_columns: names of the columns, where data give them.
         renderer: draws the mesh.
+        textures: the `human_scans` with the textures of all who come; None: vertices' colours are drawn.
         picture, mesh: what is drawn, and of what.
 
     Raises:
-        ConfigError: an input that is no cloud of coloured points, or a renderer that lacks a channel.
-        DataError: the mesh cannot be had.
+        ConfigError: an input that is no cloud of coloured points, a renderer that lacks a channel, or other data with
+            textures.
+        DataError: the mesh cannot be had; or, from `forward`, a texture.
     """
 
     fixed = True
@@ -75,7 +85,6 @@ class Rasterised(Encoder):
   booktitle = {Conference on Computer Vision and Pattern Recognition},
   year = {2018}
 }"""
-    faces: Tensor
 
     def __init__(
         self,
@@ -83,6 +92,7 @@ class Rasterised(Encoder):
         input_columns: tuple[str, ...] = (),
         *,
         renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
+        textures: Data | None = None,
         picture: Picture,
         mesh: Registered,
     ) -> None:
@@ -92,7 +102,11 @@ class Rasterised(Encoder):
                 f"encoder rasterised got inputs of shape {input_shape}; wanted (points, columns) whose first six "
                 f"columns are {', '.join(COLUMNS)}. Choose data=human_scans, or another encoder."
             )
-        if missing := {"color", "depth"} - renderer.channels:
+        if textures is not None and not isinstance(textures, HumanScans):
+            raise ConfigError(
+                f"encoder.rasterised.textures = {type(textures).__name__} has none; wanted human_scans, say ${{data}}."
+            )
+        if missing := {"color", "depth", *(["uv"] if textures else [])} - renderer.channels:
             raise ConfigError(
                 f"encoder.rasterised.renderer = {type(renderer).__name__} draws no {' and '.join(sorted(missing))}; "
                 "choose another renderer."
@@ -103,10 +117,12 @@ class Rasterised(Encoder):
                 "below farthest, metres from the camera."
             )
         self.renderer = renderer
+        self.people, self.topology = textures, mesh.topology
+        self.textures: Textures | None = None
         self.camera = canonical_camera(picture.height, picture.width)
         self.depth = picture.depth
         self.limits = (picture.nearest, picture.farthest)
-        self.register_buffer("faces", faces_of(mesh), persistent=False)
+        self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU wherever the model is
         self.output_shape = (3 + picture.depth, picture.height, picture.width)
 
     @torch.no_grad()
@@ -118,16 +134,7 @@ class Rasterised(Encoder):
                 "encoder.rasterised.topology to that of the data."
             )
         height, width = self.camera.height, self.camera.width
-        scenes = [
-            Scene(
-                cloud[:, :3].float(),
-                self.faces,
-                # the fourth channel is how much of a pixel the mesh covers
-                torch.cat([light_of(cloud[:, 3:6].float()), cloud.new_ones(len(cloud), 1).float()], 1),
-                self.camera,
-            )
-            for cloud in inputs.cpu()
-        ]
+        scenes = [self._scene(cloud, row) for row, cloud in enumerate(inputs.cpu())]
         channels = ("color", "depth") if self.depth else ("color",)
         drawn = self.renderer.batch(scenes, channels)
         found = inputs.new_empty(len(inputs), 3 + self.depth, height, width)
@@ -138,6 +145,17 @@ class Rasterised(Encoder):
                 nearest, farthest = self.limits
                 picture[3] = ((one["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
         return found
+
+    def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
+        """A fourth channel of what the mesh shows is 1: how much of a pixel the mesh covers."""
+        vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
+        if self.people is None:
+            paint = torch.cat([light_of(colors), colors.new_ones(len(colors), 1)], 1)
+            return Scene(vertices, self.faces, paint, self.camera)
+        if self.textures is None:
+            longest = TEXELS * max(self.camera.height, self.camera.width)
+            self.textures = Textures(self.people.place, self.topology, self.faces, longest)
+        return Scene(vertices, self.faces, None, self.camera, self.textures.of(colors, row))
 
 
 def faces_of(mesh: Registered) -> Tensor:

@@ -88,7 +88,9 @@ def people(folder: Path) -> Mapping[str, str]:
 
 
 def scanned(folder: Path) -> Mapping[str, str]:
-    """Six subjects of 40 coloured vertices, photographed twice each: 12 × 9 pixels of noise, half of them masked."""
+    """Six subjects of 40 coloured vertices, photographed twice each: 12 × 9 pixels of noise, half of them masked; each
+    has a texture."""
+    folder.mkdir(exist_ok=True)
     names = {"train": ("ann", "bob", "cleo"), "validation": ("dan",), "test": ("eve", "fay")}
     scan_layout.write_splits(folder, names)
     for number, name in enumerate(name for some in names.values() for name in some):
@@ -110,7 +112,18 @@ def scanned(folder: Path) -> Mapping[str, str]:
             file = home / f"{place}.png"
             file.parent.mkdir(exist_ok=True)
             Image.fromarray(pixels if "images" in place else pixels[..., 0]).save(file)
+        Image.fromarray(random.integers(0, 256, (7, 5, 3), np.uint8)).save(home / "texture.png")
+    places = np.random.default_rng(6).random((6, 2), np.float32)
+    faces = np.array([(0, 1, 2), (2, 1, 3)])
+    np.savez(folder / "topology_7k.npz", faces=faces, uv=places, uv_faces=[(0, 1, 2), (5, 4, 3)])
     return {"root": str(folder)}
+
+
+def seen(count: int) -> torch.Tensor:
+    """The first of these subjects, one after the other, 3 m ahead."""
+    people = [colored(number % 6) for number in range(count)]
+    clouds = [torch.cat([one.vertices * 2 + torch.tensor([0, -2, 3]), one.colors / 255], 1) for one in people]
+    return torch.stack(clouds) if clouds else torch.empty(0, 40, 6)
 
 
 def colored(number: int) -> Registration:
@@ -131,6 +144,7 @@ def colored_meshes(folder: Path) -> Sequence[Path]:
 
 
 DOLL = small_body()
+SCANNED = scanned(Path(FOLDER.name) / "scans")
 NUMBERS = figure_of(DOLL["body"]).names
 SMALL = {"renderer": "rasterizer", "topologies": ["7k"], "views": 2}
 ROWS = {
@@ -169,6 +183,21 @@ ROWS = {
             "a doll, its depth",
             (132, 6),
             {**DOLL, "renderer": "rasterizer", "height": 9, "width": 14, "depth": True},
+        ),
+        EncoderRow(
+            "six people's textures",
+            (40, 6),
+            {
+                **SCANNED,
+                "renderer": "rasterizer",
+                "height": 24,
+                "width": 18,
+                "textures": {"name": "human_scans", **SCANNED},
+            },
+            leave_out={
+                "finite on extreme inputs": "of constant colours there is nobody; test_textures.py has others"
+            },
+            inputs=seen,
         ),
     ),
     "pose_error": (MetricRow("a doll", Target("real", NUMBERS)),),

@@ -69,8 +69,7 @@ def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, 
         ConfigError: fewer skins than splits, or skins for a body without texture places.
     """
     crowd = Crowd(renderer, counts, drawing, seed)
-    root = cache.folder("human_scans") / crowd.digest
-    return generated(root, crowd.mark, crowd.write)
+    return generated(crowd.root, crowd.mark, crowd.write)
 
 
 class Person(NamedTuple):
@@ -101,7 +100,7 @@ class Crowd:
             "skins": [[file.name, _hash(file.read_bytes())] for some in self.skins for file in some],
             "renderer": f"{type(renderer).__module__}.{type(renderer).__qualname__}",
         }
-        self.digest = _hash(repr(sorted(self.mark.items())).encode())
+        self.root = cache.folder("human_scans") / _hash(repr(sorted(self.mark.items())).encode())
 
     @cached_property
     def wardrobe(self) -> Wardrobe:

@@ -288,7 +288,10 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
             arrays["uv"].astype(np.float32),
             arrays["uv_faces"].astype(np.int64),
         )
-        fits = found.uv_faces.shape == found.faces.shape and np.isfinite(found.uv).all()
+        fits = found.uv_faces.shape == found.faces.shape == (len(found.faces), 3) and found.uv.shape[1:] == (
+            2,
+        )
+        fits = fits and np.isfinite(found.uv).all()
         if not fits or found.uv_faces.min() < 0 or found.uv_faces.max() >= len(found.uv):
             raise ValueError("uv_faces do not fit faces and uv")
     return found
