@@ -1,0 +1,204 @@
+"""Motions from BVH files (Biovision hierarchy, as of the CMU motion capture), for any body: poses of each frame.
+
+A body's bones take the directions that the file's have. Where somebody walks to is left out, and so are fingers, toes
+and what only some skeletons have.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from framework.errors import DataError, shown
+from framework.storage.reading import guarded, read_bytes
+from plugins.data.bodies.body import Body
+from plugins.data.bodies.poses import skeleton
+
+BONES = {
+    "chest": ("spine2", "spine1", "chest"),
+    "head": ("head",),
+    "clavicle": ("{side}shoulder", "{side}collar"),
+    "arm": ("{side}arm", "{side}uparm"),
+    "elbow": ("{side}forearm", "{side}lowarm"),
+    "wrist": ("{side}hand",),
+    "hip": ("{side}upleg", "{side}hip"),
+    "knee": ("{side}leg", "{side}lowleg"),
+    "ankle": ("{side}foot",),
+}
+"""What a role of plugins.data.bodies.poses.Skeleton is called, in small letters, without what ends with a colon; of two
+in one file the first."""
+ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
+"""Where bones end whose direction is taken; the others turn as they do in the file."""
+LONGEST = 1_000_000
+"""Frames of a file, at most."""
+
+
+class Motion(NamedTuple):
+    """What a BVH file says.
+
+    Attributes:
+        names, parents: of its joints; -1 is the root's parent.
+        offsets: from the parent, where nothing turns, in the file's unit.
+        rotations: of each joint relative to its parent.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: Float[np.ndarray, "joint 3"]
+    rotations: Float[np.ndarray, "frame joint 3 3"]
+
+
+def read(file: Path) -> Motion:
+    """A BVH file, angles in degrees, y up.
+
+    Raises:
+        DataError: it cannot be read, or is no BVH file.
+    """
+    with guarded(file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."):
+        head, found, rest = read_bytes(file).decode("utf-8").partition("MOTION")
+        if not found or head.split()[:1] != ["HIERARCHY"]:
+            raise ValueError("HIERARCHY or MOTION is missing")
+        names, parents, offsets, channels = _hierarchy(head.split()[1:])
+        words = rest.split()
+        if words[:1] != ["Frames:"] or words[2:4] != ["Frame", "Time:"]:
+            raise ValueError("MOTION does not start with Frames: and Frame Time:")
+        frames, numbers = int(words[1]), np.array(words[5:], np.float64)
+        columns = sum(map(len, channels))
+        if not 1 <= frames <= LONGEST or numbers.size != frames * columns or not np.isfinite(numbers).all():
+            raise ValueError(
+                f"{numbers.size} finite numbers wanted for {frames} frames of {columns} channels"
+            )
+        values = numbers.reshape(frames, columns)
+        turns, first = np.empty((frames, len(names), 3, 3)), 0
+        for joint, kinds in enumerate(channels):
+            turning = [place for place, kind in enumerate(kinds) if kind.endswith("rotation")]
+            axes = "".join(kinds[place][0] for place in turning).upper()
+            turns[:, joint] = np.eye(3)
+            if axes:  # in capitals about axes that turn along: the first channel is the outermost
+                turns[:, joint] = Rotation.from_euler(
+                    axes, values[:, [first + place for place in turning]], degrees=True
+                ).as_matrix()
+            first += len(kinds)
+        return Motion(tuple(names), tuple(parents), np.array(offsets), turns)
+
+
+def _hierarchy(
+    words: list[str],
+) -> tuple[list[str], list[int], list[list[float]], list[list[str]]]:
+    """Names, parents, offsets and channels of the joints; ends of the last bones are left out."""
+    names, parents, offsets, channels = [], [], [], []
+    above, place = [-1], 0
+    while place < len(words):
+        word = words[place]
+        if word in ("ROOT", "JOINT"):
+            if (word == "ROOT") != (len(above) == 1) or (word == "ROOT" and names):
+                raise ValueError(
+                    f"{word} {shown(words[place + 1])} stands where none can; wanted a single ROOT"
+                )
+            parents.append(above[-1])
+            above.append(len(names))
+            names.append(words[place + 1])
+            offsets.append([0.0] * 3)
+            channels.append([])
+            place += 3
+        elif word == "End":
+            place = words.index("}", place) + 1
+        elif word == "OFFSET":
+            offsets[above[-1]] = [float(number) for number in words[place + 1 : place + 4]]
+            place += 4
+        elif word == "CHANNELS":
+            count = int(words[place + 1])
+            channels[above[-1]] = words[place + 2 : place + 2 + count]
+            place += 2 + count
+        elif word == "}":
+            above.pop()
+            place += 1
+        else:
+            raise ValueError(f"{shown(word)} stands where a joint's description should go on")
+    if len(above) != 1 or not names:
+        raise ValueError("its joints are not closed, or it has none")
+    return names, parents, offsets, channels
+
+
+def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray, "pose joint 3"]:
+    """Joint rotations for plugins.data.bodies.body, axis times angle in radians, in which the body's upper arms,
+    forearms, thighs and shanks point as the motion's do, and everything else turns as it does there.
+
+    A bend of the back and of the neck is shared equally by the body's joints there. In the file's own rest pose the
+    trunk is taken to be upright and to face z.
+
+    Raises:
+        DataError: the file has no joint that could be one of the body's.
+    """
+    where, roles = skeleton(body), _roles(motion)
+    whole: list[Rotation] = []  # of the file's joints, from its rest pose
+    for joint, parent in enumerate(motion.parents):
+        local = Rotation.from_matrix(motion.rotations[frames, joint])
+        whole.append(local if parent < 0 else whole[parent] * local)
+    found = {where.root: whole[0]}
+    along = (("spine", where.spine, whole[0], "chest"), ("neck", where.neck, whole[roles["chest"]], "head"))
+    for _, joints, below, end in along:
+        bend = (below.inv() * whole[roles[end]]).as_rotvec() / len(joints)
+        for number, joint in enumerate(joints):
+            found[joint] = below * Rotation.from_rotvec(bend * (number + 1))
+    places = _places(motion)
+    for number, side in enumerate(("left", "right")):
+        direction = Rotation.identity()
+        for role in ("clavicle", "arm", "elbow", "wrist", "hip", "knee", "ankle"):
+            joint, theirs = getattr(where, role)[number], roles[f"{side} {role}"]
+            if role in ("clavicle", "hip"):
+                direction = Rotation.identity()
+            if role in ENDS:  # the smallest turn from our bone's direction to theirs, each in its rest pose
+                end = getattr(where, ENDS[role])[number]
+                ours = (body.joints[end] - body.joints[joint]).astype(np.float64)
+                direction = _turn(ours, places[roles[f"{side} {ENDS[role]}"]] - places[theirs])
+            found[joint] = whole[theirs] * direction
+    pose = np.zeros((len(frames), len(body.parents), 3))
+    for joint in _downwards(body.parents):
+        parent = body.parents[joint]
+        above = found[parent] if parent >= 0 else Rotation.identity(len(frames))
+        pose[:, joint] = (above.inv() * found.setdefault(joint, above)).as_rotvec()
+    return pose
+
+
+def _roles(motion: Motion) -> dict[str, int]:
+    names = [name.rpartition(":")[2].replace("_", "").lower() for name in motion.names]
+    found = {}
+    for role, wanted in BONES.items():
+        for side in ("left", "right") if "{" in wanted[0] else ("",):
+            called = [name.format(side=side) for name in wanted]
+            there = [names.index(name) for name in called if name in names]
+            if not there:
+                raise DataError(
+                    f"A motion has no joint called {' or '.join(called)}; wanted one. Its joints: "
+                    f"{shown(', '.join(motion.names))}. Rename them."
+                )
+            found[f"{side} {role}".strip()] = there[0]
+    return found
+
+
+def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
+    """Of the joints where nothing turns."""
+    found = motion.offsets.copy()
+    for joint, parent in enumerate(motion.parents):
+        found[joint] += found[parent] if parent >= 0 else 0
+    return found
+
+
+def _turn(one: np.ndarray, other: np.ndarray) -> Rotation:
+    """The smallest rotation from one direction to another."""
+    axis = np.cross(one, other)
+    angle = np.arctan2(np.linalg.norm(axis), one @ other)
+    if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(one) * np.linalg.norm(other):  # the same, or the opposite
+        axis = np.cross(one, np.eye(3)[np.abs(one).argmin()])
+    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+
+
+def _downwards(parents: tuple[int, ...]) -> list[int]:
+    """All joints, each after its parent."""
+    found = [joint for joint, parent in enumerate(parents) if parent < 0]
+    for joint in found:
+        found += [child for child, parent in enumerate(parents) if parent == joint]
+    return found
