@@ -8,6 +8,7 @@ from PIL import Image
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
+from framework.geometry.light import light_of
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
 from plugins.data.bodies import scan_layout
@@ -219,3 +220,41 @@ def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
         assert (given[:, 2] > 0).all() and (pixel > 0).all() and (pixel < torch.tensor([29.0, 39.0])).all()
     beside = whole / "subjects/ann"
     assert unprepared.inputs(beside / "registration_7k.ply").shape == (2, 40, 6)
+
+
+def test_targets_are_silhouettes_where_who_is_where_is_asked(whole):
+    found, shown = (data(whole, shows=what) for what in ("subject", "photograph"))
+    for one in (found, shown):
+        one.prepare()
+    assert found.target.names == ("subject",) and found.target.event_shape == (12, 9, 1)
+    assert found.fingerprint() != shown.fingerprint() and "shows" not in shown.fingerprint()
+    for one, other in zip(found.splits().test, shown.splits().test, strict=True):
+        assert torch.equal(one["target"][..., 0], other["mask"].float()) and 0 < one["target"].mean() < 1
+        assert all(torch.equal(one[name], other[name]) for name in ("input", "color", "mask"))
+
+
+def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
+    random = torch.Generator().manual_seed(0)
+    cloud = torch.cat([torch.randn(1, 132, 3, generator=random) / 4, torch.zeros(1, 132, 3)], 2)
+    cloud[..., 2] += 2
+    config = {
+        "name": "rasterised",
+        **DOLL,
+        "renderer": "rasterizer",
+        "height": 24,
+        "width": 20,
+        "depth": True,
+    }
+    drawn, ground = (
+        build(
+            "encoder",
+            resolve("encoder", {**config, "ground": ground}),
+            input_shape=(132, 6),
+            input_columns=(),
+        )(cloud)
+        for ground in (False, True)
+    )
+    assert drawn.shape == (1, 4, 24, 20) and ground.shape == (1, 2, 24, 20)
+    # black vertices: what light is left is the white of the ground
+    torch.testing.assert_close(light_of(drawn[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
+    assert torch.equal(drawn[:, 3], ground[:, 1]) and 0 < float(ground[:, 0].mean()) < 1
