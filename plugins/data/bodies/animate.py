@@ -24,7 +24,6 @@ from framework.renderer import Renderer
 from plugins.data.bodies import motion
 from plugins.data.bodies.animation import Actor, Generated, Moment, actor, columns, orbit, side_by_side
 from plugins.data.bodies.human_scans import HumanScans
-from plugins.data.bodies.poses import skeleton
 from plugins.data.bodies.scan_generator import Crowd
 from plugins.data.bodies.scan_layout import read_registration, read_splits
 
@@ -139,12 +138,12 @@ def moving(
         return actor(person.registration), [person.first()] * frames
     found = motion.read(file)
     numbers = np.round((start + np.arange(frames) / SPEED) / found.seconds).astype(int)
-    if numbers[0] < 0 or numbers[-1] >= len(found.turns):
+    if numbers[0] < 0 or numbers[-1] >= len(found.rotations):
         raise ConfigError(
             f"{frames} pictures last {frames / SPEED:g} s; from second {start:g} on {file} has "
-            f"{len(found.turns) * found.seconds - start:.3g} s. Lower --frames or --start."
+            f"{len(found.rotations) * found.seconds - start:.3g} s. Lower --frames or --start."
         )
-    poses = motion.poses_of(found, person.crowd.body, skeleton(person.crowd.body), numbers.tolist())
+    poses = motion.poses_of(person.crowd.body, found, numbers.tolist())
     return actor(person.registration), [person.at(pose) for pose in poses]
 
 

@@ -224,6 +224,7 @@ class BodyModel(nn.Module):
         shape: Float[Tensor, "_batch _shape"],
         pose: Float[Tensor, "_batch _joint 3"],
         translation: Float[Tensor, "_batch 3"] | None = None,
+        offsets: Float[Tensor, "_batch vertex 3"] | None = None,
     ) -> Float[Tensor, "batch vertex 3"]:
         """Posed vertices, metres, of the model's dtype.
 
@@ -231,6 +232,7 @@ class BodyModel(nn.Module):
             shape: coefficients β; fewer than the model has are the first of them.
             pose: θ, axis times angle of each joint, radians; any number of turns.
             translation: of the whole body, metres.
+            offsets: of one person's vertices from the model's in the rest pose, metres: clothes, hair.
 
         Raises:
             ValueError: other shapes, or numbers that are not finite; names the first such row.
@@ -243,14 +245,23 @@ class BodyModel(nn.Module):
         if self.pose_shapes is not None:
             rest = rest + self._features(turns, pose, shape) @ self.pose_shapes
         rest = rest.unflatten(1, (3, -1))
-        transforms = self._transforms(shape, turns).to(rest.dtype)
-        blended = transforms.transpose(1, 2) @ self.weights  # (batch, 12, vertex)
+        if offsets is not None:
+            rest = rest + offsets.transpose(1, 2)
+        blended = self._blended(shape, turns)
         # Σ_j w_j (R_j x + t_j) = x + Σ_j w_j ((R_j - 1) x + t_j), which is x where nothing turns
         moved = (blended[:, :9].unflatten(1, (3, 3)) * rest[:, None]).sum(2)
         posed = rest + (moved + blended[:, 9:])
         if translation is not None:
             posed = posed + translation[..., None]
         return posed.transpose(1, 2).contiguous()
+
+    def skinning(
+        self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
+    ) -> Float[Tensor, "batch vertex 3 3"]:
+        """Of each vertex Σ_j w_j R_j, the matrix that skinning turns it by: W of eq. 7.1 without what it moves."""
+        self._check(shape, pose, None)
+        blended = self._blended(shape, turns_less_identity(pose.double()))[:, :9]
+        return blended.mT.unflatten(2, (3, 3)) + torch.eye(3).to(blended)
 
     def rest_joints(self, shape: Float[Tensor, "batch shape"]) -> Float[Tensor, "batch joint 3"]:
         """J(β), joint positions in the rest pose, metres."""
@@ -265,6 +276,10 @@ class BodyModel(nn.Module):
         found = self._transforms(shape, turns_less_identity(pose.double()))
         moved = torch.einsum("bjmn,bjn->bjm", found[..., :9].unflatten(-1, (3, 3)), joints)
         return (joints + moved + found[..., 9:]).to(self.template.dtype)
+
+    def _blended(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch 12 vertex"]:
+        """Of each vertex Σ_j w_j (R_j - 1, t_j)."""
+        return self._transforms(shape, turns).to(self.weights.dtype).transpose(1, 2) @ self.weights
 
     def _transforms(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch joint 12"]:
         """Of each joint (R - 1, t), such that x becomes R x + t: the chain of the rotations up to the root, float64."""

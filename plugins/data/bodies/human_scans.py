@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ VERSION = 1
 """Of how the files are read; a change takes a new number."""
 Number = Annotated[int, Field(ge=1, le=100_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Shows = Literal["photograph", "subject"]
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,40}$")]
 
 
@@ -57,6 +58,8 @@ class HumanScans(Data):
         renderer: draws the photographs of generated people.
         root: a folder laid out as plugins.data.bodies.scan_layout says; None: people are generated into the cache once.
         topology: which of the registered meshes; generated are 7k (6,890 vertices) and 27k (27,578).
+        shows: what the target is: "photograph", or "subject", one number a pixel, 1 where half of it or more is the
+            subject and else 0, for a network that segments (thesis §7.3.1).
         counts, drawing: of generated people.
         data_seed: of their draws, whatever the seed of the run.
         mirrored: whether half of the pictures to train on are seen in a mirror, points and photograph.
@@ -91,6 +94,7 @@ class HumanScans(Data):
         renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
         root: str | None = None,
         topology: Word = "7k",
+        shows: Shows = "photograph",
         counts: Counts,
         drawing: Drawing,
         data_seed: Seed = 0,
@@ -104,6 +108,7 @@ class HumanScans(Data):
         self.renderer = renderer
         self.root = root
         self.topology = topology
+        self.shows: Shows = shows
         self.counts = asdict(counts)
         self.drawing = drawing
         self.data_seed = data_seed
@@ -140,9 +145,10 @@ class HumanScans(Data):
         every = [subject for some in subjects.values() for subject in some]
         self.size, points = _common(root, every)
         self.input_shape = (points, len(self.columns))
-        self.target = Target("image", COLOURS, size=self.size)
+        channels = COLOURS if self.shows == "photograph" else (self.shows,)
+        self.target = Target("image", channels, size=self.size)
         self._digest = _digest(subjects)
-        self._splits = Splits(**{split: Photographs(some) for split, some in subjects.items()})
+        self._splits = Splits(**{split: Photographs(some, self.shows) for split, some in subjects.items()})
 
     def splits(self) -> Splits:
         return self._splits
@@ -187,7 +193,7 @@ class HumanScans(Data):
         for name in ("target", "color", "mask"):
             if name in batch:
                 found[name] = _turned(batch[name], mirrored)
-                if name != "mask":
+                if batch[name].shape[-1:] == (3,) and batch[name].dim() == 4:  # a silhouette has no colours
                     found[name] = _reordered(found[name], orders)
         points = batch["input"].clone()
         points[mirrored.to(points.device), :, 0] *= -1  # the canonical camera looks through the middle
@@ -199,6 +205,7 @@ class HumanScans(Data):
             "root": "generated" if self.root is None else self.root,
             "version": f"human_scans {VERSION}",
             "topology": self.topology,
+            **({} if self.shows == "photograph" else {"shows": self.shows}),
             "size": "×".join(map(str, self.size)),
             **{name: str(len(split)) for name, split in self._splits._asdict().items()},
             "sha256": self._digest,
@@ -223,7 +230,8 @@ class HumanScans(Data):
 class Photographs(Dataset[Batch]):
     """Photographs of one split, read when they are fetched; subject after subject, each in the order of its views."""
 
-    def __init__(self, subjects: Sequence[Subject]) -> None:
+    def __init__(self, subjects: Sequence[Subject], shows: Shows) -> None:
+        self.shows = shows
         self.subjects = list(subjects)
         self.of = [(number, view) for number, one in enumerate(subjects) for view in one.views]
 
@@ -234,11 +242,12 @@ class Photographs(Dataset[Batch]):
         number, view = self.of[index]
         registration = self.subjects[number].registration
         light, cover = photograph(view)
+        mask = cover >= 0.5
         return {
             "input": _input(registration.vertices, registration.colors, view.camera),
-            "target": encoded(light),
+            "target": encoded(light) if self.shows == "photograph" else mask.float()[..., None],
             "color": light,
-            "mask": cover >= 0.5,
+            "mask": mask,
             "subject": torch.tensor(number),
             "group": torch.tensor(0),
             "index": torch.tensor(range(len(self))[index]),

@@ -1,7 +1,9 @@
-"""Motion files (BVH) of the CMU kind, and the poses of a body that moves as they say."""
+"""Motions from BVH files (Biovision hierarchy, as of the CMU motion capture), for any body: poses of each frame.
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+A body's bones take the directions that the file's have. Where somebody walks to is left out, and so are fingers, toes
+and what only some skeletons have.
+"""
+
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,205 +11,200 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from framework.errors import DataError
+from framework.errors import DataError, shown
 from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies.body import Body
-from plugins.data.bodies.poses import Skeleton
+from plugins.data.bodies.poses import skeleton
 
-SPINE, NECK = ("LowerBack", "Spine", "Spine1"), ("Neck", "Neck1", "Head")
-LIMBS = {"clavicle": "Shoulder", "arm": "Arm", "arm_twist": "Arm", "elbow": "ForeArm", "pronate": "ForeArm",
-         "wrist": "Hand", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot"}  # fmt: skip
-"""Of a body's joints on each side, what turns them in the file, there with Left and Right before."""
-BONES = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
-"""Where a limb's joints lead to; the others of a limb hold to the bone before them."""
-NAMES = (
-    "Hips",
-    *SPINE,
-    *NECK,
-    *(side + name for side in ("Left", "Right") for name in dict.fromkeys(LIMBS.values())),
-)
-CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
-MOST_FRAMES = 1_000_000
+BONES = {
+    "chest": ("spine2", "spine1", "chest"),
+    "head": ("head",),
+    "clavicle": ("{side}shoulder", "{side}collar"),
+    "arm": ("{side}arm", "{side}uparm"),
+    "elbow": ("{side}forearm", "{side}lowarm"),
+    "wrist": ("{side}hand",),
+    "hip": ("{side}upleg", "{side}hip"),
+    "knee": ("{side}leg", "{side}lowleg"),
+    "ankle": ("{side}foot",),
+}
+"""What a role of plugins.data.bodies.poses.Skeleton is called, in small letters, without what ends with a colon; of two
+in one file the first."""
+ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
+"""Where bones end whose direction is taken; the others turn as they do in the file."""
+LONGEST = 1_000_000
+"""Frames of a file, at most."""
+SLOWEST = 1_000
+"""Seconds of a frame, less than."""
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Joints that turn; axes: x to the left of who moves, y up, z ahead, where all angles are 0.
+class Motion(NamedTuple):
+    """What a BVH file says.
 
     Attributes:
-        names, parents: of the joints, each after its parent; -1: none.
-        offsets: from the parent where all angles are 0, in the file's own unit.
-        turns: of each frame and joint relative to its parent, about axes of the parent.
+        names, parents: of its joints; -1 is the root's parent.
+        offsets: from the parent, where nothing turns, in the file's unit.
+        rotations: of each joint relative to its parent.
         seconds: of a frame.
     """
 
     names: tuple[str, ...]
     parents: tuple[int, ...]
     offsets: Float[np.ndarray, "joint 3"]
-    turns: Float[np.ndarray, "frame joint 3 3"]
+    rotations: Float[np.ndarray, "frame joint 3 3"]
     seconds: float
-
-    def oriented(self) -> Float[np.ndarray, "frame joint 3 3"]:
-        """Rotations of the joints in the world."""
-        found = self.turns.copy()
-        for joint, parent in enumerate(self.parents):
-            if parent >= 0:
-                found[:, joint] = found[:, parent] @ found[:, joint]
-        return found
 
 
 def read(file: Path) -> Motion:
-    """A BVH file.
+    """A BVH file, angles in degrees, y up.
 
     Raises:
-        DataError: it is missing or damaged.
+        DataError: it cannot be read, or is no BVH file.
     """
-    with guarded(file, "a motion file (BVH)"):
-        words = iter(read_bytes(file).decode("utf-8").split())
-        try:
-            names, parents, offsets, channels = _hierarchy(words)
-            count, seconds = _header(words)
-        except StopIteration:
-            raise ValueError("it ends before its motion") from None
-        numbers = np.array([float(word) for word in words])
-        wanted = (count, sum(map(len, channels)))
-        if numbers.size != wanted[0] * wanted[1] or not np.isfinite(numbers).all():
+    with guarded(file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."):
+        head, found, rest = read_bytes(file).decode("utf-8").partition("MOTION")
+        if not found or head.split()[:1] != ["HIERARCHY"]:
+            raise ValueError("HIERARCHY or MOTION is missing")
+        names, parents, offsets, channels = _hierarchy(head.split()[1:])
+        words = rest.split()
+        if words[:1] != ["Frames:"] or words[2:4] != ["Frame", "Time:"]:
+            raise ValueError("MOTION does not start with Frames: and Frame Time:")
+        frames, seconds, numbers = int(words[1]), float(words[4]), np.array(words[5:], np.float64)
+        if not 0 < seconds < SLOWEST:
+            raise ValueError(f"a frame lasts {seconds:g} s")
+        columns = sum(map(len, channels))
+        if not 1 <= frames <= LONGEST or numbers.size != frames * columns or not np.isfinite(numbers).all():
             raise ValueError(
-                f"{numbers.size} numbers for {wanted[0]} frames of {wanted[1]}, or one is not finite"
+                f"{numbers.size} finite numbers wanted for {frames} frames of {columns} channels"
             )
-        each = np.split(numbers.reshape(wanted), np.cumsum([len(some) for some in channels])[:-1], axis=1)
-        turns = [_turned(some, values) for some, values in zip(channels, each, strict=True)]
-        return Motion(tuple(names), tuple(parents), np.array(offsets), np.stack(turns, 1), seconds)
+        values = numbers.reshape(frames, columns)
+        turns, first = np.empty((frames, len(names), 3, 3)), 0
+        for joint, kinds in enumerate(channels):
+            turning = [place for place, kind in enumerate(kinds) if kind.endswith("rotation")]
+            axes = "".join(kinds[place][0] for place in turning).upper()
+            turns[:, joint] = np.eye(3)
+            if axes:  # in capitals about axes that turn along: the first channel is the outermost
+                turns[:, joint] = Rotation.from_euler(
+                    axes, values[:, [first + place for place in turning]], degrees=True
+                ).as_matrix()
+            first += len(kinds)
+        return Motion(tuple(names), tuple(parents), np.array(offsets), turns, seconds)
 
 
-class _Hierarchy(NamedTuple):
-    names: list[str]
-    parents: list[int]
-    offsets: list[list[float]]
-    channels: list[list[str]]
-
-
-def _hierarchy(words: Iterator[str]) -> _Hierarchy:
-    """All up to the word MOTION."""
-    found, open_joints = _Hierarchy([], [], [], []), list[int]()
-    _expect(words, "HIERARCHY")
-    for word in words:
+def _hierarchy(
+    words: list[str],
+) -> tuple[list[str], list[int], list[list[float]], list[list[str]]]:
+    """Names, parents, offsets and channels of the joints; ends of the last bones are left out."""
+    names, parents, offsets, channels = [], [], [], []
+    above, place = [-1], 0
+    while place < len(words):
+        word = words[place]
         if word in ("ROOT", "JOINT"):
-            found.names.append(next(words))
-            found.parents.append(open_joints[-1] if open_joints else -1)
-            found.channels.append([])
-            _expect(words, "{", "OFFSET")
-            found.offsets.append([float(next(words)) for _ in range(3)])
-            open_joints.append(len(found.names) - 1)
+            if (word == "ROOT") != (len(above) == 1) or (word == "ROOT" and names):
+                raise ValueError(
+                    f"{word} {shown(words[place + 1])} stands where none can; wanted a single ROOT"
+                )
+            parents.append(above[-1])
+            above.append(len(names))
+            names.append(words[place + 1])
+            offsets.append([0.0] * 3)
+            channels.append([])
+            place += 3
+        elif word == "End":
+            place = words.index("}", place) + 1
+        elif word == "OFFSET":
+            offsets[above[-1]] = [float(number) for number in words[place + 1 : place + 4]]
+            place += 4
         elif word == "CHANNELS":
-            some = [next(words) for _ in range(int(next(words)))]
-            if unknown := [name for name in some if name not in CHANNELS]:
-                raise ValueError(f"a channel {unknown[0]!r}; wanted some of {', '.join(CHANNELS)}")
-            found.channels[open_joints[-1]] = some
-        elif word == "End":  # no joint: where the last bone ends
-            _expect(words, "Site", "{", "OFFSET")
-            _ = [float(next(words)) for _ in range(3)]
-            _expect(words, "}")
+            count = int(words[place + 1])
+            channels[above[-1]] = words[place + 2 : place + 2 + count]
+            place += 2 + count
         elif word == "}":
-            open_joints.pop()
-        elif word == "MOTION" and found.names and not open_joints:
-            return found
+            above.pop()
+            place += 1
         else:
-            raise ValueError(f"the word {word!r} in its hierarchy")
-    raise StopIteration
+            raise ValueError(f"{shown(word)} stands where a joint's description should go on")
+    if len(above) != 1 or not names:
+        raise ValueError("its joints are not closed, or it has none")
+    return names, parents, offsets, channels
 
 
-def _header(words: Iterator[str]) -> tuple[int, float]:
-    _expect(words, "Frames:")
-    count = int(next(words))
-    _expect(words, "Frame", "Time:")
-    seconds = float(next(words))
-    if not 0 < count <= MOST_FRAMES or not 0 < seconds < 1e3:
-        raise ValueError(f"{count} frames of {seconds} s")
-    return count, seconds
+def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray, "pose joint 3"]:
+    """Joint rotations for plugins.data.bodies.body, axis times angle in radians, in which the body's upper arms,
+    forearms, thighs and shanks point as the motion's do, and everything else turns as it does there.
 
-
-def _expect(words: Iterator[str], *wanted: str) -> None:
-    for word in wanted:
-        if (found := next(words, "its end")) != word:
-            raise ValueError(f"{found!r} where {word!r} has to stand")
-
-
-def _turned(channels: Sequence[str], values: np.ndarray) -> Float[np.ndarray, "frame 3 3"]:
-    """Rotations in the order of their channels, the last nearest to what is turned."""
-    axes = [(name[0], column) for column, name in enumerate(channels) if name.endswith("rotation")]
-    if not axes:
-        return np.tile(np.eye(3), (len(values), 1, 1))
-    order = "".join(axis for axis, _ in axes)
-    degrees = values[:, [column for _, column in axes]]
-    return Rotation.from_euler(
-        order, degrees, degrees=True
-    ).as_matrix()  # capitals: each about the axes turned before
-
-
-def poses_of(
-    motion: Motion, body: Body, where: Skeleton, frames: Sequence[int]
-) -> Float[np.ndarray, "pose joint 3"]:
-    """Joint rotations for plugins.data.bodies.body, axis times angle in radians, of these frames.
-
-    Bones point where those of the file do: a limb that rests in another direction than the file's is first turned there
-    by the smallest rotation. The body stays where it is.
+    A bend of the back and of the neck is shared equally by the body's joints there. In the file's own rest pose the
+    trunk is taken to be upright and to face z.
 
     Raises:
-        DataError: the file lacks a joint.
+        DataError: the file has no joint that could be one of the body's.
     """
-    missing = [name for name in NAMES if name not in motion.names]
-    if missing:
-        raise DataError(
-            f"the motion has no joint {missing[0]!r}; wanted {', '.join(NAMES)}, as those of CMU have."
-        )
-    place = {name: motion.names.index(name) for name in NAMES}
-    oriented = motion.oriented()[list(frames)]
-    joints = body.joints.astype(np.float64)
-    world = np.tile(np.eye(3), (len(oriented), len(body.parents), 1, 1))
-    moved = np.zeros(len(body.parents), bool)
-
-    def hold(joint: int, name: str, rest: np.ndarray) -> None:
-        world[:, joint] = oriented[:, place[name]] @ rest
-        moved[joint] = True
-
-    hold(where.root, "Hips", np.eye(3))
-    for chain, names in ((where.spine, SPINE), (where.neck, NECK)):
-        for number, joint in enumerate(chain):
-            last = max(len(chain) - 1, 1)
-            hold(joint, names[round(number * (len(names) - 1) / last)], np.eye(3))
-    for side, word in enumerate(("Left", "Right")):
-        rest = np.eye(3)
-        for role, name in LIMBS.items():
-            joint = getattr(where, role)[side]
+    where, roles = skeleton(body), _roles(motion)
+    whole: list[Rotation] = []  # of the file's joints, from its rest pose
+    for joint, parent in enumerate(motion.parents):
+        local = Rotation.from_matrix(motion.rotations[frames, joint])
+        whole.append(local if parent < 0 else whole[parent] * local)
+    found = {where.root: whole[0]}
+    along = (("spine", where.spine, whole[0], "chest"), ("neck", where.neck, whole[roles["chest"]], "head"))
+    for _, joints, below, end in along:
+        bend = (below.inv() * whole[roles[end]]).as_rotvec() / len(joints)
+        for number, joint in enumerate(joints):
+            found[joint] = below * Rotation.from_rotvec(bend * (number + 1))
+    places = _places(motion)
+    for number, side in enumerate(("left", "right")):
+        direction = Rotation.identity()
+        for role in ("clavicle", "arm", "elbow", "wrist", "hip", "knee", "ankle"):
+            joint, theirs = getattr(where, role)[number], roles[f"{side} {role}"]
             if role in ("clavicle", "hip"):
-                rest = np.eye(3)
-            if role in BONES:
-                ours = joints[getattr(where, BONES[role])[side]] - joints[joint]
-                rest = _between(ours, motion.offsets[place[word + LIMBS[BONES[role]]]])
-            hold(joint, word + name, rest)
-    found = np.zeros((len(oriented), len(body.parents), 3))
-    for joint in _from_the_root(body.parents):
+                direction = Rotation.identity()
+            if role in ENDS:  # the smallest turn from our bone's direction to theirs, each in its rest pose
+                end = getattr(where, ENDS[role])[number]
+                ours = (body.joints[end] - body.joints[joint]).astype(np.float64)
+                direction = _turn(ours, places[roles[f"{side} {ENDS[role]}"]] - places[theirs])
+            found[joint] = whole[theirs] * direction
+    pose = np.zeros((len(frames), len(body.parents), 3))
+    for joint in _downwards(body.parents):
         parent = body.parents[joint]
-        above = world[:, parent] if parent >= 0 else np.eye(3)
-        if not moved[joint]:
-            world[:, joint] = above
-        found[:, joint] = Rotation.from_matrix(np.swapaxes(np.broadcast_to(above, world[:, joint].shape), -1, -2)
-                                               @ world[:, joint]).as_rotvec()  # fmt: skip
+        above = found[parent] if parent >= 0 else Rotation.identity(len(frames))
+        pose[:, joint] = (above.inv() * found.setdefault(joint, above)).as_rotvec()
+    return pose
+
+
+def _roles(motion: Motion) -> dict[str, int]:
+    names = [name.rpartition(":")[2].replace("_", "").lower() for name in motion.names]
+    found = {}
+    for role, wanted in BONES.items():
+        for side in ("left", "right") if "{" in wanted[0] else ("",):
+            called = [name.format(side=side) for name in wanted]
+            there = [names.index(name) for name in called if name in names]
+            if not there:
+                raise DataError(
+                    f"A motion has no joint called {' or '.join(called)}; wanted one. Its joints: "
+                    f"{shown(', '.join(motion.names))}. Rename them."
+                )
+            found[f"{side} {role}".strip()] = there[0]
     return found
 
 
-def _from_the_root(parents: Sequence[int]) -> list[int]:
-    """Joints, each after its parent."""
-    order = [joint for joint, parent in enumerate(parents) if parent < 0]
-    for joint in order:
-        order += [child for child, parent in enumerate(parents) if parent == joint]
-    return order
+def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
+    """Of the joints where nothing turns."""
+    found = motion.offsets.copy()
+    for joint, parent in enumerate(motion.parents):
+        found[joint] += found[parent] if parent >= 0 else 0
+    return found
 
 
-def _between(one: np.ndarray, other: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes one direction to another."""
-    a, b = one / np.linalg.norm(one), other / np.linalg.norm(other)
-    axis, cosine = np.cross(a, b), float(a @ b)
-    sine = float(np.linalg.norm(axis))
-    return Rotation.from_rotvec(axis / max(sine, 1e-300) * np.arctan2(sine, cosine)).as_matrix()
+def _turn(one: np.ndarray, other: np.ndarray) -> Rotation:
+    """The smallest rotation from one direction to another."""
+    axis = np.cross(one, other)
+    angle = np.arctan2(np.linalg.norm(axis), one @ other)
+    if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(one) * np.linalg.norm(other):  # the same, or the opposite
+        axis = np.cross(one, np.eye(3)[np.abs(one).argmin()])
+    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+
+
+def _downwards(parents: tuple[int, ...]) -> list[int]:
+    """All joints, each after its parent."""
+    found = [joint for joint, parent in enumerate(parents) if parent < 0]
+    for joint in found:
+        found += [child for child, parent in enumerate(parents) if parent == joint]
+    return found

@@ -36,12 +36,14 @@ class Picture:
 
     Attributes:
         height, width: pixels.
-        depth: whether there is a fourth channel, 0 at `nearest` and 1 at `farthest` and beyond.
+        ground: one channel in place of the colours: how much of a pixel the mesh leaves free.
+        depth: whether there is one channel more, 0 at `nearest` and 1 at `farthest` and beyond.
         nearest, farthest: metres.
     """
 
     height: Annotated[int, Field(ge=8, le=4096)] = 256
     width: Annotated[int, Field(ge=8, le=4096)] = 192
+    ground: bool = False
     depth: bool = False
     nearest: Metres = 1.0
     farthest: Metres = 5.0
@@ -63,7 +65,7 @@ class Rasterised(Encoder):
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
     averaged as light. Textures lie in the folder of the data and are read when first drawn. Features are (3, height,
     width), numbers as files hold them, in the inputs' dtype; with `depth` (4, height, width), as `encoder=projection`
-    has it: what a network may start from in place of points.
+    has it: what a network may start from in place of points. With `ground` the silhouette alone, black on white.
 
     Args:
         input_shape: (points, columns).
@@ -120,10 +122,10 @@ class Rasterised(Encoder):
         self.people, self.topology = textures, mesh.topology
         self.textures: Textures | None = None
         self.camera = canonical_camera(picture.height, picture.width)
-        self.depth = picture.depth
+        self.ground, self.depth = picture.ground, picture.depth
         self.limits = (picture.nearest, picture.farthest)
         self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU wherever the model is
-        self.output_shape = (3 + picture.depth, picture.height, picture.width)
+        self.output_shape = ((1 if picture.ground else 3) + picture.depth, picture.height, picture.width)
 
     @torch.no_grad()
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
@@ -133,17 +135,17 @@ class Rasterised(Encoder):
                 f"A mesh of {inputs.shape[1]} vertices came; the topology has {int(self.faces.max()) + 1}. Set "
                 "encoder.rasterised.topology to that of the data."
             )
-        height, width = self.camera.height, self.camera.width
         scenes = [self._scene(cloud, row) for row, cloud in enumerate(inputs.cpu())]
         channels = ("color", "depth") if self.depth else ("color",)
         drawn = self.renderer.batch(scenes, channels)
-        found = inputs.new_empty(len(inputs), 3 + self.depth, height, width)
+        found = inputs.new_empty(len(inputs), *self.output_shape)
         for picture, one in zip(found, drawn, strict=True):
             light, cover = one["color"][..., :3], one["color"][..., 3:]
-            picture[:3] = encoded(light + (1 - cover)).movedim(-1, 0)
+            shown = 1 - cover if self.ground else encoded(light + (1 - cover))
+            picture[: shown.shape[-1]] = shown.movedim(-1, 0)
             if self.depth:
                 nearest, farthest = self.limits
-                picture[3] = ((one["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
+                picture[-1] = ((one["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
         return found
 
     def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:

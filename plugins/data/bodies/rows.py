@@ -199,6 +199,11 @@ ROWS = {
             },
             inputs=seen,
         ),
+        EncoderRow(
+            "a doll, its silhouette",
+            (132, 6),
+            {**DOLL, "renderer": "rasterizer", "height": 9, "width": 14, "ground": True},
+        ),
     ),
     "pose_error": (MetricRow("a doll", Target("real", NUMBERS)),),
     "human_scans": (
@@ -222,6 +227,22 @@ ROWS = {
                 **{f"subjects/*/{name}": DAMAGES for name in ("registration_7k.ply", "cameras.json")},
                 **{f"subjects/*/{name}/*.png": DAMAGES for name in ("images", "masks")},
             },
+        ),
+        DataRow(
+            "six silhouettes",
+            {
+                **SMALL,
+                **DOLL,
+                "train": 1,
+                "validation": 1,
+                "test": 1,
+                "height": 12,
+                "width": 9,
+                "shows": "subject",
+            },
+            write=scanned,
+            synthetic=False,
+            files=colored_meshes,
         ),
     ),
     "registration": (

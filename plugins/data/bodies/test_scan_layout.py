@@ -10,6 +10,7 @@ from torch.utils.data import default_collate
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
+from framework.geometry.light import light_of
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
 from plugins.data.bodies import scan_layout
@@ -223,10 +224,13 @@ def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
     assert unprepared.inputs(beside / "registration_7k.ply").shape == (2, 40, 6)
 
 
+@pytest.mark.parametrize("shows", ["photograph", "subject"])
 @pytest.mark.parametrize(("mirrored", "recoloured"), [(True, 0.0), (False, 1.0), (True, 0.5), (False, 0.0)])
-def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(whole, mirrored, recoloured):
+def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(
+    whole, mirrored, recoloured, shows
+):
     """Mesh and photograph change alike: of each sample one of twelve ways, and no way but those chosen."""
-    prepared = data(whole, mirrored=mirrored, recoloured=recoloured)
+    prepared = data(whole, mirrored=mirrored, recoloured=recoloured, shows=shows)
     prepared.prepare()
     train = prepared.splits().train
     batch = default_collate([train[number % len(train)] for number in range(120)])
@@ -249,7 +253,8 @@ def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(whole
         turned = {
             key: batch[key][row].flip(1) if sign[0] < 0 else batch[key][row] for key in ("target", "mask")
         }
-        assert torch.equal(found["target"][row], turned["target"][..., list(order)])
+        target = turned["target"][..., list(order)] if shows == "photograph" else turned["target"]
+        assert torch.equal(found["target"][row], target)
         assert torch.equal(found["mask"][row], turned["mask"])
         # where the canonical camera sees the points, mirrored about its middle column
         pixel = height * found["input"][row, :, 0] / found["input"][row, :, 2] + (width - 1) / 2
@@ -258,3 +263,41 @@ def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(whole
         assert torch.equal(found["input"][row, :, 1:3], batch["input"][row, :, 1:3])
     assert len(ways) == (2 if mirrored else 1) * (6 if recoloured else 1)
     assert prepared.varies == (mirrored or recoloured > 0)
+
+
+def test_targets_are_silhouettes_where_who_is_where_is_asked(whole):
+    found, shown = (data(whole, shows=what) for what in ("subject", "photograph"))
+    for one in (found, shown):
+        one.prepare()
+    assert found.target.names == ("subject",) and found.target.event_shape == (12, 9, 1)
+    assert found.fingerprint() != shown.fingerprint() and "shows" not in shown.fingerprint()
+    for one, other in zip(found.splits().test, shown.splits().test, strict=True):
+        assert torch.equal(one["target"][..., 0], other["mask"].float()) and 0 < one["target"].mean() < 1
+        assert all(torch.equal(one[name], other[name]) for name in ("input", "color", "mask"))
+
+
+def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
+    random = torch.Generator().manual_seed(0)
+    cloud = torch.cat([torch.randn(1, 132, 3, generator=random) / 4, torch.zeros(1, 132, 3)], 2)
+    cloud[..., 2] += 2
+    config = {
+        "name": "rasterised",
+        **DOLL,
+        "renderer": "rasterizer",
+        "height": 24,
+        "width": 20,
+        "depth": True,
+    }
+    drawn, ground = (
+        build(
+            "encoder",
+            resolve("encoder", {**config, "ground": ground}),
+            input_shape=(132, 6),
+            input_columns=(),
+        )(cloud)
+        for ground in (False, True)
+    )
+    assert drawn.shape == (1, 4, 24, 20) and ground.shape == (1, 2, 24, 20)
+    # black vertices: what light is left is the white of the ground
+    torch.testing.assert_close(light_of(drawn[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
+    assert torch.equal(drawn[:, 3], ground[:, 1]) and 0 < float(ground[:, 0].mean()) < 1

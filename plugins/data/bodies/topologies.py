@@ -4,13 +4,14 @@ All of them are rows of one finely split surface, so that what is known there (c
 """
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from framework.errors import DataError
 from framework.storage import cache as cached
 from framework.storage.arrays import archive
 from framework.storage.generated import generated
@@ -116,6 +117,50 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
     corners = split(surface.corners[stage], vertices, places, chosen, numbered_as_all=True).corners
     rows = np.concatenate([np.arange(vertices), vertices + np.flatnonzero(chosen)])
     return _compact(rows, *corners)
+
+
+def recognised(
+    body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
+) -> tuple[Sheet, Topology]:
+    """Which of the body's meshes this is.
+
+    Raises:
+        DataError: none has so many vertices, or the one that has other triangles.
+    """
+    for name in ("14k", "7k", "27k", "110k"):
+        # decimating takes seconds
+        if name == "7k" and not vertices == COUNTS["7k"] < len(body.template):
+            continue
+        surface = sheet(body, {"7k": 0, "110k": 2}.get(name, 1))
+        mesh = topology(body, surface, name)
+        if len(mesh.rows) != vertices:
+            continue
+        ours, theirs = (np.unique(np.sort(corners, 1), axis=0) for corners in (mesh.faces, faces))
+        if np.array_equal(ours, theirs):
+            return surface, mesh
+        raise DataError(
+            f"{source}: it has the {vertices} vertices of {body.source}, but other triangles, so that its vertices are "
+            "in another order. Give a mesh registered to that body, or the body that it is registered to."
+        )
+    raise DataError(
+        f"{source}: no mesh of {body.source} has {vertices} vertices; it has {len(body.template)}, and decimated or "
+        f"split {', '.join(map(str, COUNTS.values()))}. Give the body that this mesh is registered to."
+    )
+
+
+def in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
+    """A body with the vertices of a mesh, each with the template, shapes and shares of joints that it has on the body's
+    surface: means of an edge's ends where it is a midpoint. Without places in a texture.
+
+    Vertices of a decimated mesh are the body's own. A midpoint's skinning is not quite the middle of its edge where
+    that is bent.
+    """
+    parts = {
+        part: surface.carried(getattr(body, part))[mesh.rows]
+        for part in ("template", "weights", "shapes", "pose_shapes")
+        if getattr(body, part) is not None
+    }
+    return replace(body, faces=mesh.faces, uv=None, uv_faces=None, **parts)
 
 
 def split(

@@ -1,0 +1,156 @@
+"""Finds pose and shape of a registered mesh, whose vertices are those of the body: nonlinear least squares."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from framework.errors import DataError
+from plugins.data.bodies.body import Body, BodyModel
+
+OFF = 0.01
+"""Standard deviation of vertices from the model's, metres: clothes, hair, errors of the registration."""
+INDEPENDENT = 35
+"""What lies under one garment is off alike: a mesh counts for so many vertices that are off independently, however many
+it has."""
+BENT = 0.7
+"""Standard deviation of the angles of joints but the root, radians; it shares a bend among joints that lie close."""
+STEPS = 60
+ENOUGH = 1e-6
+"""Metres and radians: a step below ends the search."""
+MOST = 2_500
+"""Vertices that are looked at: evenly spread ones of a finer mesh do."""
+STEP = 1e-5
+"""Of differences: radians, metres, standard deviations of shape."""
+TOGETHER = 24
+"""Numbers in which the model is differentiated at once."""
+
+
+class Found(NamedTuple):
+    """Shape coefficients, joint rotations and translation as BodyModel takes them, float64, a batch of one; and the
+    root mean square distance of vertices, metres."""
+
+    shape: Float[Tensor, "1 shape"]
+    pose: Float[Tensor, "1 joint 3"]
+    translation: Float[Tensor, "1 3"]
+    error: float
+
+
+class _Problem(NamedTuple):
+    """Numbers are pose, translation and shape, in this order."""
+
+    model: BodyModel
+    vertices: Float[Tensor, "vertex 3"]
+    prior: Float[Tensor, "number"]
+
+    def parts(self, numbers: Float[Tensor, "batch number"]) -> tuple[Tensor, Tensor, Tensor]:
+        turned = 3 * len(self.model.parents)
+        pose, translation, shape = numbers.tensor_split((turned, turned + 3), 1)
+        return shape, pose.unflatten(1, (-1, 3)), translation
+
+    def apart(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
+        return self.model(*self.parts(numbers[None]))[0] - self.vertices
+
+    def cost(self, numbers: Float[Tensor, "number"]) -> float:
+        return float(self.apart(numbers).square().sum() + (self.prior * numbers.square()).sum())
+
+    def derivatives(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "coordinate number"]:
+        """Central differences, a row of a batch for each number: some ten digits in float64."""
+        found = []
+        for steps in (STEP * torch.eye(len(numbers)).to(numbers)).split(TOGETHER):
+            after, before = (self.model(*self.parts(numbers + sign * steps)) for sign in (1, -1))
+            found.append((after - before).flatten(1) / (2 * STEP))
+        return torch.cat(found).T
+
+
+@torch.no_grad()
+def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0) -> Found:
+    """The most probable pose, shape and translation of a mesh, metres (Levenberg-Marquardt; Moré 1978).
+
+    It starts from how the vertices of each joint are turned, so that any pose is found, also of somebody upside down.
+
+    Args:
+        body: whose shape coefficients have standard deviation 1.
+        usual: how much what is usual of people counts; 0: nothing but the vertices.
+
+    Raises:
+        DataError: another number of vertices, or numbers that are not finite.
+    """
+    if len(vertices) != len(body.template) or not vertices.isfinite().all():
+        raise DataError(
+            f"A mesh has {len(vertices)} vertices, {int((~vertices.isfinite()).any(1).sum())} of them not finite; "
+            f"wanted the {len(body.template)} of {body.source}, metres. Register it to that body."
+        )
+    step = -(-len(vertices) // MOST)
+    looked_at = {
+        name: getattr(body, name)[::step]
+        for name in ("template", "weights", "shapes", "pose_shapes")
+        if getattr(body, name) is not None
+    }
+    model = BodyModel(replace(body, faces=body.faces[:0], uv=None, uv_faces=None, **looked_at)).double()
+    vertices = vertices[::step].double()
+    joints, shapes = len(body.parents), body.shapes.shape[-1]
+    prior = vertices.new_full((joints + 1, 3), BENT**-2)
+    prior[[body.parents.index(-1), -1]] = 0  # where somebody stands, and faces, is free
+    prior = torch.cat([prior.flatten(), vertices.new_ones(shapes)]) * (
+        usual * OFF**2 * len(vertices) / INDEPENDENT
+    )
+    problem = _Problem(model, vertices, prior)
+    start = torch.cat([rotations_of(model, vertices).flatten(), vertices.new_zeros(3 + shapes)])
+    start[3 * joints :][:3] = -problem.apart(start).mean(0)
+    numbers = _least(problem, start)
+    error = float(problem.apart(numbers).square().sum(1).mean().sqrt())
+    return Found(*problem.parts(numbers[None]), error)
+
+
+def _least(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor, "number"]:
+    damping, cost = 1e-3, problem.cost(numbers)
+    for _ in range(STEPS):
+        slopes = problem.derivatives(numbers)
+        curvature = slopes.T @ slopes + problem.prior.diag()
+        uphill = slopes.T @ problem.apart(numbers).flatten() + problem.prior * numbers
+        while True:
+            # numbers that change nothing have no curvature of their own
+            scaled = curvature + (damping * curvature.diagonal() + 1e-9).diag()
+            step = -torch.linalg.solve(scaled, uphill)
+            tried = problem.cost(numbers + step)
+            if tried <= cost or damping > 1e10:
+                break
+            damping *= 4
+        if tried > cost:
+            break
+        numbers, cost, damping = numbers + step, tried, max(damping / 9, 1e-12)
+        if float(step.abs().max()) < ENOUGH:
+            break
+    return numbers
+
+
+def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
+    """Of each joint the rotation, relative to its parent's, that best takes the template's vertices that follow it to
+    where they are (Kabsch 1976): axis times angle, radians. The root's is that of all vertices. Joints with too few
+    vertices to tell turn as their parents do."""
+    template = model.template.unflatten(0, (3, -1)).T
+    upright = torch.eye(3).to(vertices)
+    turned = [upright] * len(model.parents)
+    found = torch.zeros(len(model.parents), 3).to(vertices)
+    for level, parents in model.levels:
+        for joint, parent in zip(level, parents, strict=True):
+            above = turned[parent] if parent >= 0 else upright
+            weights = model.weights[joint].square() if parent >= 0 else torch.ones_like(model.weights[joint])
+            total = weights.sum()
+            turned[joint] = above
+            if total < 3:
+                continue
+            one, other = (points - weights @ points / total for points in (template, vertices))
+            left, values, right = torch.linalg.svd(other.T @ (weights[:, None] * one))
+            if values[1] < 1e-3 * values[0]:  # on a line: a turn about it is not seen
+                continue
+            mirror = torch.ones_like(values)
+            mirror[2] = torch.linalg.det(left @ right).sign()
+            turned[joint] = left @ mirror.diag() @ right
+            local = Rotation.from_matrix((above.T @ turned[joint]).numpy())
+            found[joint] = torch.from_numpy(local.as_rotvec())
+    return found

@@ -1,0 +1,1 @@
+"""Densities over black and white images: how likely each pixel is white."""

@@ -1,0 +1,102 @@
+"""Independent Bernoulli densities of the numbers of an image."""
+
+from collections.abc import Collection
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+from torch.nn.functional import logsigmoid
+
+from framework.distributions.protocol import (
+    estimate,
+    exactly,
+    images,
+    median,
+    pick,
+    take,
+    tempered,
+)
+from framework.geometry.light import light_of
+
+
+class BernoulliImage(Distribution):
+    """Every number of an image is 1 with a probability of its own, else 0, independent of one another.
+
+    log p is y log σ(r) + (1 - y) log σ(-r). A value y between 0 and 1 is the share of a pixel that is 1, and log p the
+    mean over its parts; beyond, it is cut off.
+
+    Args:
+        logits: r, (*batch, height, width, number), log-odds of 1.
+    """
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, logits: Float[Tensor, "*batch height width number"]) -> None:
+        self.logits = logits
+        super().__init__(logits.shape[:-3], logits.shape[-3:], validate_args=False)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.independent(constraints.boolean, 3)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.logits.sigmoid()
+
+    @property
+    def mode(self) -> Tensor:
+        return (self.logits >= 0).to(self.logits)
+
+    @property
+    def variance(self) -> Tensor:
+        return self.logits.sigmoid() * (-self.logits).sigmoid()
+
+    def each_log_prob(self, value: Tensor) -> Tensor:
+        """Of every number by itself, nats."""
+        share = value.clamp(0, 1)
+        return share * logsigmoid(self.logits) + (1 - share) * logsigmoid(-self.logits)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.each_log_prob(value).sum((-3, -2, -1))
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        with torch.no_grad():
+            return self.mean.expand(torch.Size(sample_shape) + self.logits.shape).bernoulli()
+
+    def entropy(self) -> Tensor:
+        # -p log p - q log q = log(1 + e^-|r|) + |r| / (1 + e^|r|)
+        size = self.logits.abs()
+        return (size * (-size).sigmoid() - logsigmoid(size)).sum((-3, -2, -1))
+
+
+estimate.register(BernoulliImage, exactly)
+
+
+@median.register
+def _(density: BernoulliImage, samples: int) -> Tensor:
+    return density.mode
+
+
+@pick.register
+def _(density: BernoulliImage, index: Tensor) -> BernoulliImage:
+    return BernoulliImage(take(density.logits.flatten(-3), index).unflatten(-1, density.event_shape))
+
+
+@tempered.register
+def _(density: BernoulliImage, temperature: Tensor) -> BernoulliImage:
+    # odds^(1/T)
+    return BernoulliImage(density.logits / temperature)
+
+
+@images.register
+def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
+    """As "color" the light of the probabilities; as "mask" where a single number is rather 1."""
+    if (
+        not channels
+        or not set(channels) <= {"color", "mask"}
+        or ("mask" in channels and density.event_shape[-1] > 1)
+    ):
+        return images.dispatch(Distribution)(density, channels)
+    drawn = {"color": lambda: light_of(density.mean), "mask": lambda: density.logits[..., 0] >= 0}
+    return {name: drawn[name]() for name in channels}

@@ -1,0 +1,82 @@
+"""The Bernoulli image head: how likely each number of an image is 1 and not 0."""
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import hardtanh
+
+from framework.density_head import DensityHead
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.density_head.bernoulli_image.density import BernoulliImage
+
+SMALLEST = 1e-3
+"""Probabilities lie between this and 1 less this: what is wrong costs 7 nats a number at most, before calibration. A
+step of 8 bits is 4e-3: smaller ones say nothing about a picture."""
+LEAST, MOST, ROUNDS = 1e-2, 1e2, 60
+"""Of the factor of log-odds, and halvings of the interval in which it is sought."""
+
+
+class BernoulliImageHead(DensityHead):
+    """Bernoulli densities over the numbers of an image (`BernoulliImage`); it reads what an encoder paints on white.
+
+    Features are (channel, height, width), one channel for each of the target's: 1, the white of the empty ground, where
+    the number is surely 0, and 0, black, where it is surely 1; what lies beyond is cut off. The loss is the
+    cross-entropy, nats a number, so that it does not grow with the image. One factor of all log-odds is fitted to the
+    validation split (Guo et al. 2017, its inverse).
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    direct: ClassVar[bool] = True
+    bibtex = """@inproceedings{guo2017calibration,
+  title = {On Calibration of Modern Neural Networks},
+  author = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
+  booktitle = {International Conference on Machine Learning (ICML)},
+  year = {2017}
+}"""
+
+    factor: Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("image", by="density_head bernoulli_image")
+        self.shape = (len(target.names), *target.size)
+        self.size = math.prod(self.shape)
+        self.register_buffer("factor", torch.ones((), dtype=torch.float64))
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> BernoulliImage:
+        logits = self._logits(raw)
+        return BernoulliImage(logits * self.factor.to(logits))
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        # before what calibrate fits: it is the same loss whenever it is asked
+        return -BernoulliImage(self._logits(raw)).each_log_prob(target).mean((-3, -2, -1))
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        # the log-likelihood is concave in the factor, so that its slope is 0 once
+        if len(raw) == 0:
+            raise ValueError("the factor of log-odds is fitted to validation data, but got none of it.")
+        low, high = math.log(LEAST), math.log(MOST)
+        for _ in range(ROUNDS):
+            middle = (low + high) / 2
+            rising = self._slope(raw, target, math.exp(middle)) > 0
+            low, high = (middle, high) if rising else (low, middle)
+        self.factor.fill_(math.exp((low + high) / 2))
+
+    def _slope(self, raw: Tensor, target: Tensor, factor: float) -> float:
+        """Of the log-likelihood in the factor f: Σ r (y - σ(f r)), image by image."""
+        total = 0.0
+        for one, value in zip(raw, target, strict=True):
+            logits = self._logits(one).double()
+            total += float((logits * (value.double().clamp(0, 1) - (factor * logits).sigmoid())).sum())
+        return total
+
+    def _logits(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch height width number"]:
+        image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
+        # log((1 - w) / w) of white w; in float64: near 1 a float32 has no digits of what is missing
+        return -hardtanh(image.double(), SMALLEST, 1 - SMALLEST).logit().to(image.dtype)

@@ -1,0 +1,34 @@
+"""Rows of the contract: images of few pixels, with log-densities from 50 digits."""
+
+from collections.abc import Iterator
+
+import mpmath
+import torch
+
+from framework.density_head import DensityHead
+from framework.target import Target
+from framework.testing.rows import Case, HeadRow
+
+SILHOUETTE = Target("image", ("subject",), size=(2, 3))
+PARTS = Target("image", ("skin", "cloth"), size=(1, 2))
+WHITE = (-1e30, 0.0, 1e-7, 0.0625, 0.25, 0.5, 0.875, 0.9990234375, 1.0, 3.0)
+
+
+def bernoulli(head: DensityHead) -> Iterator[Case]:
+    """Σ log w where the number is 0, Σ log(1 - w) where it is 1, white w within its bounds."""
+    for given in WHITE:
+        raw = torch.full((2, head.size), given, dtype=torch.float64)
+        with mpmath.workdps(50):
+            white = min(max(mpmath.mpf(given), mpmath.mpf(1e-3)), mpmath.mpf(1 - 1e-3))
+            log_prob = [float(head.size * mpmath.log(part)) for part in (white, 1 - white)]
+        shape = (2, 3, 1) if head.size == 6 else (1, 2, 2)
+        value = torch.tensor([0.0, 1.0]).double().reshape(2, 1, 1, 1).expand(2, *shape)
+        yield Case(f"w = {given:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
+
+
+ROWS = {
+    "bernoulli_image": (
+        HeadRow("a silhouette", SILHOUETTE, cases=bernoulli),
+        HeadRow("two parts", PARTS, cases=bernoulli),
+    )
+}
