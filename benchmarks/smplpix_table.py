@@ -27,6 +27,7 @@ from framework.configuration.schema import build, resolve
 from framework.data import Batch, Data
 from framework.encoder import Encoder
 from framework.evaluation.splits import BLOCK, evaluate
+from framework.model import Predictor
 from framework.reports.table import NOT_AVAILABLE
 from framework.runs.job import RECORD
 from framework.training.batches import Batches
@@ -229,6 +230,10 @@ def judged(folder: Path, lpips: str | None) -> tuple[Judged, Data]:
     predictor, description = load_with_description(folder)
     data = reader(description)
     data.prepare()
+    return examined(predictor, data, lpips), data
+
+
+def examined(predictor: Predictor, data: Data, lpips: str | None) -> Judged:
     metrics = []
     for name in METRICS:
         weights = {"weights": lpips} if name == "lpips" else {}
@@ -256,7 +261,7 @@ def judged(folder: Path, lpips: str | None) -> tuple[Judged, Data]:
         for encoder, (before, _) in zip(encoders, pairwise(inputs), strict=True):
             spent[encoder.fixed] += milliseconds(partial(encoder, before), 30, warm_up=3)
     learns = any(True for encoder in encoders for _ in encoder.parameters())
-    return Judged(numbers, torch.cat(subjects).numpy(), spent[True], spent[False], learns), data
+    return Judged(numbers, torch.cat(subjects).numpy(), spent[True], spent[False], learns)
 
 
 def described(data: Data) -> str:
