@@ -241,9 +241,11 @@ def pictured(kind: str, made: Made, density: Distribution) -> None:
         wanted = torch.stack([light_of(part.mean) for part in made.parts], 1)
     elif kind == "reshaped":
         wanted = parts[..., 0].reshape(2, 2, *made.parts[0].event_shape)
-    elif kind in ("mixture", "tempered"):
-        weights = density.log_weights.exp() if kind == "tempered" else share(made.weights)
-        wanted = (parts * weights[:, None, None, None]).sum(-1)
+    elif kind == "mixture":
+        wanted = (parts * share(made.weights)[:, None, None, None]).sum(-1)
+    elif kind == "tempered":  # weights and, of some, means are its own
+        inside = light_of(density.components.mean).movedim(1, -1)
+        wanted = (inside * density.log_weights.exp()[:, None, None, None]).sum(-1)
     assert found.shape == (*density.batch_shape, *density.event_shape)
     assert wanted is not None or kind in ("mixture of a fold", "mixture of mixtures")
     if wanted is not None:

@@ -59,8 +59,7 @@ class Registered:
 
 
 class Rasterised(Encoder):
-    """The mesh of a registered body with its vertices' colours or its texture, on white, as the canonical camera of its
-    size sees it.
+    """The mesh of a registered body with its vertices' colours or its texture, on white, before the canonical camera.
 
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
     averaged as light. Textures lie in the folder of the data and are read when first drawn. Features are (3, height,

@@ -9,6 +9,7 @@ from torch.distributions import Distribution, constraints
 from torch.nn.functional import logsigmoid
 
 from framework.distributions.protocol import (
+    each_cdf,
     estimate,
     exactly,
     images,
@@ -76,6 +77,12 @@ estimate.register(BernoulliImage, exactly)
 @median.register
 def _(density: BernoulliImage, samples: int) -> Tensor:
     return density.mode
+
+
+@each_cdf.register
+def _(density: BernoulliImage, value: Tensor) -> Tensor:
+    below = (-density.logits.double()).sigmoid()
+    return torch.where(value < 0, 0.0, torch.where(value < 1, below, 1.0))
 
 
 @pick.register

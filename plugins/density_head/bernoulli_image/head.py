@@ -33,10 +33,11 @@ class BernoulliImageHead(DensityHead):
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct: ClassVar[bool] = True
     bibtex = """@inproceedings{guo2017calibration,
-  title = {On Calibration of Modern Neural Networks},
-  author = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
-  booktitle = {International Conference on Machine Learning (ICML)},
-  year = {2017}
+  author    = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
+  title     = {On Calibration of Modern Neural Networks},
+  booktitle = {International Conference on Machine Learning},
+  pages     = {1321--1330},
+  year      = {2017}
 }"""
 
     factor: Tensor

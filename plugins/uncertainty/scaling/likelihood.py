@@ -13,6 +13,7 @@ Term = Callable[[Tensor], Tensor]
 """Part of the mean negative log-likelihood: parameters (n,), float64 → a scalar, differentiable."""
 
 
+RESTARTS = 20
 NEAREST = 1e-9
 """Steps, in slopes, to a region that is not numbers."""
 
@@ -59,10 +60,15 @@ def minimise(
 
     options = {"ftol": rounding, "gtol": 1e-12, "maxiter": 200}
     bounds = np.stack([low, high], 1)
-    found = optimize.minimize(
-        trial, start.tolist(), jac=True, method="L-BFGS-B", bounds=bounds, options=options
-    )
-    x = found.x if found.fun <= first else start.cpu().numpy()
+    x, least = start.cpu().numpy(), first
+    for _ in range(RESTARTS):
+        found = optimize.minimize(trial, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        gained = least - found.fun
+        if gained >= 0:
+            x, least = found.x, found.fun
+        # it takes one step that gains nothing for the end, also where the slope is steep: begun anew it goes on
+        if gained <= rounding * (1 + abs(least)):
+            break
     step = 1.0 if walled else 0.0
     while (
         step > NEAREST

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
@@ -114,6 +114,7 @@ def test_slopes_agree_with_finite_differences():
 
 
 @settings(max_examples=60, deadline=None)
+@example(start=[2.40625, 2.5, 2.5, 0.0], low=1.5, width=1.625, seed=605)  # SciPy stops far from any minimum
 @given(
     st.lists(st.floats(-5, 5), min_size=2, max_size=4),
     st.floats(-3, 3),
