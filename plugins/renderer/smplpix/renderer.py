@@ -16,7 +16,7 @@ from framework.geometry.light import encoded
 from framework.model import Predictor
 from framework.renderer import Renderer, Scene
 from plugins.renderer.smplpix.canvas import Precision
-from plugins.renderer.smplpix.projection import COLUMNS
+from plugins.renderer.smplpix.projection import COLUMNS, Projection
 
 SIZES_KEPT = 4
 """Networks of so many image sizes are kept ready."""
@@ -46,13 +46,7 @@ class SMPLpix(Renderer):
 
     channels = frozenset({"color"})
     background = 1.0
-    bibtex = """@inproceedings{prokudin2021smplpix,
-  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
-  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  pages = {1810--1819},
-  year = {2021}
-}"""
+    bibtex = Projection.bibtex
 
     def __init__(
         self,
