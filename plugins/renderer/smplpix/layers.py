@@ -6,11 +6,12 @@ beyond a border in every layer, and what is far from any subject need not be com
 """
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 Normalisation = Literal["batch", "renorm", "group"]
@@ -67,17 +68,21 @@ class Layer(nn.Module):
         return lambda maps: torch.maximum(convolved(maps, weight, bias, self.stride), floor)
 
     def _normalised(self, maps: Tensor) -> Tensor:
-        scale, shift = (self._of_groups if self.normalisation == "group" else self._of_batch)(maps)
+        if self.normalisation != "group":
+            return self._of_batch(maps)
+        scale, shift = self._of_groups(maps)
         ground = shift.relu()
         # relu(scale m + shift) - relu(shift)
         return torch.maximum(torch.addcmul((shift - ground).to(maps), maps, scale.to(maps)), -ground.to(maps))
 
-    def _of_batch(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        """Scale and shift, (channels, 1, 1), by the moments of the batch; these enter the running ones."""
-        variance, mean = torch.var_mean(maps, (0, 2, 3), correction=0)
-        deviation = (variance + EPSILON).sqrt()
-        ratio, moved = 1.0, 0.0
+    def _of_batch(self, maps: Tensor) -> Tensor:
+        """By the moments of the batch; these enter the running ones."""
         with torch.no_grad():
+            standard, mean, inverse = torch.native_batch_norm(
+                maps, None, None, None, None, True, 0.0, EPSILON
+            )
+            deviation = inverse.reciprocal()
+            ratio, moved = torch.ones_like(mean), torch.zeros_like(mean)
             if self.normalisation == "renorm" and self.batches > 0:
                 usual = (self.variance + EPSILON).sqrt()
                 ratio = (deviation / usual).clamp(1 / LARGEST_RATIO, LARGEST_RATIO)
@@ -85,10 +90,11 @@ class Layer(nn.Module):
             self.batches += 1
             share = max(SLOWEST, 1 / self.batches.item())
             self.mean.lerp_(mean.to(self.mean), share)
-            self.variance.lerp_(variance.to(self.variance), share)
-        scale = self.gain * ratio / deviation
-        shift = self.offset + self.gain * moved - mean * scale
-        return scale[:, None, None], shift[:, None, None]
+            self.variance.lerp_((deviation.square() - EPSILON).clamp_min(0).to(self.variance), share)
+        answer: Tensor = FromGround.apply(
+            maps, self.gain * ratio, self.offset + self.gain * moved, standard, mean, inverse
+        )
+        return answer
 
     def _of_groups(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Scale and shift, (batch, channels, 1, 1), by the moments of each picture's groups of channels."""
@@ -98,6 +104,52 @@ class Layer(nn.Module):
         scale = self.gain * torch.rsqrt(variance + EPSILON).repeat_interleave(each, 1)
         shift = self.offset - mean.repeat_interleave(each, 1) * scale
         return scale[..., None, None], shift[..., None, None]
+
+
+class FromGround(torch.autograd.Function):
+    """relu(gain s + offset) less what that is on the empty ground, where maps are 0; s are the maps, standardised.
+
+    Autograd on the same formula takes five times as long: this reads the maps a few times, backwards too, and knows
+    that the moments, of the maps and of the ground, are functions of the maps.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, maps: Tensor, gain: Tensor, offset: Tensor, standard: Tensor, mean: Tensor, inverse: Tensor
+    ) -> Tensor:
+        """`standard`, `mean` and `inverse` (of the deviation) are those of the maps over all but channels."""
+        shift = offset - gain * mean * inverse
+        ground = shift.relu()
+        upper, factor, floor = ((offset - ground), gain, -ground)
+        answer = torch.addcmul(_channels(upper, maps), standard, _channels(factor, maps))
+        answer = torch.maximum(answer, _channels(floor, maps))
+        ctx.save_for_backward(answer, standard, gain, mean, inverse, shift)
+        return answer
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        answer, standard, gain, mean, inverse, shift = ctx.saved_tensors
+        count = slope.numel() // slope.shape[1]
+        of_ground = -_sum(slope).to(gain) * (shift > 0)
+        slope = slope * (answer > _channels(-shift.relu(), answer))
+        of_offset, of_gain = _sum(slope).to(gain), _sum(slope * standard).to(gain)
+        # how the answer moves with mean and inverse by the ground alone; by s both are in the usual formula
+        of_mean, of_inverse = -of_ground * gain * inverse, -of_ground * gain * mean
+        constant = (of_mean - gain * inverse * of_offset) / count
+        standardised = -(gain * inverse * of_gain + of_inverse * inverse.square()) / count
+        of_maps = torch.addcmul(_channels(constant, slope), slope, _channels(gain * inverse, slope))
+        of_maps = torch.addcmul(of_maps, standard, _channels(standardised, slope))
+        return of_maps, of_gain - of_ground * mean * inverse, of_offset + of_ground, None, None, None
+
+
+def _channels(values: Tensor, maps: Tensor) -> Tensor:
+    return values.to(maps.dtype)[:, None, None]
+
+
+def _sum(maps: Tensor) -> Float[Tensor, " channels"]:
+    """Over all but channels; over rows it takes a third of the time where channels lie last."""
+    return maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]).sum(0)
 
 
 def convolved(maps: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1) -> Tensor:
