@@ -35,11 +35,8 @@ from framework.training.batches import Batches
 HERE = Path(__file__).resolve()
 FOLDER = HERE.parents[1] / "outputs/smplpix_table"
 SWEEPS = {
-    "rows": (
-        "experiment=smplpix/rasterised,smplpix/textured,smplpix/quick",
-        "data.topology=7k,27k",
-        "seed=1,2,3",
-    ),
+    "meshes": ("experiment=smplpix/rasterised,smplpix/textured", "data.topology=7k,27k", "seed=1"),
+    "networks": ("experiment=smplpix/quick,smplpix/hybrid", "data.topology=7k,27k", "seed=1,2,3"),
     "plain": (
         "experiment=smplpix/rasterised,smplpix/textured",
         "data.topology=7k,27k",
@@ -47,9 +44,14 @@ SWEEPS = {
         "seed=1",
     ),
 }
-"""Folders and arguments: the table's six rows, and what meshes are without anti-aliasing."""
+"""Folders and arguments: the table's six rows, what a network over the mesh adds, meshes without anti-aliasing."""
 METRICS = ("psnr", "ssim", "ms_ssim", "lpips")
-NAMES = {"rasterised": "mesh, vertex colours", "textured": "mesh, texture", "quick": "SMPLpix"}
+NAMES = {
+    "rasterised": "mesh, vertex colours",
+    "textured": "mesh, texture",
+    "quick": "SMPLpix",
+    "hybrid": "network over the mesh",
+}
 """Of rows, by the experiments' names; any other stands for itself."""
 SAID = ("experiment", "data.topology", "seed", "metric", "pictures", "logger", "threads", "workers")
 """Arguments that a row says already, or that change no picture."""
@@ -133,6 +135,7 @@ def main() -> None:
 
 def report(folders: Sequence[Path], lpips: str | None) -> str:
     runs = grouped([result for folder in folders for result in completed(folder)])
+    told = " and ".join(f"`python -m framework -m {' '.join(words)}`" for words in SWEEPS.values())
     rows: dict[Row, list[Judged]] = {}
     about = ""
     for row, results in runs.items():
@@ -149,7 +152,7 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
         [
             "# Table 7.1 on synthetic people",
             "",
-            f"{about} The six rows are from one sweep: `python -m framework -m {' '.join(SWEEPS['rows'])}`. Means over "
+            f"{about} Sweeps: {told}. Means over "
             "test pictures; behind ± the standard deviation over seeds, then that over subjects (of the means of each "
             "one's pictures and seeds). A dash: nothing is trained, all seeds give the same numbers. Inside: over "
             "the subject's pixels; the others over the frame, most of which is white. Milliseconds of "

@@ -1,0 +1,281 @@
+"""What networks of neural pixels gain with training time, against meshes; results and pictures lie beside this file.
+
+`python benchmarks/smplpix_training.py [--skins <folder>]` runs what outputs/benchmarks/smplpix_training does not hold
+yet, three hours and a half on two cores, and goes on where it was stopped. Minutes are a step's time, measured while
+nothing else runs, times the steps: `--steps <file>` takes the times of an earlier call.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.machine import machine
+from framework.configuration.loading import load, load_with_description, reader
+from framework.figures.style import GREEN, GREY, RED, titled_figure
+
+HERE = Path(__file__).resolve()
+ROOT = HERE.parents[1]
+FOLDER = ROOT / "outputs/benchmarks/smplpix_training"
+SKINS = "Skins nobody wore in training"
+STEPS_AN_EPOCH = 240
+TIMED = (20, 80)
+"""Steps of the two trainings whose difference is a step's time: without what starting and ending take."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    Attributes:
+        words: arguments of its runs.
+        epochs: of trainings, each with its own schedule; none: nothing is trained.
+        seeds: of the training of `epochs[-1]`; the shorter ones have the first.
+    """
+
+    words: tuple[str, ...]
+    epochs: tuple[int, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+
+    def runs(self) -> list[tuple[int, int]]:
+        """(epochs, seed) of each; (0, 0) where nothing is trained."""
+        if not self.epochs:
+            return [(0, 0)]
+        short = [(epochs, self.seeds[0]) for epochs in self.epochs[:-1]]
+        return short + [(self.epochs[-1], seed) for seed in self.seeds]
+
+
+def over(experiment: str, *more: str) -> tuple[str, ...]:
+    return (f"experiment=smplpix/{experiment}", *more)
+
+
+SEEDS = (0, 1, 2)
+METHODS = {
+    "mesh, 7k": Method(over("rasterised")),
+    "mesh, 7k, one sample a pixel": Method(over("rasterised", "encoder.rasterised.renderer.supersampling=1")),
+    "mesh, 27k": Method(over("rasterised", "data.topology=27k")),
+    "points alone, 7k": Method(over("quick"), (2, 6, 20), SEEDS),
+    "points alone, 27k": Method(over("quick", "data.topology=27k"), (20,)),
+    "points alone, 7k, unet": Method(over("quick", "encoder=[projection,unet]"), (1,)),
+    "over the mesh, 7k": Method(over("hybrid"), (2, 6, 20), SEEDS),
+    "over the mesh, 27k": Method(over("hybrid", "data.topology=27k"), (20,)),
+}
+DRAWN = {"points alone, 7k": RED, "over the mesh, 7k": GREEN}
+LINES = {"mesh, 7k": "-", "mesh, 27k": "--"}
+RIVAL = "mesh, 7k"
+COLUMNS = {
+    "psnr_db": ("PSNR, dB", 2),
+    "psnr_masked_db": ("inside", 2),
+    "ssim": ("SSIM", 4),
+    "ssim_masked": ("inside", 3),
+    "ms_ssim": ("MS-SSIM", 4),
+}
+
+
+def folder(name: str, epochs: int, seed: int) -> Path:
+    return FOLDER / "_".join([name.replace(",", "").replace(" ", "_"), str(epochs), str(seed)])
+
+
+def completed(name: str, method: Method) -> dict[tuple[int, int], dict[str, float]]:
+    """Results of its runs, those that are missing run first."""
+    found = {}
+    for epochs, seed in method.runs():
+        place = folder(name, epochs, seed) / "results.json"
+        if not place.is_file():
+            words = [*method.words, f"seed={seed}", "logger=none", f"hydra.run.dir={place.parent}"]
+            words += [f"trainer.max_epochs={epochs}"] if epochs else []
+            subprocess.run([sys.executable, "-m", "framework", *words], cwd=ROOT, check=True)
+        found[epochs, seed] = json.loads(place.read_text())
+    return found
+
+
+def step_seconds(words: Sequence[str]) -> float:
+    """Of a training step with all threads, from two short trainings."""
+    took = []
+    for steps in TIMED:
+        with TemporaryDirectory() as place:
+            limits = [f"+trainer.limit_train_batches={steps}", "+trainer.limit_val_batches=1"]
+            command = [*words, "trainer.max_epochs=1", "+trainer.limit_test_batches=1", *limits]
+            command += ["logger=none", "pictures=false", f"hydra.run.dir={place}/run"]
+            start = time.perf_counter()
+            subprocess.run(
+                [sys.executable, "-m", "framework", *command], cwd=ROOT, check=True, capture_output=True
+            )
+            took.append(time.perf_counter() - start)
+    return (took[1] - took[0]) / (TIMED[1] - TIMED[0])
+
+
+def crossing(minutes: Sequence[float], values: Sequence[float], level: float) -> str:
+    """When a curve rises above a level, straight between trainings in the logarithm of time."""
+    for first, (before, after) in enumerate(pairwise(values)):
+        if before <= level < after:
+            share = (level - before) / (after - before)
+            return f"after {np.exp(np.interp(share, [0, 1], np.log(minutes[first : first + 2]))):.0f} minutes"
+    return (
+        f"before {minutes[0]:.0f} minutes" if values[0] > level else f"not within {minutes[-1]:.0f} minutes"
+    )
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    arguments.add_argument("--skins", help="folder of skins in the default body's texture layout")
+    arguments.add_argument("--steps", type=Path, help="file of seconds a step")
+    given = arguments.parse_args()
+    methods = dict(METHODS)
+    if given.skins:
+        worn = f"data.skins={given.skins}"
+        methods |= {
+            f"skins, {RIVAL}": Method(over("rasterised", worn)),
+            "skins, over the mesh, 7k": Method(over("hybrid", worn), (20,)),
+        }
+    results = {name: completed(name, method) for name, method in methods.items()}
+    times = FOLDER / "steps.json"
+    if given.steps:
+        seconds = json.loads(given.steps.read_text())
+    else:
+        seconds = {name: step_seconds(method.words) for name, method in METHODS.items() if method.epochs}
+        times.write_text(json.dumps(seconds, indent=1))
+    draw(results, seconds, HERE.with_suffix(".png"))
+    sheet(HERE.with_name(HERE.stem + "_people.png"))
+    HERE.with_suffix(".md").write_text(report(results, seconds), encoding="utf-8")
+
+
+def mean(found: Mapping[tuple[int, int], Mapping[str, float]], epochs: int, key: str) -> tuple[float, float]:
+    """Over seeds, with their standard deviation (NaN of one)."""
+    values = [result[key] for (trained, _), result in found.items() if trained == epochs]
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
+def report(
+    results: Mapping[str, Mapping[tuple[int, int], dict[str, float]]], seconds: Mapping[str, float]
+) -> str:
+    def minutes(name: str, epochs: int) -> float:
+        return epochs * STEPS_AN_EPOCH * seconds[name.removeprefix("skins, ")] / 60
+
+    def rows(chosen: Sequence[str]) -> list[str]:
+        lines = []
+        for name in chosen:
+            found = results[name]
+            for epochs in sorted({epochs for epochs, _ in found}):
+                cells = []
+                for key, (_, decimals) in COLUMNS.items():
+                    middle, over_seeds = mean(found, epochs, key)
+                    spread = "" if np.isnan(over_seeds) else f" ± {over_seeds:.{decimals}f}"
+                    cells.append(f"{middle:.{decimals}f}{spread}")
+                seeds = sum(trained == epochs for trained, _ in found)
+                trained = f"{epochs} | {minutes(name, epochs):.0f} | {seeds}" if epochs else "– | – | –"
+                lines.append(f"| {name.removeprefix('skins, ')} | {trained} | {' | '.join(cells)} |")
+        return lines
+
+    header = [
+        f"| | epochs | minutes | seeds | {' | '.join(heading for heading, _ in COLUMNS.values())} |",
+        f"|---|{'---:|' * (3 + len(COLUMNS))}",
+    ]
+    crossings = []
+    for name in DRAWN:
+        budgets = METHODS[name].epochs
+        for key, heading in (("psnr_db", "PSNR"), ("ssim_masked", "SSIM inside")):
+            curve = [mean(results[name], epochs, key)[0] for epochs in budgets]
+            level = mean(results[RIVAL], 0, key)[0]
+            found = crossing([minutes(name, epochs) for epochs in budgets], curve, level)
+            crossings.append(f"- {name}, {heading}: above the mesh of 7k {found}.")
+    skins = [name for name in results if name.startswith("skins, ")]
+    return "\n".join(
+        [
+            "# Neural pixels against meshes, by training time (synthetic)",
+            "",
+            "Generated people (`human_scans`, not real ones): 160 to train on, 96 views of 16 unseen ones, 256 × 192. "
+            "Meshes are drawn with their vertices' colours, 4 × 4 samples a pixel unless said. Inside: over the "
+            "subject's pixels. ± is the standard deviation over seeds, where there are several. Each budget is a "
+            "training of its own, whose rate falls to 0 at its end. Minutes on two cores.",
+            "",
+            f"![curves]({HERE.stem}.png)",
+            "",
+            *header,
+            *rows([name for name in results if name not in skins]),
+            "",
+            *crossings,
+            "",
+            f"![people]({HERE.stem}_people.png)",
+            "",
+            "From the left: photograph, mesh, points alone, network over the mesh (20 epochs); then where each is off.",
+            "",
+            *([f"## {SKINS}", "", *header, *rows(skins), ""] if skins else []),
+            f"{machine('torch', 'numpy')} Command: `python benchmarks/smplpix_training.py"
+            f"{' --skins <folder>' if skins else ''}`.",
+            "",
+        ]
+    )
+
+
+def draw(
+    results: Mapping[str, Mapping[tuple[int, int], dict[str, float]]],
+    seconds: Mapping[str, float],
+    place: Path,
+) -> None:
+    figure = titled_figure(
+        (10, 4), "Unseen people, 256 × 192 pixels; bars: standard deviation of three seeds", True
+    )
+    for axes, key, label in zip(
+        figure.subplots(1, 2),
+        ("psnr_db", "ssim_masked"),
+        ("PSNR of the frame, dB", "SSIM inside the subject"),
+        strict=True,
+    ):
+        for name, colour in DRAWN.items():
+            epochs = METHODS[name].epochs
+            minutes = [each * STEPS_AN_EPOCH * seconds[name] / 60 for each in epochs]
+            values, spreads = zip(*(mean(results[name], each, key) for each in epochs), strict=True)
+            axes.errorbar(
+                minutes, values, np.nan_to_num(spreads), color=colour, marker="o", capsize=3, label=name
+            )
+        for name, dashes in LINES.items():
+            axes.axhline(mean(results[name], 0, key)[0], color=GREY, linestyle=dashes, label=name)
+        axes.set(xscale="log", xlabel="minutes of training on two cores", ylabel=label)
+    axes.legend()
+    figure.savefig(place)
+
+
+@torch.inference_mode()
+def sheet(place: Path, chosen: Sequence[int] = (0, 20, 44, 75)) -> None:
+    """Photographs of unseen people, their pictures, and where these are off."""
+    names = (RIVAL, "points alone, 7k", "over the mesh, 7k")
+    runs = [folder(name, METHODS[name].epochs[-1] if METHODS[name].epochs else 0, 0) for name in names]
+    _, description = load_with_description(runs[0])
+    data = reader(description)
+    data.prepare()
+    test = data.splits().test
+    inputs = torch.stack([test[row]["input"] for row in chosen])
+    truths = torch.stack([test[row]["target"] for row in chosen])
+    pictures = [load(run)(inputs).mean.reshape(truths.shape).clamp(0, 1) for run in runs]
+    columns = [truths, *pictures, *((1 - 3 * (picture - truths).abs()).clamp(0, 1) for picture in pictures)]
+    figure = titled_figure((1.5 * len(columns), 2.0 * len(chosen)), "Unseen people", True)
+    titles = [
+        "photograph",
+        "mesh",
+        "points alone",
+        "over the mesh",
+        *(f"{name}, 3 × error" for name in ("mesh", "points", "over it")),
+    ]
+    for row, line in enumerate(figure.subplots(len(chosen), len(columns))):
+        for axes, column, title in zip(line, columns, titles, strict=True):
+            axes.imshow(column[row].numpy())
+            axes.set_axis_off()
+            if row == 0:
+                axes.set_title(title, fontsize=9)
+    figure.savefig(place)
+
+
+if __name__ == "__main__":
+    main()
