@@ -351,6 +351,21 @@ TEXTS = [
     b"a b c " * 10**5,
     b"\0" * 10**6,
 ]
+
+
+def motions(whole: bytes) -> list[bytes]:
+    """Of a BVH file: counts that lie, joints that end before they begin, numbers that are none."""
+    changes = [
+        (b"CHANNELS 3", b"CHANNELS -2"), (b"CHANNELS 3", b"CHANNELS 99999999999"), (b"CHANNELS 3", b"CHANNELS 3_0"),
+        (b"Zrotation", b"Qrotation"), (b"Zrotation", b"Yrotation"), (b"Zrotation", b"Wrotation"), (b"Spine", b""),
+        (b"OFFSET 0 1.5 0", b"OFFSET nan inf 1e400"), (b"ROOT Hips\n{", b"ROOT Hips\n}"), (b"ROOT Hips\n", b""),
+        (b"JOINT Spine", b"ROOT Spine"), (b"End Site\n{", b"End Site\n"), (b"Frames: 3", b"Frames: -3"),
+        (b"Frames: 3", b"Frames: 99999999999"), (b"0.0083", b"1e-320"), (b"0.0083", b"-1"), (b"8.5", b"1e300"),
+        (b"JOINT", b"JOINT a { JOINT " * 50_000 + b"JOINT"),
+    ]  # fmt: skip
+    return [whole.replace(old, new) for old, new in changes]
+
+
 SAFETENSORS = [
     struct.pack("<Q", 2**63) + b"{}", struct.pack("<Q", 10**6) + b"{", struct.pack("<Q", 10**5) + b"[" * 10**5,
     struct.pack("<Q", 64) + b'{"a":{"dtype":"F32","shape":[1000000000000],"data_offsets":[0,4]}}'[:64],

@@ -197,6 +197,18 @@ def xyz() -> bytes:
     return ("x y z red green blue\n" + "\n".join(" ".join(map(str, row)) for row in rows)).encode()
 
 
+def bvh() -> bytes:
+    """Two joints, three frames."""
+    turns = "CHANNELS 3 Zrotation Yrotation Xrotation"
+    head = [
+        "HIERARCHY", "ROOT Hips", "{", "OFFSET 0 0 0", "CHANNELS 6 Xposition Yposition Zposition " + turns[11:],
+        "JOINT Spine", "{", "OFFSET 0 1.5 0", turns, "End Site", "{", "OFFSET 0 1 0", "}", "}", "}",
+        "MOTION", "Frames: 3", "Frame Time: 0.0083",
+    ]  # fmt: skip
+    rows = [" ".join(f"{row * 9 + column}.5" for column in range(9)) for row in range(3)]
+    return "\n".join([*head, *rows, ""]).encode()
+
+
 def image(kind: str, mode: str = "RGB", **how: Any) -> bytes:
     picture = Image.fromarray(RANDOM.integers(0, 256, (20, 24, 3), np.uint8)).convert(mode)
     return saved(lambda stream: picture.save(stream, kind, **how))

@@ -37,7 +37,7 @@ from framework.sweeps import jobs
 from framework.testing import sample_files
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import read_run_info
-from plugins.data.bodies import body_files
+from plugins.data.bodies import body_files, motion, scan_layout
 from plugins.data.coil20.views import read_views
 from plugins.data.head_pose import caviar_labels, idiap_labels, towncentre_labels
 from plugins.data.images_with_angles.table import read_table
@@ -86,6 +86,7 @@ def readers() -> Iterator[Reader]:
     """In the order of the report."""
     yield from clouds()
     yield from subjects()
+    yield from people()
     yield from tables_and_images()
     yield from labels()
     yield from models()
@@ -136,6 +137,46 @@ def subjects() -> Iterator[Reader]:
         [*crafted.images()],
     )
     yield Reader("JSON, cameras", "camera.json", [camera], turntable.read_camera)
+
+
+def people() -> Iterator[Reader]:
+    """Motions, and the layout of photographed people."""
+    colors = np.arange(3 * len(VERTICES), dtype=np.uint8).reshape(-1, 3)
+    parts = (torch.from_numpy(part) for part in (VERTICES.astype(np.float32), colors, FACES.astype(np.int64)))
+    mesh = written(
+        "a.ply", lambda file: scan_layout.write_registration(file, scan_layout.Registration(*parts))
+    )
+    places = [
+        npz(
+            packed=packed, faces=FACES, uv=np.random.default_rng(0).random((len(VERTICES), 2)), uv_faces=FACES
+        )
+        for packed in (False, True)
+    ]
+    camera = b'"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "R": [[1,0,0], [0,1,0], [0,0,1]], "t": [0,0,2]'
+    cameras = b'{"views": [{"name": "view_00", "height": 9, "width": 9, %s}]}' % camera
+    yield Reader(
+        "BVH", "walk.bvh", [whole.bvh()], motion.read, crafted=[*crafted.TEXTS, *crafted.motions(whole.bvh())]
+    )
+    yield Reader("PLY, registrations", "registration_7k.ply", [mesh], scan_layout.read_registration)
+    yield Reader(
+        "NPZ, places in textures",
+        "topology_7k.npz",
+        places,
+        lambda file: scan_layout.read_places(file.parent, "7k"),
+        [in_zip],
+        [*crafted.npz("uv")],
+    )
+    yield Reader(
+        "JSON, cameras of people", "cameras.json", [cameras], scan_layout.read_cameras, crafted=crafted.JSONS
+    )
+    yield Reader("text, lists of people", "train.txt", [b"test_0001\ntest_0002\n"], lists)
+
+
+def lists(file: Path) -> object:
+    """Splits, one of whose lists is damaged."""
+    for number, split in enumerate(("validation", "test")):
+        file.with_name(f"{split}.txt").write_text(f"other_{number}\n")
+    return scan_layout.read_splits(file.parent)
 
 
 def materials(file: Path) -> object:

@@ -31,6 +31,7 @@ BONES = {
 in one file the first."""
 ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
 """Where bones end whose direction is taken; the others turn as they do in the file."""
+CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 LONGEST = 1_000_000
 """Frames of a file, at most."""
 SLOWEST = 1_000
@@ -98,6 +99,8 @@ def _hierarchy(
     above, place = [-1], 0
     while place < len(words):
         word = words[place]
+        if word in ("OFFSET", "CHANNELS", "}", "End") and len(above) == 1:
+            raise ValueError(f"{word} stands outside of any joint")
         if word in ("ROOT", "JOINT"):
             if (word == "ROOT") != (len(above) == 1) or (word == "ROOT" and names):
                 raise ValueError(
@@ -113,10 +116,18 @@ def _hierarchy(
             place = words.index("}", place) + 1
         elif word == "OFFSET":
             offsets[above[-1]] = [float(number) for number in words[place + 1 : place + 4]]
+            if len(offsets[above[-1]]) != 3 or not np.isfinite(offsets[above[-1]]).all():
+                raise ValueError(f"the OFFSET of {shown(names[above[-1]])} is not three finite numbers")
             place += 4
         elif word == "CHANNELS":
             count = int(words[place + 1])
-            channels[above[-1]] = words[place + 2 : place + 2 + count]
+            kinds = words[place + 2 : place + 2 + max(0, count)]
+            if len(kinds) != count or not set(kinds) <= CHANNELS or len(set(kinds)) < count:
+                raise ValueError(
+                    f"CHANNELS of {shown(names[above[-1]])}: wanted a number, and so many of "
+                    f"{', '.join(sorted(CHANNELS))}"
+                )
+            channels[above[-1]] = kinds
             place += 2 + count
         elif word == "}":
             above.pop()
