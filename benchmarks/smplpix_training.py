@@ -37,11 +37,13 @@ TIMED = (20, 80)
 class Method:
     """
     Attributes:
+        folder: what the folders of its runs begin with.
         words: arguments of its runs.
         epochs: of trainings, each with its own schedule; none: nothing is trained.
         seeds: of the training of `epochs[-1]`; the shorter ones have the first.
     """
 
+    folder: str
     words: tuple[str, ...]
     epochs: tuple[int, ...] = ()
     seeds: tuple[int, ...] = (0,)
@@ -60,14 +62,16 @@ def over(experiment: str, *more: str) -> tuple[str, ...]:
 
 SEEDS = (0, 1, 2)
 METHODS = {
-    "mesh, 7k": Method(over("rasterised")),
-    "mesh, 7k, one sample a pixel": Method(over("rasterised", "encoder.rasterised.renderer.supersampling=1")),
-    "mesh, 27k": Method(over("rasterised", "data.topology=27k")),
-    "points alone, 7k": Method(over("quick"), (2, 6, 20), SEEDS),
-    "points alone, 27k": Method(over("quick", "data.topology=27k"), (20,)),
-    "points alone, 7k, unet": Method(over("quick", "encoder=[projection,unet]"), (1,)),
-    "over the mesh, 7k": Method(over("hybrid"), (2, 6, 20), SEEDS),
-    "over the mesh, 27k": Method(over("hybrid", "data.topology=27k"), (20,)),
+    "mesh, 7k": Method("rasterised_7k", over("rasterised")),
+    "mesh, 7k, one sample a pixel": Method(
+        "rasterised_7k_plain", over("rasterised", "encoder.rasterised.renderer.supersampling=1")
+    ),
+    "mesh, 27k": Method("rasterised_27k", over("rasterised", "data.topology=27k")),
+    "points alone, 7k": Method("quick_7k", over("quick"), (2, 6, 20), SEEDS),
+    "points alone, 27k": Method("quick_27k", over("quick", "data.topology=27k"), (20,)),
+    "points alone, 7k, unet": Method("unet_7k", over("quick", "encoder=[projection,unet]"), (1,)),
+    "over the mesh, 7k": Method("hybrid_7k", over("hybrid"), (2, 6, 20), SEEDS),
+    "over the mesh, 27k": Method("hybrid_27k", over("hybrid", "data.topology=27k"), (20,)),
 }
 DRAWN = {"points alone, 7k": RED, "over the mesh, 7k": GREEN}
 LINES = {"mesh, 7k": "-", "mesh, 27k": "--"}
@@ -81,15 +85,15 @@ COLUMNS = {
 }
 
 
-def folder(name: str, epochs: int, seed: int) -> Path:
-    return FOLDER / "_".join([name.replace(",", "").replace(" ", "_"), str(epochs), str(seed)])
+def folder(method: Method, epochs: int, seed: int) -> Path:
+    return FOLDER / (f"{method.folder}_{epochs}_{seed}" if method.epochs else method.folder)
 
 
-def completed(name: str, method: Method) -> dict[tuple[int, int], dict[str, float]]:
+def completed(method: Method) -> dict[tuple[int, int], dict[str, float]]:
     """Results of its runs, those that are missing run first."""
     found = {}
     for epochs, seed in method.runs():
-        place = folder(name, epochs, seed) / "results.json"
+        place = folder(method, epochs, seed) / "results.json"
         if not place.is_file():
             words = [*method.words, f"seed={seed}", "logger=none", f"hydra.run.dir={place.parent}"]
             words += [f"trainer.max_epochs={epochs}"] if epochs else []
@@ -136,10 +140,10 @@ def main() -> None:
     if given.skins:
         worn = f"data.skins={given.skins}"
         methods |= {
-            f"skins, {RIVAL}": Method(over("rasterised", worn)),
-            "skins, over the mesh, 7k": Method(over("hybrid", worn), (20,)),
+            f"skins, {RIVAL}": Method("skins_rasterised_7k", over("rasterised", worn)),
+            "skins, over the mesh, 7k": Method("skins_hybrid_7k", over("hybrid", worn), (20,)),
         }
-    results = {name: completed(name, method) for name, method in methods.items()}
+    results = {name: completed(method) for name, method in methods.items()}
     times = FOLDER / "steps.json"
     if given.steps:
         seconds = json.loads(given.steps.read_text())
@@ -250,8 +254,8 @@ def draw(
 @torch.inference_mode()
 def sheet(place: Path, chosen: Sequence[int] = (0, 20, 44, 75)) -> None:
     """Photographs of unseen people, their pictures, and where these are off."""
-    names = (RIVAL, "points alone, 7k", "over the mesh, 7k")
-    runs = [folder(name, METHODS[name].epochs[-1] if METHODS[name].epochs else 0, 0) for name in names]
+    methods = [METHODS[name] for name in (RIVAL, "points alone, 7k", "over the mesh, 7k")]
+    runs = [folder(method, *method.runs()[-len(method.seeds)]) for method in methods]
     _, description = load_with_description(runs[0])
     data = reader(description)
     data.prepare()
