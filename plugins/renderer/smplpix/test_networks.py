@@ -169,6 +169,18 @@ def test_gradients_of_a_layer_in_training(normalisation):
     assert torch.autograd.gradcheck(answer, parts)
 
 
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("middle", [0.0, 1e4])
+def test_moments_keep_their_digits_wherever_channels_lie(middle, layout):
+    torch.manual_seed(0)
+    layer = Layer(4, 4, 3, "batch")
+    maps = (torch.randn(4, 4, 64, 48) + middle).contiguous(memory_format=layout)
+    layer._normalised(maps)
+    wanted = maps.double().var((0, 2, 3), correction=0)
+    torch.testing.assert_close(layer.variance.double(), wanted, rtol=1e-5, atol=0)
+    torch.testing.assert_close(layer.mean.double(), maps.double().mean((0, 2, 3)), rtol=1e-6, atol=1e-6)
+
+
 def test_group_norm_is_torchs():
     torch.manual_seed(0)
     made = build(
