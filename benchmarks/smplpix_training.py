@@ -68,8 +68,11 @@ METHODS = {
     ),
     "mesh, 27k": Method("rasterised_27k", over("rasterised", "data.topology=27k")),
     "points alone, 7k": Method("quick_7k", over("quick"), (2, 6, 20), SEEDS),
+    "points alone, 7k, no splats": Method(
+        "bare_7k", over("quick", "encoder.projection.splat=0", "encoder.slim.residual=false"), (20,)
+    ),
     "points alone, 27k": Method("quick_27k", over("quick", "data.topology=27k"), (20,)),
-    "points alone, 7k, unet": Method("unet_7k", over("quick", "encoder=[projection,unet]"), (1,)),
+    "points alone, 7k, unet": Method("unet_7k", over("unet"), (1,)),
     "over the mesh, 7k": Method("hybrid_7k", over("hybrid"), (2, 6, 20), SEEDS),
     "over the mesh, 27k": Method("hybrid_27k", over("hybrid", "data.topology=27k"), (20,)),
 }

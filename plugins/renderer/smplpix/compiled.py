@@ -91,3 +91,68 @@ def paint(cloud, index, level, nearest, farthest, picture):
                 for channel in range(3):
                     picture[channel, row, column] = cloud[point, 3 + channel]
                 picture[3, row, column] = (np.float64(cloud[point, 2]) - nearest) / span
+
+
+@compiled
+@no_type_check
+def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
+    """Fill the five channels of `filled` from the four of `picture`, as `splats.splatted` says.
+
+    Args:
+        nearest, span: metres, of the fourth channel.
+        focal, thick: pixels.
+        around, close: (places, 2) rows and columns of discs, row by row; of splats, and of holes that are closed.
+        weights: by the squared distances of a point, and of the nearest one.
+    """
+    height, width = picture.shape[1:]
+    first = np.full((height, width), np.inf)
+    square = np.full((height, width), len(weights), np.int64)
+    total = np.zeros((4, height, width))
+    mass = np.zeros((height, width))
+    near = np.zeros((height, width), np.bool_)
+    for row in range(height):
+        for column in range(width):
+            if not picture[3, row, column] < 1:
+                continue
+            depth = nearest + span * np.float64(picture[3, row, column])
+            for place in range(len(around)):
+                down, across = row - around[place, 0], column - around[place, 1]
+                if 0 <= down < height and 0 <= across < width:
+                    away = around[place, 0] ** 2 + around[place, 1] ** 2
+                    cone = depth * (1 + away**0.5 / focal)
+                    there = first[down, across]
+                    if cone < there or (cone == there and away < square[down, across]):
+                        first[down, across], square[down, across] = cone, away
+    for row in range(height):
+        for column in range(width):
+            if not picture[3, row, column] < 1:
+                continue
+            depth = nearest + span * np.float64(picture[3, row, column])
+            for place in range(len(around)):
+                down, across = row - around[place, 0], column - around[place, 1]
+                if not (0 <= down < height and 0 <= across < width):
+                    continue
+                if depth < first[down, across] * (1 + thick / focal):
+                    away = around[place, 0] ** 2 + around[place, 1] ** 2
+                    one = weights[away, square[down, across]]
+                    mass[down, across] += one
+                    for channel in range(4):
+                        total[channel, down, across] += one * picture[channel, row, column]
+            for place in range(len(close)):
+                down, across = row - close[place, 0], column - close[place, 1]
+                if 0 <= down < height and 0 <= across < width:
+                    near[down, across] = True
+    filled[:] = 1.0
+    reach = around[-1, 0] + 1
+    for row in range(height):
+        for column in range(width):
+            if square[row, column] < len(weights):
+                filled[4, row, column] = square[row, column] ** 0.5 / reach
+            inside = near[row, column]
+            for place in range(len(close)):
+                down, across = row + close[place, 0], column + close[place, 1]
+                if inside and 0 <= down < height and 0 <= across < width:
+                    inside = near[down, across]
+            if inside:
+                for channel in range(4):
+                    filled[channel, row, column] = total[channel, row, column] / mass[row, column]

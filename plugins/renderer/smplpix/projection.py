@@ -15,7 +15,7 @@ from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
 from framework.geometry.clouds import sizes
 from framework.storage.threads import POOL
-from plugins.renderer.smplpix import compiled
+from plugins.renderer.smplpix import compiled, splats
 
 COLUMNS = ("x", "y", "z", "red", "green", "blue")
 CHANNELS = 4
@@ -191,8 +191,10 @@ class Projection(Encoder):
             where people stand further off.
         levels: how many images, each of half the size of the one before and enlarged again by repetition: a pixel
             between sparse points still shows one at some level. Four channels each.
+        splat: radius, pixels, of splats that fill the surface between points: five channels before the others, red,
+            green, blue and depth of the surface and the distance to the nearest point; 0: none. See `splats.splatted`.
 
-    Features are (4 · levels, height, width), of the clouds' dtype; see `project`.
+    Features are (4 · levels, height, width), five channels more with `splat`, of the clouds' dtype; see `project`.
 
     Raises:
         ConfigError: an input that is no cloud of coloured points, or a range of depths without any.
@@ -217,6 +219,7 @@ class Projection(Encoder):
         nearest: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
         farthest: Annotated[float, Field(gt=0, le=1e6)] = 5.0,
         levels: Annotated[int, Field(ge=1, le=8)] = 1,
+        splat: Annotated[int, Field(ge=0, le=16)] = 0,
     ) -> None:
         super().__init__()
         named = not input_columns or input_columns[: len(COLUMNS)] == COLUMNS
@@ -232,8 +235,13 @@ class Projection(Encoder):
                 "metres from the camera. Set both around the subject."
             )
         self.view = View(height, width, (nearest, farthest), levels)
-        self.output_shape = (CHANNELS * levels, height, width)
+        self.splat = splat
+        self.output_shape = (CHANNELS * levels + (splats.CHANNELS if splat else 0), height, width)
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         sizes(inputs)  # refuses what is no cloud
-        return project(inputs, self.view)
+        points = project(inputs, self.view)
+        if not self.splat:
+            return points
+        surface = splats.splatted(points[:, :CHANNELS], self.view.limits, self.view.lens[0], self.splat)
+        return torch.cat([surface, points], 1)
