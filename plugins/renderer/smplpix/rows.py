@@ -65,20 +65,23 @@ POINTS_ARE_DRAWN = {
     "bad triangles are left out": "it draws vertices: those of a triangle without area too",
 }
 WHITE = {"nothing seen is background": 0.05}  # the drawn weights' answer to an empty picture
-SLIM_RUN, UNET_RUN = (
+UNBOUNDED_WHITE = {"nothing seen is background": 0.2}  # and where no sigmoid keeps it near 1
+SLIM_RUN, SURFACE_RUN, UNET_RUN = (
     checkpoint(
-        Path(FOLDER.name) / f"{network['name']}.ckpt",
-        [seeing(size, levels=levels, **NEAR), network],
+        Path(FOLDER.name) / f"{network['name']}_{size[0]}.ckpt",
+        [seeing(size, **of_points, **NEAR), network],
         size,
     )
-    for network, size, levels in (
-        ({"name": "slim", **SLIM}, (48, 64), 1),
-        ({"name": "unet", **UNET}, (24, 20), 2),
+    for network, size, of_points in (
+        ({"name": "slim", **SLIM}, (48, 64), {}),
+        ({"name": "slim", **SLIM, "residual": True}, (32, 32), {"splat": 3}),
+        ({"name": "unet", **UNET}, (24, 20), {"levels": 2}),
     )
 )
 ROWS = {
     "smplpix": (
         RendererRow("slim", {"checkpoint": SLIM_RUN}, WHITE, POINTS_ARE_DRAWN),
+        RendererRow("over splats", {"checkpoint": SURFACE_RUN}, UNBOUNDED_WHITE, POINTS_ARE_DRAWN),
         RendererRow(
             "unet of another size, bfloat16, whole frame",
             {"checkpoint": UNET_RUN, "precision": "bfloat16", "crop": "whole"},
@@ -96,6 +99,9 @@ ROWS = {
             config={**NEAR, "height": 1, "width": 1, "levels": 2},
         ),
         CloudRow("one point", (1, 6), config={**NEAR, "height": 12, "width": 9}),
+        CloudRow(
+            "splats, two levels", (40, 6), config={**NEAR, "height": 21, "width": 16, "levels": 2, "splat": 4}
+        ),
     ),
     "unet": (
         EncoderRow("odd size", (4, 13, 10), UNET),
