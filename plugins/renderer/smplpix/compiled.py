@@ -105,54 +105,69 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
         weights: by the squared distances of a point, and of the nearest one.
     """
     height, width = picture.shape[1:]
-    first = np.full((height, width), np.inf)
-    square = np.full((height, width), len(weights), np.int64)
-    total = np.zeros((4, height, width))
-    mass = np.zeros((height, width))
-    near = np.zeros((height, width), np.bool_)
+    longest = len(weights)
+    radius = around[-1, 0]
+    away = np.empty(len(around), np.int64)
+    factor = np.empty(len(around))
+    for place in range(len(around)):
+        away[place] = around[place, 0] ** 2 + around[place, 1] ** 2
+        factor[place] = 1 + away[place] ** 0.5 / focal
+    # of the image and a border of `radius` pixels, so that no place about a pixel is beyond
+    first = np.full((height + 2 * radius, width + 2 * radius), np.inf)
+    square = np.full(first.shape, longest, np.int64)
+    behind = np.empty(first.shape)
+    total = np.zeros((*first.shape, 5))
+    near = np.zeros(first.shape, np.bool_)
+    seen = np.empty((height * width, 2), np.int64)
+    count = 0
     for row in range(height):
         for column in range(width):
-            if not picture[3, row, column] < 1:
-                continue
-            depth = nearest + span * np.float64(picture[3, row, column])
-            for place in range(len(around)):
-                down, across = row - around[place, 0], column - around[place, 1]
-                if 0 <= down < height and 0 <= across < width:
-                    away = around[place, 0] ** 2 + around[place, 1] ** 2
-                    cone = depth * (1 + away**0.5 / focal)
-                    there = first[down, across]
-                    if cone < there or (cone == there and away < square[down, across]):
-                        first[down, across], square[down, across] = cone, away
-    for row in range(height):
-        for column in range(width):
-            if not picture[3, row, column] < 1:
-                continue
-            depth = nearest + span * np.float64(picture[3, row, column])
-            for place in range(len(around)):
-                down, across = row - around[place, 0], column - around[place, 1]
-                if not (0 <= down < height and 0 <= across < width):
-                    continue
-                if depth < first[down, across] * (1 + thick / focal):
-                    away = around[place, 0] ** 2 + around[place, 1] ** 2
-                    one = weights[away, square[down, across]]
-                    mass[down, across] += one
-                    for channel in range(4):
-                        total[channel, down, across] += one * picture[channel, row, column]
-            for place in range(len(close)):
-                down, across = row - close[place, 0], column - close[place, 1]
-                if 0 <= down < height and 0 <= across < width:
-                    near[down, across] = True
+            if picture[3, row, column] < 1:
+                seen[count, 0], seen[count, 1] = row, column
+                count += 1
+    for point in range(count):
+        row, column = seen[point]
+        depth = nearest + span * np.float64(picture[3, row, column])
+        for place in range(len(around)):
+            down, across = row + radius - around[place, 0], column + radius - around[place, 1]
+            cone = depth * factor[place]
+            there = first[down, across]
+            if cone <= there and (cone < there or away[place] < square[down, across]):
+                first[down, across] = cone
+                square[down, across] = away[place]
+        for place in range(len(close)):
+            near[row + radius - close[place, 0], column + radius - close[place, 1]] = True
+    for row in range(first.shape[0]):
+        for column in range(first.shape[1]):
+            behind[row, column] = first[row, column] * (1 + thick / focal)
+    for point in range(count):
+        row, column = seen[point]
+        red, green = np.float64(picture[0, row, column]), np.float64(picture[1, row, column])
+        blue, far = np.float64(picture[2, row, column]), np.float64(picture[3, row, column])
+        depth = nearest + span * far
+        for place in range(len(around)):
+            down, across = row + radius - around[place, 0], column + radius - around[place, 1]
+            if depth < behind[down, across]:
+                one = weights[away[place], square[down, across]]
+                pixel = total[down, across]
+                pixel[0] += one * red
+                pixel[1] += one * green
+                pixel[2] += one * blue
+                pixel[3] += one * far
+                pixel[4] += one
     filled[:] = 1.0
-    reach = around[-1, 0] + 1
     for row in range(height):
         for column in range(width):
-            if square[row, column] < len(weights):
-                filled[4, row, column] = square[row, column] ** 0.5 / reach
-            inside = near[row, column]
-            for place in range(len(close)):
-                down, across = row + close[place, 0], column + close[place, 1]
-                if inside and 0 <= down < height and 0 <= across < width:
-                    inside = near[down, across]
+            down, across = row + radius, column + radius
+            if square[down, across] < longest:
+                filled[4, row, column] = square[down, across] ** 0.5 / (radius + 1)
+            inside = near[down, across]
+            place = 0
+            while inside and place < len(close):
+                beside, along = row + close[place, 0], column + close[place, 1]
+                if 0 <= beside < height and 0 <= along < width:
+                    inside = near[beside + radius, along + radius]
+                place += 1
             if inside:
                 for channel in range(4):
-                    filled[channel, row, column] = total[channel, row, column] / mass[row, column]
+                    filled[channel, row, column] = total[down, across, channel] / total[down, across, 4]
