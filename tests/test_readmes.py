@@ -1,7 +1,9 @@
-"""Every command of every README composes, and its plugins accept it; a user's files are not looked at."""
+"""Every command of every README and of the page of claims composes, and its plugins accept it; a user's files are not
+looked at."""
 
 import re
 import shlex
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +18,8 @@ from framework.configuration.config import Config
 from framework.modes import MODES
 
 ROOT = Path(__file__).parent.parent
-READMES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("plugins/*/*/README.md"))]
+CLAIMS = ROOT / "benchmarks" / "claims.md"
+READMES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", CLAIMS, *sorted(ROOT.glob("plugins/*/*/README.md"))]
 FOLDERS = cache(composition.config_folders)
 """Found once for all commands."""
 NOT_OURS = ("=mine", "=theirs", "X=", "resume=", "--")
@@ -27,7 +30,7 @@ def commands(readme: Path) -> list[str]:
     """What follows `python -m framework`, in code blocks and between backticks, lines that go on joined."""
     text = re.sub("<[^>\n]*>", "X", readme.read_text(encoding="utf-8").replace("\\\n", " "))
     found = re.findall(r"python -m framework((?: [^`\n]*)?)", text)
-    return [line.partition("   #")[0].partition(" # ")[0].strip() for line in found]
+    return list(dict.fromkeys(line.partition("   #")[0].partition(" # ")[0].strip() for line in found))
 
 
 ALL = [
@@ -76,3 +79,36 @@ def test_the_readme_leads_to_every_plugin_and_every_benchmark() -> None:
     assert not [str(page) for page in wanted if f"({page.relative_to(ROOT)})" not in text]
     linked = re.findall(r"\]\(((?!https)[^)]*)\)", text)
     assert not [path for path in linked if not (ROOT / path).exists()]
+
+
+def test_every_claim_has_evidence_a_verdict_and_a_command() -> None:
+    text = CLAIMS.read_text(encoding="utf-8")
+    rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in text.splitlines() if re.match(r"\| \d-\d", line)]
+    verdicts: dict[str, Counter[str]] = {}
+    for number, *filled, data, verdict, command in (map(str.strip, row) for row in rows):
+        assert len(filled) == 3 and all(filled), number
+        assert data in ("synthetic", "real", "none"), number
+        said = re.fullmatch(r"holds|contradicted: .*\d SE.*|contradicted: a count|open(: .+)?", verdict)
+        assert said, number
+        verdicts.setdefault(number[0], Counter())[verdict.partition(":")[0]] += 1
+        words = shlex.split(command.strip("`"))
+        assert command == f"`{command.strip('`')}`" and words[0] in ("python", "pytest"), number
+        files = [ROOT / word for word in words if word.startswith(("benchmarks/", "plugins/", "tests/"))]
+        assert all(file.exists() for file in files), number
+        if "-k" in words:  # a test of that name is there
+            sources = [one for file in files for one in (file, *file.glob("test_*.py")) if one.is_file()]
+            name = re.compile(rf"def test_\w*{words[-1]}")
+            assert any(name.search(one.read_text(encoding="utf-8")) for one in sources), number
+        named = re.findall(r"(?<=[=,])\w+/\w+(?=[,\s]|$)", command.strip("`"))
+        assert all((ROOT / "conf/experiment" / f"{name}.yaml").exists() for name in named), number
+    assert [row[0].strip() for row in rows] == [
+        f"{chapter}-{index}" for chapter, found in verdicts.items() for index in range(1, found.total() + 1)
+    ]
+    kinds = ("holds", "contradicted", "open")
+    total = [sum(found[kind] for found in verdicts.values()) for kind in kinds]
+    apart = "; ".join(
+        f"Chapter {key}: {', '.join(str(found[kind]) for kind in kinds)}" for key, found in verdicts.items()
+    )
+    assert f"{len(rows)} claims: {total[0]} hold, {total[1]} contradicted, {total[2]} open ({apart})." in text
+    linked = re.findall(r"\]\(([^)]*)\)", text)
+    assert linked and not [path for path in linked if not (CLAIMS.parent / path).exists()]
