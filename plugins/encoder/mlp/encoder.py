@@ -1,7 +1,7 @@
 """Fully connected layers, for features, point clouds and images small enough to flatten."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
@@ -12,21 +12,24 @@ from framework.encoder import Encoder
 from framework.errors import ConfigError
 
 Width = Annotated[int, Field(gt=0)]
+Probability = Annotated[float, Field(ge=0, lt=1)]
 
 
 class MLP(Encoder):
     """Fully connected layers with ReLU; flattens whatever comes in.
 
-    Each layer is linear, batch norm where asked for, ReLU, dropout.
+    Each layer is linear, batch norm where asked for, ReLU, dropout; with `batch_norm="after_relu"` linear, ReLU, batch
+    norm, dropout, the blocks of thesis §6.5.1.
 
     Args:
         input_shape: any; a sample is flattened.
         widths: output length of each layer; with an empty list the features are the flattened input.
-        dropout: probability of dropping an output of a layer.
-        batch_norm: whether to normalise over the batch; training then needs batches of at least two.
+        dropout: probability of dropping an output of a layer; one for all layers, or one for each.
+        batch_norm: whether to normalise over the batch, before ReLU or after it; training then needs batches of at
+            least two.
 
     Raises:
-        ConfigError: a sample holds no numbers.
+        ConfigError: a sample holds no numbers, or there are more or fewer probabilities than layers.
     """
 
     bibtex = """@article{rumelhart1986learning,
@@ -43,8 +46,8 @@ class MLP(Encoder):
         input_shape: tuple[int, ...],
         *,
         widths: list[Width] = [512, 512],  # noqa: B006 - never written
-        dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0,
-        batch_norm: bool = False,
+        dropout: Probability | list[Probability] = 0.0,
+        batch_norm: bool | Literal["after_relu"] = False,
     ) -> None:
         super().__init__()
         length = math.prod(input_shape)
@@ -53,12 +56,22 @@ class MLP(Encoder):
                 f"mlp got samples of shape {input_shape}, which hold no numbers; wanted at least one. "
                 "Check what `data` yields, or the encoder before it."
             )
+        drops = dropout if isinstance(dropout, list) else [dropout] * len(widths)
+        if len(drops) != len(widths):
+            raise ConfigError(
+                f"encoder.mlp.dropout has {len(drops)} probabilities for {len(widths)} layers; give as many, or one "
+                "number for all."
+            )
         layers: list[nn.Module] = []
-        for width in widths:
-            layers.append(nn.Linear(length, width, bias=not batch_norm))  # batch norm has its own
+        for width, drop in zip(widths, drops, strict=True):
+            after = batch_norm == "after_relu"
+            layers.append(
+                nn.Linear(length, width, bias=after or not batch_norm)
+            )  # before ReLU it has its own
+            parts: list[nn.Module] = [nn.ReLU(inplace=True)]
             if batch_norm:
-                layers.append(nn.BatchNorm1d(width))
-            layers += [nn.ReLU(inplace=True), nn.Dropout(dropout)]
+                parts.insert(1 if after else 0, nn.BatchNorm1d(width))
+            layers += [*parts, nn.Dropout(drop)]
             length = width
         self.layers = nn.Sequential(*layers)
         self.vectorises = not batch_norm  # whose running moments are buffers

@@ -7,5 +7,10 @@ ROWS = {
         EncoderRow("defaults", (7,)),
         EncoderRow("images", (3, 4, 5), {"widths": [16, 8], "dropout": 0.2}),
         EncoderRow("batch norm", (6, 4), {"widths": [12, 8], "batch_norm": True}),
+        EncoderRow(
+            "the thesis's blocks",
+            (24,),
+            {"widths": [12, 8], "batch_norm": "after_relu", "dropout": [0.8, 0.4]},
+        ),
     )
 }

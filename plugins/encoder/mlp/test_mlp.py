@@ -23,12 +23,17 @@ def by_hand(encoder, inputs):
     return numbers
 
 
-@pytest.mark.parametrize("batch_norm", [False, True])
+@pytest.mark.parametrize("batch_norm", [False, True, "after_relu"])
 @pytest.mark.parametrize("shape, widths", [((7,), [5]), ((3, 4, 2), [16, 8, 4]), ((1,), [1]), ((2, 3), [])])
 def test_agrees_with_numpy(shape, widths, batch_norm):
     torch.manual_seed(0)
     config = resolve("encoder", {"name": "mlp", "widths": widths, "batch_norm": batch_norm, "dropout": 0.3})
     encoder = build("encoder", config, input_shape=shape)
+    kinds = [type(layer).__name__ for layer in encoder.layers]
+    order = {False: ["ReLU"], True: ["BatchNorm1d", "ReLU"], "after_relu": ["ReLU", "BatchNorm1d"]}[
+        batch_norm
+    ]
+    assert kinds == ["Linear", *order, "Dropout"] * len(widths)
     encoder(torch.randn(50, *shape) * 3 + 1)  # gives the running moments something to hold
     inputs = torch.randn(6, *shape)
     found = encoder.eval()(inputs)
@@ -37,15 +42,16 @@ def test_agrees_with_numpy(shape, widths, batch_norm):
     np.testing.assert_allclose(found.detach().numpy(), by_hand(encoder, inputs.numpy()), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("batch_norm", [False, True])
+@pytest.mark.parametrize("batch_norm", [False, True, "after_relu"])
 def test_an_empty_batch_in_training_gives_no_features(batch_norm):
     encoder = MLP((4,), widths=[3, 2], batch_norm=batch_norm).train()
     assert encoder(torch.randn(0, 4)).shape == (0, 2)
 
 
-def test_dropout_acts_in_training_alone():
+@pytest.mark.parametrize("dropout", [0.25, [0.25]])
+def test_dropout_acts_in_training_alone(dropout):
     torch.manual_seed(0)
-    encoder = MLP((4,), widths=[1000], dropout=0.25)
+    encoder = MLP((4,), widths=[1000], dropout=dropout)
     inputs = torch.ones(1, 4)
     kept = encoder.eval()(inputs)
     dropped = encoder.train()(inputs)
@@ -56,13 +62,29 @@ def test_dropout_acts_in_training_alone():
     torch.testing.assert_close(dropped[still], kept[still] / 0.75)
 
 
+def test_each_layer_has_its_dropout():
+    """Thesis §6.5.3: 0.8 and 0.4."""
+    encoder = MLP((4,), widths=[3, 2], dropout=[0.8, 0.4])
+    assert [layer.p for layer in encoder.layers if isinstance(layer, torch.nn.Dropout)] == [0.8, 0.4]
+    with pytest.raises(ConfigError, match="3 probabilities for 2 layers"):
+        MLP((4,), widths=[3, 2], dropout=[0.1, 0.2, 0.3])
+
+
 def test_refuses_samples_without_numbers():
     with pytest.raises(ConfigError, match="hold no numbers"):
         MLP((3, 0, 4))
 
 
 @pytest.mark.parametrize(
-    "config", [{"widths": [0]}, {"dropout": 1.0}, {"dropout": float("nan")}, {"width": [3]}]
+    "config",
+    [
+        {"widths": [0]},
+        {"dropout": 1.0},
+        {"dropout": float("nan")},
+        {"dropout": [0.5, 1.0]},
+        {"batch_norm": "after"},
+        {"width": [3]},
+    ],
 )
 def test_refuses_a_config_out_of_range(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
