@@ -44,12 +44,16 @@ class Done:
 
     def losses(self) -> dict[int, float]:
         """Training loss by step, to the last bit, from the journal."""
+        return self.values("train/loss")
+
+    def values(self, name: str) -> dict[int, float]:
+        """Of one metric by step."""
         found: dict[int, float] = {}
         for line in (self.folder / "journal.jsonl").read_text(encoding="utf-8").splitlines():
             record: Mapping[str, Any] = json.loads(line)
-            if "train/loss" in record.get("values", {}):
+            if name in record.get("values", {}):
                 assert record["step"] not in found, f"step {record['step']} stands twice in the journal"
-                found[record["step"]] = record["values"]["train/loss"]
+                found[record["step"]] = record["values"][name]
         return found
 
 

@@ -20,6 +20,7 @@ from framework.objective import Objective, Rival
 from framework.target import Target
 from framework.testing.wrappers import LENGTH, Plain
 from framework.training.module import Training
+from framework.training.schedules import schedule, see
 
 
 @pytest.mark.parametrize("momentum", [None, 0.0, 0.9])
@@ -34,7 +35,7 @@ def test_settings_reach_the_optimiser(
     settings = OptimizerSettings(name=name, learning_rate=0.25, weight_decay=0.5, momentum=momentum)
     data = build("data", resolve("data", {"name": "moons"}))
     training = Training(Plain(Target("real", ("x",))), [], data, settings, 0, {})
-    monkeypatch.setattr(training, "_planned_steps", lambda: 10)
+    monkeypatch.setattr(training, "_planned_steps", lambda: (10, 5))
     made = training.configure_optimizers()["optimizer"]
     (group,) = made.param_groups
     assert type(made).__name__.lower() == name
@@ -42,6 +43,43 @@ def test_settings_reach_the_optimiser(
     assert group["params"] == list(training.parameters())
     if name == "sgd":
         assert group["momentum"] == (momentum or 0.0)
+
+
+@pytest.mark.parametrize("patience", [1, 2, 5])
+def test_plateau_reduces_when_torchs_does(patience: int) -> None:
+    """Whose patience is one less: it reduces at the first epoch beyond it."""
+    settings = OptimizerSettings(schedule="plateau", factor=0.5, patience=patience, learning_rate=0.25)
+    ours, theirs = (torch.optim.SGD([nn.Parameter(torch.zeros(2))], lr=0.25) for _ in range(2))
+    rates = torch.optim.lr_scheduler.LambdaLR(ours, [schedule(settings, 100, 4)])
+    reference = torch.optim.lr_scheduler.ReduceLROnPlateau(
+        theirs, factor=0.5, patience=patience - 1, threshold=0, eps=0
+    )
+    losses = torch.randint(20, (40,), generator=torch.Generator().manual_seed(patience)).double().tolist()
+    for epoch, loss in enumerate(losses):
+        for _ in range(4):
+            ours.step()
+            rates.step()
+        see(rates, loss, epoch + 1)
+        reference.step(loss)
+        assert ours.param_groups[0]["lr"] == theirs.param_groups[0]["lr"]
+    assert 0 < ours.param_groups[0]["lr"] < 0.25
+
+
+def test_step_reduces_after_the_epochs_that_it_names() -> None:
+    """As torch's MultiStepLR by epochs."""
+    settings = OptimizerSettings(schedule="step", factor=0.1, milestones=[2, 3], learning_rate=0.25)
+    ours, theirs = (torch.optim.SGD([nn.Parameter(torch.zeros(2))], lr=0.25) for _ in range(2))
+    rates = torch.optim.lr_scheduler.LambdaLR(ours, [schedule(settings, 20, 5)])
+    reference = torch.optim.lr_scheduler.MultiStepLR(theirs, [2, 3], gamma=0.1)
+    for step in range(20):
+        assert ours.param_groups[0]["lr"] == pytest.approx(theirs.param_groups[0]["lr"], rel=1e-12)
+        ours.step()
+        rates.step()
+        if step % 5 == 4:
+            theirs.step()
+            reference.step()
+    with pytest.raises(ValueError, match="milestones names none"):
+        OptimizerSettings(schedule="step")
 
 
 class Against(Objective):
@@ -74,7 +112,7 @@ def test_a_rival_steps_as_by_an_optimiser_of_its_own(
     twins = copy.deepcopy((predictor, objective))
     settings = OptimizerSettings(name="adamw", learning_rate=0.01, weight_decay=0.1)
     training = Training(predictor, [objective], data, settings, 0, {})
-    monkeypatch.setattr(training, "_planned_steps", lambda: 6)
+    monkeypatch.setattr(training, "_planned_steps", lambda: (6, 3))
     made = training.configure_optimizers()
     first = torch.optim.AdamW(twins[0].parameters(), lr=0.01, weight_decay=0.1, fused=True)
     second = torch.optim.AdamW(

@@ -114,6 +114,32 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     assert status(killed) == "FINISHED"
 
 
+def test_a_rate_that_waits_for_the_validation_loss_goes_on_with_the_same_bits(
+    framework: Framework, tmp_path: Path
+) -> None:
+    """Killed in the epoch after a reduction, when the last checkpoint is the one of the epoch before it."""
+    plateau = [
+        "trainer.max_epochs=6",
+        "optimizer.learning_rate=0.3",
+        "optimizer.schedule=plateau",
+        "optimizer.warmup_steps=0",
+        "optimizer.patience=1",
+        "optimizer.factor=0.5",
+    ]
+    whole = framework(*QUIET, *plateau, folder="whole")
+    assert whole.code == 0, whole.out
+    rates = whole.values("train/learning_rate")
+    first = next(step for step in rates if rates[step] < 0.3)
+    assert first % 9 == 1, "reduced between epochs, at once"
+    signalled = [f"+data.signal_at={first + 3}", f"+data.signal_marker={tmp_path / 'marker'}"]
+    killed = framework(*QUIET, *plateau, *signalled, folder="killed")
+    assert killed.code == -signal.SIGKILL
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert killed.losses() == whole.losses()
+    assert killed.values("train/learning_rate") == rates
+
+
 def test_what_a_resumed_run_computes_is_not_changed(
     framework: Framework, whole: Done, tmp_path: Path
 ) -> None:

@@ -59,21 +59,31 @@ class _Strict(BaseModel):
 
 
 class OptimizerSettings(_Strict):
-    """An optimiser of torch.optim by its lower-case name, and a schedule per step."""
+    """An optimiser of torch.optim by its lower-case name, and a schedule of its rate (framework.training.schedules)."""
 
     name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
     momentum: Annotated[float, Field(ge=0, lt=1)] | None = None
     """Of sgd alone, and 0 where nothing is said; the others have moments of their own."""
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    schedule: Literal["constant", "cosine"] = "constant"
+    schedule: Literal["constant", "cosine", "step", "plateau"] = "constant"
     warmup_steps: NotNegative = 0
+    factor: Annotated[float, Field(gt=0, lt=1)] = 0.1
+    """Of a reduction by step or plateau."""
+    milestones: list[Count] = []
+    """Epochs after which step reduces the rate."""
+    patience: Count = 5
+    """Epochs without a better validation loss after which plateau does."""
 
     @model_validator(mode="after")
-    def _momentum_is_sgds(self) -> "OptimizerSettings":
+    def _fits(self) -> "OptimizerSettings":
         if self.momentum is not None and self.name != "sgd":
             raise ValueError(
                 f"momentum is a setting of sgd, {self.name} has none. Leave it out, or choose sgd"
+            )
+        if self.schedule == "step" and not self.milestones:
+            raise ValueError(
+                "schedule=step reduces the rate after some epochs and milestones names none. Give them: [2000]"
             )
         return self
 

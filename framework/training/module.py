@@ -20,6 +20,7 @@ from framework.objective import Objective, Rival
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
 from framework.training.ranks import Share, WholeBatch, gathered, share, summed
+from framework.training.schedules import schedule, see, smooth
 
 # fused: one pass over the memory of each parameter instead of several, half the time of a small network's step
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
@@ -122,18 +123,19 @@ class Training(pl.LightningModule):
         optimizer = OPTIMIZERS[chosen.name](
             groups, lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **momentum
         )
-        total = self._planned_steps()
+        total, epoch = self._planned_steps()
+        factors = [schedule(chosen, total, epoch)]
+        factors += [
+            partial(smooth, total=total if rival.schedule == "cosine" else None)
+            for _, rival in self._rivals()
+        ]
+        rates = torch.optim.lr_scheduler.LambdaLR(optimizer, factors)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rates, "interval": "step"}}
 
-        def factor(step: int, schedule: str, warmup_steps: int = 0) -> float:
-            warm = min(1.0, (step + 1) / (warmup_steps + 1))
-            if schedule == "constant":
-                return warm
-            return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
-
-        factors = [partial(factor, schedule=chosen.schedule, warmup_steps=chosen.warmup_steps)]
-        factors += [partial(factor, schedule=rival.schedule) for _, rival in self._rivals()]
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factors)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+    def on_validation_end(self) -> None:
+        if self.trainer.state.fn == "fit" and not self.trainer.sanity_checking:
+            loss = float(self.trainer.callback_metrics["validation/loss"])
+            see(self.lr_schedulers(), loss, self.current_epoch + 1)
 
     def _rivals(self) -> list[tuple[Objective, Rival]]:
         objectives = [one for one in self.objectives if isinstance(one, Objective)]
@@ -160,8 +162,8 @@ class Training(pl.LightningModule):
             else:
                 nn.utils.clip_grad_norm_(group["params"], gradient_clip_val)
 
-    def _planned_steps(self) -> int:
-        """Optimiser steps until the end, for the schedule.
+    def _planned_steps(self) -> tuple[int, int]:
+        """Optimiser steps until the end, and of one epoch, for the schedule.
 
         Not `trainer.estimated_stepping_batches`: it starts the loader, whose workers then fetch from the first batch
         before a resumed run knows where it is.
@@ -170,8 +172,9 @@ class Training(pl.LightningModule):
         batches = len(trainer.datamodule.train_dataloader())
         limit = trainer.limit_train_batches
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
-        steps = math.ceil(batches / trainer.accumulate_grad_batches) * max(1, trainer.max_epochs or 1)
-        return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps)
+        epoch = math.ceil(batches / trainer.accumulate_grad_batches)
+        steps = epoch * max(1, trainer.max_epochs or 1)
+        return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps), epoch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["framework"] = self.description

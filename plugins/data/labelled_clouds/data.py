@@ -48,7 +48,8 @@ class ModelNet40(LabelledClouds):
         root: the unpacked ModelNet40; None: a generated set in its layout, 23 classes.
         surfaces: how meshes become points.
         classes: some of them; None: all.
-        validation_share: of the official training split, of every class alike.
+        validation_share: of the official training split, of every class alike; with 0 all of it trains, as in the
+            thesis, and what validation says is said of training clouds.
         rotations: a training cloud comes so many times, turned about the up axis in equal steps (thesis §6.5.1).
         unreadable: what becomes of files that cannot be read.
         models: what is generated.
@@ -70,7 +71,7 @@ class ModelNet40(LabelledClouds):
         root: str | None = None,
         surfaces: Surfaces,
         classes: list[str] | None = None,
-        validation_share: Share = 0.15,
+        validation_share: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15,
         rotations: Annotated[int, Field(ge=1, le=360)] = 1,
         unreadable: Unreadable = "error",
         models: Models,
@@ -110,6 +111,7 @@ class ModelNet40(LabelledClouds):
             splits=kept.splits,
             skipped=len(listed.files) - len(kept.files),
             synthetic=synthetic,
+            validated_on="validation" if self.validation_share else "train",
             rotations=self.rotations,
         )
 

@@ -85,6 +85,18 @@ def test_normals_are_those_of_the_faces(prepared, tmp_path):
     torch.testing.assert_close(found[..., 3:], outwards, atol=1e-6, rtol=0)
 
 
+def test_all_of_the_training_split_may_train(prepared, tmp_path):
+    """As the thesis has it: nothing is held back, and validation sees training clouds, unturned."""
+    config = {"root": official(tmp_path / "ModelNet40"), "points": 40}
+    whole, held = prepared(**config, validation_share=0, rotations=2), prepared(**config)
+    train, validation, test = whole.splits()
+    assert len(validation) == len(held.splits().train) + len(held.splits().validation)
+    assert len(train) == 2 * len(validation)
+    first = [split.__getitems__(range(len(validation))) for split in (train, validation)]
+    assert torch.equal(first[0]["input"], first[1]["input"])
+    assert len(test) == len(held.splits().test)
+
+
 def test_rotations_repeat_the_training_split_about_the_up_axis(prepared, tmp_path):
     config = {"root": official(tmp_path / "ModelNet40"), "points": 40, "normals": True}
     plain, turned = prepared(**config), prepared(**config, rotations=3)
