@@ -79,7 +79,8 @@ def test_every_experiment_can_be_shortened(name: str) -> None:
 
 @pytest.mark.parametrize("data", SMOKE_RUNS)
 def test_a_smoke_run_goes_through_every_stage(data: str, framework: Framework) -> None:
-    run = ("debug=fast", "logger=none", "pictures=false", "samples=50", "threads=1")
+    """As the thesis trains: what no preset says is the experiment's own."""
+    run = ("preset=thesis", "debug=fast", "logger=none", "pictures=false", "samples=50", "threads=1")
     done = framework(f"experiment={SMOKE_RUNS[data]}", *run)
     assert done.code == 0, done.out
     results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))

@@ -93,8 +93,9 @@ logger=mflow | Did you mean 'mlflow'?
 logger.url=x | Did you mean 'uri'?
 debug=fats | Did you mean 'fast'?
 debug=true | A group takes a name
-preset=thesis | +preset=thesis
-+preset=thesi | Did you mean 'thesis'?
+experiment=coil20/mixture preset=thesis | no setting for data=coil20
+experiment=pascal3d/scvae preset=thesis | wanted a file of weights trained on ImageNet
+preset=thesi | Did you mean 'thesis'?
 hydra/job_logging=x | can run code
 hydra.verbos=true | Did you mean 'verbose'?
 data=moon | Did you mean 'moons'?

@@ -175,11 +175,11 @@ def composed(*overrides: str) -> DictConfig:
             [SCVAE, {"override /density_head": "mixture"}, {"override /optimizer": "adam"}],
         ),
         (
-            ["experiment=pascal3d/mixture", "+preset=thesis", "data.image_size=64", "encoder=[mlp]"],
+            ["experiment=pascal3d/mixture", "preset=thesis/pascal3d", "data.image_size=64", "encoder=[mlp]"],
             "pascal3d/mixture_best",
             [
                 {"/experiment@_global_": "pascal3d/mixture"},
-                {"/preset": "thesis"},
+                {"override /preset": "thesis/pascal3d"},
                 {"override /encoder": ["mlp"]},
             ],
         ),

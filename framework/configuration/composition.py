@@ -1,18 +1,21 @@
 """Composes a config with Hydra, and turns what Hydra says of a mistake into one sentence."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import yaml
+from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from framework.configuration.registry import config_folders
 from framework.errors import ConfigError, did_you_mean, nearest
@@ -61,7 +64,57 @@ def command_line(arguments: list[str]) -> list[str]:
                 f"{argument}: no such flag. Settings are written without dashes: {argument.lstrip('-')}"
             )
     _refuse_logging_overrides(arguments)
-    return _swept_with_experiment(_in_resumed_folder(arguments))
+    return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(arguments)))
+
+
+def _preset_for_the_data(arguments: list[str]) -> list[str]:
+    """`preset=a` as `preset=a/<experiment>` or `preset=a/<data>` where presets by such names stand in a folder a.
+
+    Raises:
+        ConfigError: there is none of that name or for this data, or a sweep over experiments wants several.
+    """
+    arguments = [one.removeprefix("+") if one.startswith("+preset=") else one for one in arguments]
+    given = [one for one in arguments if one.startswith("preset=")]
+    name = given[-1].partition("=")[2] if given else ""
+    options = _options("preset") if name else []
+    if not any(one.startswith(f"{name}/") for one in options):
+        if name not in (*options, ""):
+            known = sorted({one.partition("/")[0] for one in options})
+            raise ConfigError(f"No configuration 'preset/{name}'.{did_you_mean(name, known)}")
+        return arguments
+    swept = [one for one in arguments if one.startswith("experiment=")]
+    chosen = {
+        _preset(name, options, [one for one in arguments if one not in (*given, *swept)], experiment)
+        for experiment in (swept[-1].partition("=")[2].split(",") if swept else [""])
+    }
+    if len(chosen) > 1:
+        raise ConfigError(
+            f"preset={name} is another for each of these experiments: {', '.join(sorted(chosen))}. Sweep over those "
+            "of one alone."
+        )
+    return [f"preset={chosen.copy().pop()}" if one in given else one for one in arguments]
+
+
+def _preset(name: str, options: list[str], arguments: list[str], experiment: str) -> str:
+    """The one for what the other arguments choose."""
+    own = [one for one in arguments if one.startswith("data=")]
+    register()
+    ready = GlobalHydra.instance().is_initialized()
+    with nullcontext() if ready else initialize_config_dir(str(folder()), version_base="1.3"):
+        composed = compose(
+            "config",
+            [f"experiment={experiment}"] * bool(experiment) + own,
+            return_hydra_config=True,
+        )
+    groups = composed.hydra.runtime.choices
+    for one in (f"{name}/{experiment}", f"{name}/{groups['data']}"):
+        if one in options:
+            return one
+    available = ", ".join(sorted({one.split("/")[1] for one in options if one.startswith(f"{name}/")}))
+    raise ConfigError(
+        f"preset={name} has no setting for data={groups['data']}; it has one for {available}. Leave it out, or choose "
+        "an experiment on one of these."
+    )
 
 
 def _in_resumed_folder(arguments: list[str]) -> list[str]:
@@ -130,17 +183,24 @@ def plain(config: DictConfig) -> dict[str, Any]:
     Raises:
         ConfigError: a value that must be given is not.
     """
-    try:
-        values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key} is missing. Give it a value: {error.full_key}=...") from error
+    values = OmegaConf.to_container(config, resolve=True)
     assert isinstance(values, dict)
     for group in PLURAL:
         chosen = values.get(group) or {}
         values[group] = {
             key: part for key, part in chosen.items() if isinstance(part, Mapping) and "name" in part
         }
+    for key, wanted in _missing(values):
+        raise ConfigError(f"{key} is missing{wanted}. Give it a value: {key}=...")
     return {str(key): value for key, value in values.items()}
+
+
+def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
+    """Keys of values that must be given and are not, dotted; a config may say what is wanted: `<a file of ...>`."""
+    for key, value in values.items() if isinstance(values, Mapping) else ():
+        if isinstance(value, str) and re.fullmatch(r"\?\?\?|<.*>", value):
+            yield f"{before}{key}", f": wanted {value[1:-1]}" if value != "???" else ""
+        yield from _missing(value, f"{before}{key}.")
 
 
 def help_text() -> str:
