@@ -52,6 +52,7 @@ COLUMNS = {
     "nll": "NLL",
     "brier": "Brier",
     "ece": "ECE",
+    "ece_positive": "ECE of p(y = 1)",
     "ood_entropy": "OOD entropy",
     "auroc": "AUROC",
     "milliseconds_per_sample": "ms / sample",
@@ -63,6 +64,7 @@ BETTER = {
     "nll": "lower",
     "brier": "lower",
     "ece": "lower",
+    "ece_positive": "lower",
     "ood_entropy": "higher",
     "auroc": "higher",
 }

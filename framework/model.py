@@ -200,3 +200,9 @@ def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]
         return values
     total = values.sum(-1)
     return total + (values.mean(-1) - total).detach()
+
+
+def of_its_own(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
+    """Penalties of samples each of which one member alone sees: their mean is that over all, and the gradient of that
+    mean is in each member the gradient of the mean over its own samples."""
+    return members * values - (members - 1) * values.detach()

@@ -1,7 +1,8 @@
 """The contract of an uncertainty wrapper: a predictor in, a better calibrated predictor out."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 from jaxtyping import Float
@@ -43,6 +44,49 @@ class Uncertainty(Predictor):
     @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate what is wrapped, then itself, on the validation set; called once after training."""
+
+
+class Several(ABC):
+    """What a wrapper derives from as well when it trains several models, each as it would train alone.
+
+    Attributes:
+        trained: how many.
+        own_batches: whether `loss` is given the batches of all of them one after the other, equally many rows each,
+            and each sees its own alone: set while training on one device, where each then has an order of its own.
+    """
+
+    trained: int
+    own_batches: bool = False
+
+    @abstractmethod
+    def clip_each(self, most: float) -> None:
+        """Shorten the gradient of each to the norm `most` where it is longer."""
+
+
+def outermost(predictor: Predictor) -> Several | None:
+    """The wrapper that trains several models, of nested ones the outer; None where there is none."""
+    found = (one for one in predictor.modules() if isinstance(one, Several) and one.trained > 1)
+    return next(found, None)
+
+
+def rows_each(predictor: Predictor, rows: int) -> int:
+    """How many rows of a batch each model sees."""
+    several = outermost(predictor)
+    return rows // several.trained if several is not None and several.own_batches else rows
+
+
+@contextmanager
+def own_batches(predictor: Predictor) -> Iterator[None]:
+    """Temporarily lets each of several models read its own part of a batch (`Several.own_batches`)."""
+    several = outermost(predictor)
+    if several is None:
+        yield
+        return
+    several.own_batches = True
+    try:
+        yield
+    finally:
+        several.own_batches = False
 
 
 class Joining(ABC):

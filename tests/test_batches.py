@@ -129,6 +129,38 @@ def test_every_epoch_is_a_permutation_shared_among_the_ranks(
     assert len(whole) == len(SeededBatches(length, batch_size, seed=seed, drop_last=drop_last, ranks=ranks))
 
 
+@settings(deadline=None, max_examples=50)
+@given(sizes, st.integers(0, 2**31 - 1), st.integers(0, 100), st.integers(0, 3))
+def test_models_that_train_together_each_have_an_order(
+    size: tuple[int, int, int], seed: int, epoch: int, first: int
+) -> None:
+    """The first that of one that trains alone; also from the middle of an epoch on."""
+    length, batch_size, orders = size
+
+    def batches(**more: Any) -> list[list[int]]:
+        first_one = {
+            "position": lambda batches: (epoch, min(first, batches)),
+            "seed": seed,
+            "drop_last": True,
+        }
+        return list(SeededBatches(length, batch_size, **first_one, **more))
+
+    alone, together = batches(), batches(orders=orders)
+    assert len(together) == len(alone)
+    parts = [
+        [batch[start : start + len(one)] for start in range(0, len(batch), len(one))]
+        for batch, one in zip(together, alone, strict=True)
+    ]
+    assert [part[0] for part in parts] == alone
+    for member in range(orders):
+        order = epoch_order(length, seed, epoch, member)
+        assert sorted(order) == list(range(length))
+        seen = [*chain(*(part[member] for part in parts))]
+        assert seen == order[min(first, max(1, length // batch_size)) * batch_size :][: len(seen)]
+    if length > 20:
+        assert len({tuple(epoch_order(length, seed, epoch, member)) for member in range(3)}) == 3
+
+
 @settings(deadline=None, max_examples=100)
 @given(sizes, st.integers(0, 2**31 - 1), st.integers(0, 100), st.booleans(), st.data())
 def test_starting_at_any_batch_continues_the_same_order(

@@ -179,7 +179,7 @@ def composed(*overrides: str) -> DictConfig:
             "pascal3d/mixture_best",
             [
                 {"/experiment@_global_": "pascal3d/mixture"},
-                {"override /preset": "thesis/pascal3d"},
+                {"/preset@_global_": "thesis/pascal3d"},
                 {"override /encoder": ["mlp"]},
             ],
         ),

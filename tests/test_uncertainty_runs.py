@@ -28,6 +28,7 @@ SMALL = [
     "data.data_seed=0",  # one data set for all seeds
     "batch_size=20",
     "trainer.max_epochs=3",
+    "trainer.gradient_clip_val=0.3",
     "trainer.check_val_every_n_epoch=1",
     "logger=none",
     "threads=1",

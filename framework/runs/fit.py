@@ -21,6 +21,7 @@ from framework.training.checkpoint import WholeCheckpoints
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
 from framework.training.progress import Progress
+from framework.uncertainty import outermost
 
 TRAINED = {"last.ckpt", "previous.ckpt"}
 """Checkpoints that training can go on from; the others hold weights alone."""
@@ -71,6 +72,8 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     )
     trainer = _trainer(run, keep, session.console)
     batches = session.batches(fed)
+    several = outermost(session.predictor)
+    batches.orders = several.trained if several else 1
     batches.attach(trainer)
     resume = _resumed_from(session, run)
     trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)

@@ -28,6 +28,7 @@ class SeededBatches(Sampler[list[int]]):
     Args:
         length: number of samples.
         batch_size: samples of a batch over all ranks.
+        orders: so many orders of their own; a batch holds one batch of each, one after the other.
         position: where to start, asked with the number of batches of an epoch, once per iteration and not
             before its first batch is wanted (a DataLoader calls `iter` earlier, with workers once too often).
         seed: of the order; None keeps the samples' own order.
@@ -49,6 +50,7 @@ class SeededBatches(Sampler[list[int]]):
         drop_last: bool,
         rank: int = 0,
         ranks: int = 1,
+        orders: int = 1,
     ) -> None:
         if batch_size < ranks:
             raise ConfigError(
@@ -66,6 +68,7 @@ class SeededBatches(Sampler[list[int]]):
         self.drop_last = drop_last
         self.rank = rank
         self.ranks = ranks
+        self.orders = orders
 
     def __len__(self) -> int:
         whole, rest = divmod(self.length, self.batch_size)
@@ -74,20 +77,26 @@ class SeededBatches(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         epoch, first = self.position(len(self))
-        order = epoch_order(self.length, self.seed, epoch)
+        orders = [epoch_order(self.length, self.seed, epoch, one) for one in range(self.orders)]
         for number in range(first, len(self)):
-            start = number * self.batch_size
-            last = number == len(self) - 1
-            batch = order[start:] if last and not self.drop_last else order[start : start + self.batch_size]
-            share = slice(self.rank * len(batch) // self.ranks, (self.rank + 1) * len(batch) // self.ranks)
-            yield batch[share]
+            yield [sample for order in orders for sample in self._part(order, number)]
+
+    def _part(self, order: list[int], number: int) -> list[int]:
+        start = number * self.batch_size
+        last = number == len(self) - 1
+        batch = order[start:] if last and not self.drop_last else order[start : start + self.batch_size]
+        return batch[self.rank * len(batch) // self.ranks : (self.rank + 1) * len(batch) // self.ranks]
 
 
-def epoch_order(length: int, seed: int | None, epoch: int) -> list[int]:
-    """The permutation of `length` samples that (seed, epoch) gives; None gives 0, 1, 2, …"""
+def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> list[int]:
+    """The permutation of `length` samples that (seed, epoch) gives; None gives 0, 1, 2, …
+
+    Args:
+        member: of several models that train together: the first has the order of one that trains alone.
+    """
     if seed is None:
         return list(range(length))
-    generator = torch.Generator().manual_seed(hashed(seed, "order", epoch))
+    generator = torch.Generator().manual_seed(hashed(seed, "order", epoch, *[member] * bool(member)))
     return torch.randperm(length, generator=generator).tolist()
 
 
@@ -105,10 +114,18 @@ class Batches(pl.LightningDataModule):
         workers: loading processes of each stage; 0 loads in this one.
         seed: of the training order.
         files: what `predict` reads.
+        orders: of models that train together, each with an order of its own; on one device alone.
     """
 
     def __init__(
-        self, data: Data, *, batch_size: int, workers: int, seed: int, files: Sequence[Path] = ()
+        self,
+        data: Data,
+        *,
+        batch_size: int,
+        workers: int,
+        seed: int,
+        files: Sequence[Path] = (),
+        orders: int = 1,
     ) -> None:
         super().__init__()
         self.data = data
@@ -116,13 +133,16 @@ class Batches(pl.LightningDataModule):
         self.workers = workers
         self.seed = seed
         self.files = files
+        self.orders = orders
 
     def attach(self, trainer: pl.Trainer) -> None:
         """Name the trainer whose progress says where to go on, and for whose rank and device it is."""
         self.trainer = trainer
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        return self._loader(self.data.splits().train, position=self._position, seed=self.seed, drop_last=True)
+        orders = self.orders if self.trainer is None or self.trainer.world_size == 1 else 1
+        split = self.data.splits().train
+        return self._loader(split, position=self._position, seed=self.seed, drop_last=True, orders=orders)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return self._loader(self.data.splits().validation, seed=None, drop_last=False)

@@ -21,6 +21,7 @@ from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
 from framework.training.ranks import Share, WholeBatch, gathered, share, summed
 from framework.training.schedules import schedule, see, smooth
+from framework.uncertainty import outermost, own_batches
 
 # fused: one pass over the memory of each parameter instead of several, half the time of a small network's step
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
@@ -75,7 +76,8 @@ class Training(pl.LightningModule):
         rows = self._share(batch)
         # by batches, not by optimiser steps: those stand still while gradients are accumulated
         seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train")
-        with WholeBatch(rows) if rows else nullcontext(), one_pass(self.learner):
+        own = own_batches(self.learner) if self._orders() > 1 else nullcontext()
+        with WholeBatch(rows) if rows else own, one_pass(self.learner):
             batch = self.augment(batch)
             losses = self.learner.loss(batch["input"], batch["target"])
             loss = losses.mean()
@@ -90,6 +92,11 @@ class Training(pl.LightningModule):
             raise NonFiniteLoss(self._blame(losses, batch, value))
         self.last_loss = value
         return loss
+
+    def _orders(self) -> int:
+        """How many models' batches a batch holds, one after the other (training.batches)."""
+        trainer: Any = self.trainer
+        return trainer.datamodule.orders
 
     def _share(self, batch: Batch) -> Share | None:
         """This rank's part of the batch; None where one process trains."""
@@ -152,15 +159,20 @@ class Training(pl.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """As Lightning does, but each rival's gradients by themselves."""
-        if not self._rivals() or not gradient_clip_val:
+        """As Lightning does, but each rival's gradients by themselves, and those of models that train together."""
+        several = outermost(self.predictor)
+        if several is not None and gradient_clip_val and gradient_clip_algorithm != "value":
+            several.clip_each(gradient_clip_val)
+        elif not self._rivals() or not gradient_clip_val:
             self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
             return
+        clipped = set(several.parameters()) if isinstance(several, nn.Module) else set()
         for group in optimizer.param_groups:
             if gradient_clip_algorithm == "value":
                 nn.utils.clip_grad_value_(group["params"], gradient_clip_val)
             else:
-                nn.utils.clip_grad_norm_(group["params"], gradient_clip_val)
+                left = [one for one in group["params"] if one not in clipped]
+                nn.utils.clip_grad_norm_(left, gradient_clip_val)
 
     def _planned_steps(self) -> tuple[int, int]:
         """Optimiser steps until the end, and of one epoch, for the schedule.

@@ -38,6 +38,10 @@ def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: s
     )
 
 
+AFTER = ("preset", "debug")
+"""Groups that config.yaml composes after the experiment, which therefore cannot override them but can hold one."""
+
+
 def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tuple[str, str]:
     """Name and content of an experiment that is what `overrides` make of theirs.
 
@@ -57,6 +61,8 @@ def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tu
             base = None if value is None else str(value)
         elif key.partition(".")[0] in OF_THE_RUN or _only_on_a_command_line(one):
             kept.append(text)
+        elif key in AFTER:
+            added.append({f"/{key}@_global_": value})
         elif not isinstance(value, dict) and loader.get_group_options(key, results_filter=None):
             (added if one.is_add() else chosen).append(
                 {f"{'' if one.is_add() else 'override '}/{key}": value}

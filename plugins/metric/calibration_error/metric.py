@@ -23,6 +23,8 @@ class CalibrationError(Metric, Pictured):
     """How far stated confidence is from the share that is right, over bins of confidence (thesis eq. 2.28-2.31).
 
     - `ece`: expected calibration error in bins of equal width.
+    - `ece_positive`: of two classes, in such bins of p(y = 1) against y = 1 whatever `probability` says: the letter of
+      eq. 2.28-2.29, in which a class that is predicted with confidence 0.9 and one with 0.1 do not share a bin.
     - `ece_equal_mass`: in bins of equally many samples; equal confidences share a bin, whatever their order.
     - `mce`: the largest gap of a bin of equal width that is not empty.
     - `squared_ce_debiased`: the squared calibration error in bins of equal mass less the part that chance adds to it,
@@ -77,9 +79,18 @@ class CalibrationError(Metric, Pictured):
                 f"{len(target.names)}: {target.told}. Choose probability=predicted."
             )
         self.names = target.names
+        self.two = len(target.names) == 2
+        if self.two:
+            self.columns = {  # pyright: ignore[reportAttributeAccessIssue]  # of two classes alone
+                "ece": "ECE",
+                "ece_positive": f"ECE of p({target.names[1]})",
+                "ece_equal_mass": "ECE (equal mass)",
+            }
+            self.better = dict.fromkeys(self.columns, "lower")  # pyright: ignore[reportAttributeAccessIssue]
         self.bins = bins
         self.positive = probability == "positive"
-        # (confidence, right) of each sample: bins of equal mass are not known before all are seen
+        # (confidence, right) of each sample, of two classes also (p(y = 1), y): bins of equal mass are not known before
+        # all are seen
         self.add_state("samples", [], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction) -> None:
@@ -91,15 +102,17 @@ class CalibrationError(Metric, Pictured):
             confidence, predicted = probability.max(-1)
             right = predicted == label
         assert isinstance(self.samples, list)
-        self.samples.append(torch.stack([confidence, right.double()], -1))
+        positive = [probability[:, 1], (label == 1).double()] if self.two else []
+        self.samples.append(torch.stack([confidence, right.double(), *positive], -1))
 
     def compute(self) -> dict[str, Tensor]:
         confidence, right = self._seen()
-        width = in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
+        width = self._of_equal_width(confidence, right)
         mass = in_bins(confidence, right, equal_mass(confidence, self.bins), self.bins)
         squared = squared_error_debiased(mass)
         return {
             "ece": expected_error(width),
+            **({"ece_positive": expected_error(self._of_equal_width(*self._seen(2)))} if self.two else {}),
             "ece_equal_mass": expected_error(mass),
             "mce": largest_error(width),
             "ece_debiased": squared.clamp(min=0).sqrt(),
@@ -110,7 +123,7 @@ class CalibrationError(Metric, Pictured):
         from plugins.metric.calibration_error.picture import reliability
 
         confidence, right = self._seen()
-        bins = in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
+        bins = self._of_equal_width(confidence, right)
         return reliability(
             bins.count.cpu().numpy(),
             bins.confidence.cpu().numpy(),
@@ -121,11 +134,14 @@ class CalibrationError(Metric, Pictured):
             synthetic=synthetic,
         )
 
-    def _seen(self) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
+    def _of_equal_width(self, confidence: Tensor, right: Tensor) -> "Bins":
+        return in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
+
+    def _seen(self, first: int = 0) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
         """Confidences, ascending, so that no sum depends on the order in which they came; and which are right."""
-        samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 2, dtype=torch.float64)
-        confidence, order = samples[:, 0].contiguous().sort()
-        return confidence, samples[order, 1]
+        samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 4, dtype=torch.float64)
+        confidence, order = samples[:, first].contiguous().sort()
+        return confidence, samples[order, first + 1]
 
 
 @dataclass(frozen=True)

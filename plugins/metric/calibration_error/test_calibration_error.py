@@ -109,6 +109,9 @@ def test_positive_agrees_with_loops(data, samples, bins):
     seen = class_probabilities(predicted(positive(probability), label).density)[:, 1]
     np.testing.assert_allclose(seen, probability, atol=1e-15)
     agree(found, seen.tolist(), label.tolist(), bins, 1e-12)
+    assert found["ece_positive"] == found["ece"]
+    other = measured(*batch, bins=bins)
+    assert other["ece_positive"] == found["ece"], "eq. 2.28-2.29, whatever else is binned"
 
 
 @settings(deadline=None, max_examples=100)
@@ -125,6 +128,7 @@ def test_predicted_agrees_with_loops(data, count, samples, dtype):
     np.testing.assert_allclose(probability, special.softmax(logits.double().numpy(), -1), atol=1e-6)
     right = probability.argmax(-1) == np.array(label)  # NumPy's first of equally likely ones
     agree(found, probability.max(-1).tolist(), right.tolist(), 7, 1e-12)
+    assert ("ece_positive" in found) == (count == 2)
 
 
 @pytest.mark.parametrize("bins", [*range(1, 31), 100, 1000])

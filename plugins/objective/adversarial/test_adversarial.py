@@ -1,3 +1,5 @@
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError, NonFiniteLoss
 from framework.model import Model, Predictor
 from framework.target import Target
+from framework.uncertainty import own_batches
 from plugins.objective.adversarial.objective import Adversarial
 
 TARGETS = {
@@ -65,6 +68,34 @@ class Linear(Recorded):
 
     def loss(self, inputs, target):
         return nn.functional.cross_entropy(self.layer(inputs), target, reduction="none")
+
+
+@pytest.mark.parametrize("batch_norm", [False, True], ids=["side by side", "one after the other"])
+def test_members_of_an_ensemble_are_each_moved_along_their_own_gradient(batch_norm):
+    """The penalty of each on its own rows, and its gradient, are those of a model alone."""
+    objective = Adversarial(weight=0.7, epsilon=0.3)
+    wrapper = resolve("uncertainty", {"name": "ensemble", "members": 3})
+    alone = [model("gaussian", batch_norm=batch_norm).double() for _ in range(3)]
+    for index, one in enumerate(alone):
+        for parameter in one.parameters():
+            parameter.data += 0.1 * (index + 1)
+    made = iter(copy.deepcopy(alone))
+    whole = build("uncertainty", wrapper, model=lambda: next(made), target=TARGETS["gaussian"])
+    inputs, target = torch.randn(15, 4, dtype=torch.float64), labelled("gaussian", 15)
+    with own_batches(whole):
+        found = objective(whole, {"input": inputs, "target": target})
+    found.backward()
+    wanted = [
+        objective(one, {"input": inputs[rows], "target": target[rows]})
+        for one, rows in zip(alone, torch.arange(15).chunk(3), strict=True)
+    ]
+    torch.testing.assert_close(found, torch.stack(wanted).mean(), rtol=1e-12, atol=0)
+    sum(wanted).backward()
+    gradients = [torch.cat([part.grad.flatten() for part in one.parameters()]) for one in alone]
+    total = torch.stack(gradients).norm()
+    torch.testing.assert_close(
+        torch.cat([part.grad.flatten() for part in whole.parameters()]).norm(), total, rtol=1e-9, atol=0
+    )
 
 
 @pytest.mark.parametrize("head", list(TARGETS))

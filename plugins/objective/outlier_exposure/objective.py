@@ -15,6 +15,7 @@ from framework.datasets.fields import as_batch
 from framework.errors import ConfigError
 from framework.model import Predictor, each_alone
 from framework.objective import Objective
+from framework.uncertainty import rows_each
 from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignorance, to_uniform
 
 
@@ -35,7 +36,7 @@ class OutlierExposure(Objective):
         weight: λ.
         outliers: data to draw from; prepared at once.
         low, high: the range of uniform numbers, in the units of the inputs; of images, 0 and 1.
-        count: outliers of a step; as many as the batch has samples where not given.
+        count: outliers of a step; as many as the batch has samples for each model where not given.
         clearance: outliers nearer than this to an input of the batch (Euclidean, in its units) are left out: uniform
             numbers also fall among the training data, where knowing nothing costs likelihood. 0 keeps all.
         divergence: how far from knowing nothing.
@@ -86,7 +87,7 @@ class OutlierExposure(Objective):
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         inputs = batch["input"]
-        count = len(inputs) if self.count is None else self.count
+        count = rows_each(predictor, len(inputs)) if self.count is None else self.count
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
         if self.clearance > 0:
             drawn = drawn[clear_of(drawn, inputs, self.clearance)]

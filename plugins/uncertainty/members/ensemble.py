@@ -13,21 +13,21 @@ from framework.data import Batch
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError, UserError
-from framework.model import Model, Predictor, each_alone
-from framework.uncertainty import Joining, Uncertainty
+from framework.model import Model, Predictor, each_alone, of_its_own
+from framework.uncertainty import Joining, Several, Uncertainty
 from plugins.uncertainty.members.equal_mixture import equal_mixture
 from plugins.uncertainty.members.side_by_side import SideBySide
 
 WORTH_TRYING = (1, 2, 3, 5, 10, 20, 50)
 
 
-class Ensemble(Uncertainty, Joining):
-    """T models that differ in their initial weights; p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
+class Ensemble(Uncertainty, Joining, Several):
+    """T independently trained models; p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
 
-    All members see the same batches. Where every encoder vectorises (`Encoder.vectorises`), their parameters lie side
-    by side and one pass trains and evaluates all; otherwise they are computed one after the other. Either way each
-    member's gradient is its own, so that it becomes what it would become alone (but for a clipping of the gradient's
-    norm, which is taken over all of them). One member is the wrapped model itself, to the last bit.
+    They differ in initial weights and in the order of batches. Where every encoder vectorises (`Encoder.vectorises`),
+    their parameters lie side by side and one pass trains and evaluates all; otherwise they are computed one after the
+    other. Either way each member's gradient is its own, and is clipped by itself, so that it becomes what it would
+    become alone. One member is the wrapped model itself, to the last bit.
 
     Attributes:
         members: how many of the trained members are used, the first ones; may be lowered after training (a knob).
@@ -76,6 +76,8 @@ class Ensemble(Uncertainty, Joining):
         return equal_mixture(components, self, inputs.device)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        if self.own_batches:
+            return of_its_own(self._own_losses(inputs, target), self.trained)
         if self.together is None:
             losses = torch.stack([member.loss(inputs, target) for member in self._apart()], 1)
         else:
@@ -87,6 +89,23 @@ class Ensemble(Uncertainty, Joining):
                 parts = [self._head(index).loss(raw[:, index], target) for index in range(self.trained)]
                 losses = torch.stack(parts, 1)
         return each_alone(losses)
+
+    def _own_losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Each member's of its own rows."""
+        if self.together is None:
+            parts = zip(self._apart(), inputs.chunk(self.trained), target.chunk(self.trained), strict=True)
+            return torch.cat([member.loss(given, wanted) for member, given, wanted in parts])
+        raw = self.together.own(inputs.unflatten(0, (self.trained, -1)))
+        wanted = target.unflatten(0, (self.trained, -1))
+        if len(self.heads) == 1:
+            return self._head(0).loss(raw, wanted).flatten()
+        return torch.cat([self._head(index).loss(raw[index], wanted[index]) for index in range(self.trained)])
+
+    def clip_each(self, most: float) -> None:
+        for member in self.apart:
+            nn.utils.clip_grad_norm_(member.parameters(), most)
+        if self.together is not None:
+            self.together.clip_each(most, list(self.heads) if len(self.heads) > 1 else [])
 
     def training_densities(self, inputs: Tensor) -> Distribution:
         if self.together is not None:

@@ -33,6 +33,15 @@ class SideBySide(nn.Module):
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Float[Tensor, "batch member size"]:
         """What each of the first `used` members (all by default) makes of the inputs; each has dropout of its own."""
+        return self._computed(inputs, used, None).movedim(0, 1)
+
+    def own(self, inputs: Float[Tensor, "member batch *input"]) -> Float[Tensor, "member batch size"]:
+        """What each member makes of inputs of its own."""
+        return self._computed(inputs, None, 0)
+
+    def _computed(
+        self, inputs: Tensor, used: int | None, members: int | None
+    ) -> Float[Tensor, "member batch size"]:
         template = self._template
         # module by module: dropout may be active where all else evaluates
         for mine, shown in zip(template.modules(), self.stacked.modules(), strict=True):
@@ -44,7 +53,24 @@ class SideBySide(nn.Module):
         def one(mine: dict[str, Tensor], given: Tensor) -> Tensor:
             return functional_call(template, mine, (given,))
 
-        return vmap(one, in_dims=(0, None), out_dims=1, randomness="different")(parameters, inputs)
+        return vmap(one, in_dims=(0, members), randomness="different")(parameters, inputs)
+
+    def clip_each(self, most: float, beside: Sequence[nn.Module]) -> None:
+        """Shorten each member's gradient to the norm `most`, as torch's clip_grad_norm_ does one network's.
+
+        Args:
+            beside: what else each member has.
+        """
+        gradients = [one.grad for one in self.parameters() if one.grad is not None]
+        others = [[one.grad for one in module.parameters() if one.grad is not None] for module in beside]
+        norms = [torch.linalg.vector_norm(one.reshape(self.count, -1), dim=1) for one in gradients]
+        norms += [torch.stack([one.norm() for one in some]) for some in zip(*others, strict=True)]
+        factor = (most / (torch.linalg.vector_norm(torch.stack(norms), dim=0) + 1e-6)).clamp(max=1)
+        for one in gradients:
+            one.mul_(factor.view(-1, *[1] * (one.dim() - 1)))
+        for index, some in enumerate(others):
+            for one in some:
+                one.mul_(factor[index])
 
     @torch.no_grad()
     def write(self, index: int, parameters: Mapping[str, Tensor]) -> None:

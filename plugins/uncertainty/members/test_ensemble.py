@@ -2,12 +2,14 @@ import copy
 
 import pytest
 import torch
+from torch import nn
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
 from framework.target import Target
+from framework.uncertainty import own_batches
 from plugins.uncertainty.members.ensemble import Ensemble, network
 from plugins.uncertainty.members.side_by_side import SideBySide
 
@@ -100,6 +102,61 @@ def test_each_member_becomes_what_it_becomes_alone(kind, make, dtype, tolerance)
             torch.testing.assert_close(
                 whole.together.read(index)[name], parameter, rtol=tolerance, atol=tolerance
             )
+
+
+ANOTHER = {"name": "mlp", "widths": [16, 16], "batch_norm": True}
+
+
+@pytest.mark.parametrize("clip", [None, 0.02])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        {"head": "categorical"},
+        {"head": "cvae", "target": ANGLE},
+        {"head": "categorical", "encoder": ANOTHER},
+    ],
+    ids=["side by side", "heads with weights", "one after the other"],
+)
+def test_each_member_reads_its_own_batches_and_clips_its_own_gradient(kind, clip):
+    """As a model alone with its own rows, whose gradient torch clips."""
+    inputs, target = (
+        field.to(torch.float64) if field.is_floating_point() else field
+        for field in data(kind.get("target", CLASSES))
+    )
+    whole = ensemble(3, **kind).double()
+    if whole.together is None:
+        alone = copy.deepcopy(list(whole.apart))
+    else:
+        alone = [model.double() for model in members_of(whole, **kind)]
+        for index, model in enumerate(alone):
+            model.head.load_state_dict(whole.heads[min(index, len(whole.heads) - 1)].state_dict())
+    rows = [torch.randperm(64, generator=torch.Generator().manual_seed(seed))[:16] for seed in range(3)]
+    torch.manual_seed(0)
+    with own_batches(whole):
+        found = whole.loss(inputs[torch.cat(rows)], target[torch.cat(rows)])
+    found.mean().backward()
+    losses = []
+    torch.manual_seed(0)
+    for model, some in zip(alone, rows, strict=True):
+        losses.append(model.loss(inputs[some], target[some]))
+        losses[-1].mean().backward()
+    torch.testing.assert_close(found, torch.cat(losses), rtol=1e-12, atol=1e-12)
+    if clip is not None:
+        whole.clip_each(clip)
+        for model in alone:
+            nn.utils.clip_grad_norm_(model.parameters(), clip)
+    for index, model in enumerate(alone):
+        if whole.together is None:
+            found_gradients = [one.grad for one in whole.apart[index].parameters()]
+        else:
+            found_gradients = [one.grad[index] for one in whole.together.parameters()]
+            found_gradients += (
+                [one.grad for one in whole.heads[index].parameters()] if len(whole.heads) > 1 else []
+            )
+        wanted = [one.grad for one in model.parameters()]
+        for mine, theirs in zip(found_gradients, wanted, strict=True):
+            torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-12)
+    assert not any(one.own_batches for one in whole.modules() if isinstance(one, Ensemble))
 
 
 def test_members_start_as_models_built_one_after_the_other():
