@@ -44,6 +44,9 @@ class DensityHead(nn.Module, ABC):
     every pixel an encoder gives. There must be `size` of them."""
     size: int
     """How many raw numbers the head reads per sample, > 0; set by the constructor."""
+    backbones: tuple[int, ...] = ()
+    """Sizes of parts of the raw numbers, in order and `size` together, each of which encoders of its own give: as many
+    networks as there are parts. Empty: one gives all. May be set by the constructor."""
 
     @abstractmethod
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:

@@ -55,6 +55,7 @@ class Model(Predictor):
 
     Args:
         input_shape: of one sample; needed where there are no encoders.
+        beside: for a head with several backbones, the encoders of all but the first.
 
     Raises:
         ConfigError: the last encoder does not end in a vector, or, before a direct head, in as many numbers as that
@@ -62,9 +63,15 @@ class Model(Predictor):
     """
 
     def __init__(
-        self, encoders: Sequence[Encoder], head: DensityHead, input_shape: tuple[int, ...] = ()
+        self,
+        encoders: Sequence[Encoder],
+        head: DensityHead,
+        input_shape: tuple[int, ...] = (),
+        beside: Sequence[Sequence[Encoder]] = (),
     ) -> None:
         super().__init__()
+        if beside:
+            encoders = [Backbones([encoders, *beside], head.backbones)]
         self.encoders = nn.Sequential(*encoders)
         shape = encoders[-1].output_shape if encoders else input_shape
         if isinstance(head, Fitted):
@@ -80,6 +87,8 @@ class Model(Predictor):
                     f"The last encoder gives {'×'.join(map(str, shape))} numbers, but {type(head).__name__} reads "
                     f"{head.size:,} as they are. Choose an encoder that gives as many, or change its channels."
                 )
+            self.projection = nn.Flatten()
+        elif beside:
             self.projection = nn.Flatten()
         elif len(shape) == 1:
             self.projection = nn.Linear(shape[0], head.size)
@@ -111,6 +120,39 @@ class Model(Predictor):
         pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
         raws, targets = zip(*pairs, strict=True)
         self.head.calibrate(torch.cat(raws), torch.cat(targets))
+
+
+@final
+class Backbones(Encoder):
+    """Networks of one architecture with weights of their own, each with a linear layer to its part of the raw numbers.
+
+    Args:
+        networks: encoders in a chain, of each.
+        sizes: how many numbers each gives.
+
+    Raises:
+        ConfigError: they do not end in vectors.
+    """
+
+    bibtex = ""
+
+    def __init__(self, networks: Sequence[Sequence[Encoder]], sizes: Sequence[int]) -> None:
+        super().__init__()
+        shape = networks[0][-1].output_shape if networks[0] else ()
+        if len(shape) != 1:
+            raise ConfigError(
+                f"A head with {len(sizes)} backbones wants encoders that end in a vector; the last one's features are "
+                f"of shape {shape}. Append an encoder that flattens, such as `mlp`."
+            )
+        self.networks = nn.ModuleList(
+            nn.Sequential(*network, nn.Linear(shape[0], size))
+            for network, size in zip(networks, sizes, strict=True)
+        )
+        self.vectorises = all(encoder.vectorises for network in networks for encoder in network)
+        self.output_shape = (sum(sizes),)
+
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
+        return torch.cat([network(inputs) for network in self.networks], 1)
 
 
 class Kept:

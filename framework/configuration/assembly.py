@@ -130,15 +130,19 @@ def build_predictor(
         shape, names = encoder.output_shape, ()
         del parts[0]
 
-    def model() -> Predictor:
+    def chain() -> tuple[list[Encoder], tuple[int, ...]]:
         encoders: list[Encoder] = []
         inner, called = shape, names
         for part in parts:
             built = ready.pop() if ready else build("encoder", part, input_shape=inner, input_columns=called)
             encoders.append(built)
             inner, called = encoders[-1].output_shape, ()
+        return encoders, inner
+
+    def model() -> Predictor:
+        encoders, inner = chain()
         head: DensityHead = build("density_head", resolved["density_head"], target=target)
-        return Model(encoders, head, inner)
+        return Model(encoders, head, inner, [chain()[0] for _ in head.backbones[1:]])
 
     factory: Callable[[], Predictor] = model
     for part in resolved["uncertainty"]:

@@ -28,8 +28,14 @@ def require_trained(component: DensityHead) -> DensityHead:
     """The component itself, if all it has is trained by gradient.
 
     Raises:
-        ConfigError: it fits something after training, for which it would have to know which data belong to it.
+        ConfigError: it fits something after training, for which it would have to know which data belong to it; or it
+            wants backbones, which only the head of a model has.
     """
+    if component.backbones:
+        raise ConfigError(
+            "density_head.component wants networks of its own for its parts, which only the head of a model has; leave "
+            "density_head.component.backbones at shared."
+        )
     fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
     if fitted:
         raise ConfigError(

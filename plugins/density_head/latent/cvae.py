@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -136,6 +136,8 @@ class CVAEHead(DensityHead):
         samples: S in evaluation, of the bound and of the mixture it is drawn as; may be set at any time.
         tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
             estimated error is below. None: S it is.
+        backbones: "shared": prior, encoder and decoder read the features of one network; "each": of one each, of the
+            same architecture (thesis §3.6.1).
         component: the head whose densities are mixed.
     """
 
@@ -162,6 +164,7 @@ class CVAEHead(DensityHead):
         training_samples: Annotated[int, Field(ge=1)] = 10,
         samples: Annotated[int, Field(ge=1)] = 500,
         tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
+        backbones: Literal["shared", "each"] = "shared",
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
@@ -178,7 +181,10 @@ class CVAEHead(DensityHead):
         )
         self.posterior = _rest(hidden, 2 * latent)
         self.decoder = LatentDecoder(latent, hidden, component.size)
-        self.size = 2 * hidden + self.decoder.size
+        parts = (hidden, hidden, self.decoder.size)
+        self.size = sum(parts)
+        if backbones == "each":
+            self.backbones = parts
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> LatentDensity:
         effort = Effort(self.training_samples) if self.training else Effort(self.samples, self.tolerance)

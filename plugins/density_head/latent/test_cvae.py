@@ -8,6 +8,7 @@ from torch import nn
 from torch.distributions import Categorical, Independent, Normal
 from torch.distributions import kl_divergence as torch_kl_divergence
 
+from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
@@ -26,6 +27,51 @@ from plugins.density_head.latent.cvae import (
     kl_divergence,
 )
 from plugins.density_head.latent.rows import ONE, SMALL, TWO
+
+
+def test_each_network_may_have_a_backbone_of_its_own():
+    """Thesis §3.6.1: each part of the raw numbers depends on its own, the loss on the raw numbers alone."""
+    config = {
+        "data": "moons",
+        "density_head": {"name": "cvae", **SMALL, "backbones": "each"},
+        "encoder": {"mlp": {"name": "mlp", "widths": [5]}},
+    }
+    model = build_predictor({**resolve_all_parts(config)}, ONE, (4,), 0).double()
+    shared = {**config, "density_head": {"name": "cvae", **SMALL}}
+    one = build_predictor(resolve_all_parts(shared), ONE, (4,), 0).double()
+    counts = [sum(parameter.numel() for parameter in made.encoders.parameters()) for made in (model, one)]
+    assert counts[0] == 3 * counts[1] + sum(5 * part + part for part in model.head.backbones)
+    networks = model.encoders[0].networks
+    assert not torch.equal(networks[0][0].layers[0].weight, networks[1][0].layers[0].weight)
+    inputs = torch.randn(3, 4, dtype=torch.float64)
+    raw = model.raw(inputs)
+    for index, part in enumerate(raw.split(model.head.backbones, -1)):
+        gradients = torch.autograd.grad(part.sum(), list(networks.parameters()), retain_graph=True)
+        each = len(gradients) // 3
+        moved = [any(bool(one.any()) for one in gradients[at * each : (at + 1) * each]) for at in range(3)]
+        assert moved == [at == index for at in range(3)]
+    target = torch.randn(3, 1, dtype=torch.float64)
+    torch.manual_seed(0)
+    found = model.loss(inputs, target)
+    same = head()
+    same.load_state_dict(model.head.state_dict())
+    torch.manual_seed(0)
+    torch.testing.assert_close(same.double().loss(raw, target), found, rtol=0, atol=0)
+    with pytest.raises(ConfigError, match="which only the head of a model has"):
+        component = {"name": "cvae", **SMALL, "backbones": "each"}
+        build(
+            "density_head", resolve("density_head", {"name": "mixture", "component": component}), target=ONE
+        )
+
+
+def resolve_all_parts(config):
+    """What `build_predictor` reads."""
+    encoders = [resolve("encoder", one) for one in config["encoder"].values()]
+    return {
+        "encoder": encoders,
+        "density_head": resolve("density_head", config["density_head"]),
+        "uncertainty": [],
+    }
 
 
 def head(config=SMALL, target=ONE):
