@@ -79,7 +79,7 @@ SAID = {
         "data.jitter": 0.0,
     },
     "idiap/von_mises": HEADS,
-    "caviar/cvae": HEADS,
+    "caviar/cvae": {**HEADS, "density_head.backbones": "each"},
     "towncentre/mixture": HEADS,
     # §6.5.3
     "modelnet40/bps_mlp_400": {
