@@ -98,10 +98,6 @@ def test_nothing_instantiates_from_a_config_or_loads_pickles() -> None:
     assert not faults(CORE + PLUGINS, lambda path: re.findall(bad, path.read_text(encoding="utf-8")))
 
 
-OWED = {"data/bodies", "renderer/smplpix"}
-"""Folders of plugins that are being rewritten and say later in what they differ from the thesis."""
-
-
 def test_plugin_folders_explain_themselves() -> None:
     folders = sorted(
         path for path in (ROOT / "plugins").glob("*/*") if path.is_dir() and path.name != "__pycache__"
@@ -115,7 +111,7 @@ def test_plugin_folders_explain_themselves() -> None:
         else:
             said = readme.read_text(encoding="utf-8")
             told = re.findall(r"^\*\*Differs from the thesis\*\*: (?=\S)", said, re.MULTILINE)
-            if len(told) != 1 and str(folder.relative_to(ROOT / "plugins")) not in OWED:
+            if len(told) != 1:
                 yield "one line '**Differs from the thesis**: …' in README.md, be it 'in nothing.'"
             if not re.search(r"python -m (framework|plugins)", said):
                 yield "a command to run in README.md"
