@@ -221,7 +221,7 @@ def draw(
     place: Path,
 ) -> None:
     figure = titled_figure(
-        (10, 4), "Unseen people, 256 × 192 pixels; bars: standard deviation of three seeds", True
+        (10, 4), "Unseen people, 256 × 192 pixels; bars: standard deviation over seeds", True
     )
     panels = figure.subplots(1, 2)
     for axes, key, label in zip(
