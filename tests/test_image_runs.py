@@ -228,11 +228,16 @@ def test_wrappers_and_objectives_work_on_images(framework: Framework, wrapped: t
     assert {name: again[name] for name in names} == {name: results[name] for name in names}
 
 
-@pytest.mark.parametrize("way", ["quick", "hybrid"])
-def test_the_ground_of_a_photograph_is_white_to_the_bit_and_is_not_computed(tmp_path: Path, way: str) -> None:
+@pytest.mark.parametrize(
+    "way, own",
+    [("quick", ["encoder.projection.splat=1", "encoder.slim.crop=1"]), ("hybrid", ["encoder.slim.crop=2"])],
+)
+def test_the_ground_of_a_photograph_is_white_to_the_bit_and_is_not_computed(
+    tmp_path: Path, way: str, own: list[str]
+) -> None:
     """Losses weigh figures by it, networks leave it out."""
-    _, *settings = people(tmp_path)
-    resolved = resolve_all(plain(composed(f"experiment=smplpix/{way}", *settings, "encoder.slim.crop=2")))
+    settings = [*people(tmp_path)[1:], *own]
+    resolved = resolve_all(plain(composed(f"experiment=smplpix/{way}", *settings)))
     data = build_data(resolved)
     data.prepare()
     batch = default_collate([data.splits().train[index] for index in range(3)])
