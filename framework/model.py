@@ -4,7 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import final
+from typing import Generic, TypeVar, final
 
 import torch
 from jaxtyping import Float
@@ -100,7 +100,7 @@ class Model(Predictor):
                 "Append an encoder that flattens, such as `mlp`."
             )
         self.head = head
-        self.kept = Kept()
+        self.kept: Kept[Tensor] | None = Kept() if head.direct else None
 
     def forward(self, inputs: Tensor) -> Distribution:
         return self.head(self.raw(inputs))
@@ -113,7 +113,11 @@ class Model(Predictor):
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
         """What the head reads."""
-        return self.kept.of(inputs, lambda given: self.projection(self.encoders(given)))
+        return self._raw(inputs) if self.kept is None else self.kept.of(inputs, self._raw)
+
+    def _raw(self, inputs: Tensor) -> Tensor:
+        raw: Tensor = self.projection(self.encoders(inputs))
+        return raw
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
@@ -155,12 +159,15 @@ class Backbones(Encoder):
         return torch.cat([network(inputs) for network in self.networks], 1)
 
 
-class Kept:
+Computed = TypeVar("Computed")
+
+
+class Kept(Generic[Computed]):
     """What was last computed, and of which tensor, while `one_pass` asks for it."""
 
-    last: tuple[Tensor, ...] | None = None
+    last: tuple[()] | tuple[Tensor, Computed] | None = None
 
-    def of(self, inputs: Tensor, compute: Callable[[Tensor], Tensor]) -> Tensor:
+    def of(self, inputs: Tensor, compute: Callable[[Tensor], Computed]) -> Computed:
         if self.last and self.last[0] is inputs:
             return self.last[1]
         found = compute(inputs)
@@ -180,7 +187,7 @@ class FrozenFrontEnd(Predictor):
         super().__init__()
         self.encoders = nn.Sequential(*encoders)
         self.predictor = predictor
-        self.kept = Kept()
+        self.kept: Kept[Tensor] = Kept()
 
     def features(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
         """What the predictor reads."""
@@ -204,14 +211,11 @@ class FrozenFrontEnd(Predictor):
 def one_pass(predictor: Predictor) -> Iterator[None]:
     """Temporarily computes some numbers of one tensor of inputs once, however often loss and densities are asked.
 
-    These are features that are fixed, and the raw numbers of direct heads: their encoders give images, which an
-    objective compares as the loss does.
+    These are features that are fixed, the raw numbers of direct heads, whose encoders give images which an objective
+    compares as the loss does, and what else a module keeps in `kept`.
     """
-    parts = [
-        module.kept
-        for module in predictor.modules()
-        if isinstance(module, FrozenFrontEnd) or (isinstance(module, Model) and module.head.direct)
-    ]
+    found = (getattr(module, "kept", None) for module in predictor.modules())
+    parts = [kept for kept in found if isinstance(kept, Kept)]
     for kept in parts:
         kept.last = ()
     try:

@@ -51,8 +51,9 @@ class Several(ABC):
 
     Attributes:
         trained: how many.
-        own_batches: whether `loss` is given the batches of all of them one after the other, equally many rows each,
-            and each sees its own alone: set while training on one device, where each then has an order of its own.
+        own_batches: whether `loss` and `training_densities` are given the batches of all of them one after the other,
+            equally many rows each, and each sees its own alone; densities have the batch_shape (rows of each, member).
+            Set while training on one device, where each then has an order of its own.
     """
 
     trained: int
@@ -76,17 +77,17 @@ def rows_each(predictor: Predictor, rows: int) -> int:
 
 
 @contextmanager
-def own_batches(predictor: Predictor) -> Iterator[None]:
-    """Temporarily lets each of several models read its own part of a batch (`Several.own_batches`)."""
+def own_batches(predictor: Predictor, own: bool = True) -> Iterator[None]:
+    """Temporarily lets each of several models read its own part of a batch (`Several.own_batches`), or all read all."""
     several = outermost(predictor)
     if several is None:
         yield
         return
-    several.own_batches = True
+    before, several.own_batches = several.own_batches, own
     try:
         yield
     finally:
-        several.own_batches = False
+        several.own_batches = before
 
 
 class Joining(ABC):

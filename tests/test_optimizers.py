@@ -80,6 +80,8 @@ def test_step_reduces_after_the_epochs_that_it_names() -> None:
             reference.step()
     with pytest.raises(ValueError, match="milestones names none"):
         OptimizerSettings(schedule="step")
+    with pytest.raises(ValueError, match="milestones are of schedule=step, plateau has none"):
+        OptimizerSettings(schedule="plateau", milestones=[3])
 
 
 class Against(Objective):

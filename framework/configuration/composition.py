@@ -92,7 +92,8 @@ def _preset_for_the_data(arguments: list[str]) -> list[str]:
             f"preset={name} is another for each of these experiments: {', '.join(sorted(chosen))}. Sweep over those "
             "of one alone."
         )
-    return [f"preset={chosen.copy().pop()}" if one in given else one for one in arguments]
+    (preset,) = chosen
+    return [f"preset={preset}" if one in given else one for one in arguments]
 
 
 def _preset(name: str, options: list[str], arguments: list[str], experiment: str) -> str:
@@ -197,10 +198,11 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
     """Keys of values that must be given and are not, dotted; a config may say what is wanted: `<a file of ...>`."""
-    for key, value in values.items() if isinstance(values, Mapping) else ():
-        if isinstance(value, str) and re.fullmatch(r"\?\?\?|<.*>", value):
-            yield f"{before}{key}", f": wanted {value[1:-1]}" if value != "???" else ""
-        yield from _missing(value, f"{before}{key}.")
+    if isinstance(values, str) and re.fullmatch(r"\?\?\?|<.*>", values):
+        yield before, f": wanted {values[1:-1]}" if values != "???" else ""
+    parts = enumerate(values) if isinstance(values, list) else ()
+    for key, value in values.items() if isinstance(values, Mapping) else parts:
+        yield from _missing(value, f"{before}.{key}" if before else str(key))
 
 
 def help_text() -> str:

@@ -85,6 +85,10 @@ class OptimizerSettings(_Strict):
             raise ValueError(
                 "schedule=step reduces the rate after some epochs and milestones names none. Give them: [2000]"
             )
+        if self.milestones and self.schedule != "step":
+            raise ValueError(
+                f"milestones are of schedule=step, {self.schedule} has none. Leave them out, or choose step"
+            )
         return self
 
 

@@ -63,15 +63,13 @@ class MLP(Encoder):
                 "number for all."
             )
         layers: list[nn.Module] = []
+        before, after = batch_norm is True, batch_norm == "after_relu"
         for width, drop in zip(widths, drops, strict=True):
-            after = batch_norm == "after_relu"
-            layers.append(
-                nn.Linear(length, width, bias=after or not batch_norm)
-            )  # before ReLU it has its own
-            parts: list[nn.Module] = [nn.ReLU(inplace=True)]
-            if batch_norm:
-                parts.insert(1 if after else 0, nn.BatchNorm1d(width))
-            layers += [*parts, nn.Dropout(drop)]
+            layers.append(nn.Linear(length, width, bias=not before))  # batch norm behind it has its own
+            layers += [nn.BatchNorm1d(width)] * before
+            layers.append(nn.ReLU(inplace=True))
+            layers += [nn.BatchNorm1d(width)] * after
+            layers.append(nn.Dropout(drop))
             length = width
         self.layers = nn.Sequential(*layers)
         self.vectorises = not batch_norm  # whose running moments are buffers

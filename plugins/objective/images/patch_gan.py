@@ -57,22 +57,22 @@ class PatchGAN(Objective):
         self.rival = Rival(learning_rate=learning_rate, schedule=schedule)
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
-        images = predicted_images(predictor, batch)
+        images, wanted = predicted_images(predictor, batch)
         lead = images.shape[:-3]
         false = images.reshape(-1, *images.shape[-3:]).movedim(-1, 1)
-        true = batch["target"].to(images.dtype).movedim(-1, 1)
+        true = wanted.flatten(0, -4).movedim(-1, 1)
         own = {name: one.to(images.dtype) for name, one in self.discriminators.named_parameters()}
         fixed = {name: one.detach() for name, one in own.items()}
         judged = functional_call(self.discriminators, own, (true,))
         fooled = functional_call(self.discriminators, fixed, (false,))
         caught = functional_call(self.discriminators, own, (false.detach(),))
-        count = max(1, len(true))
+        count = max(1, len(images))
         of_true = [(1 - one[-1]).square() / 2 for one in judged]
         of_false = [one[-1].square() / 2 for one in caught]
-        against = self._mean(of_true, (len(true),)).sum() / count
+        against = self._mean(of_true, (len(true),)).sum() / max(1, len(true))
         against = against + self._mean(of_false, lead).sum() / max(1, len(false))
         taken = each_alone(self._mean([(1 - one[-1]).square() for one in fooled], lead)).sum() / count
-        alike = each_alone(self._matching(fooled, judged, lead)).sum() / count
+        alike = each_alone(self._matching(fooled, judged, lead, wanted.shape[:-3])).sum() / count
         self.told = {
             "generator": taken.detach(),
             "feature_matching": alike.detach(),
@@ -86,13 +86,17 @@ class PatchGAN(Objective):
         return torch.stack([one.mean((-3, -2, -1)) for one in judged]).mean(0).reshape(lead)
 
     def _matching(
-        self, false: list[list[Tensor]], true: list[list[Tensor]], lead: tuple[int, ...]
+        self,
+        false: list[list[Tensor]],
+        true: list[list[Tensor]],
+        lead: tuple[int, ...],
+        of_true: tuple[int, ...],
     ) -> Float[Tensor, "*lead"]:
         """Mean distance of features, over layers but the last and scales (Wang et al. 2018, eq. 4)."""
         found = []
         for one, other in zip(false, true, strict=True):
             for ours, theirs in zip(one[:-1], other[:-1], strict=True):
                 ours = ours.unflatten(0, lead)
-                theirs = theirs.detach().reshape(lead[0], *[1] * (len(lead) - 1), *theirs.shape[1:])
+                theirs = theirs.detach().unflatten(0, of_true)
                 found.append((ours - theirs).abs().mean((-3, -2, -1)))
         return torch.stack(found).mean(0)

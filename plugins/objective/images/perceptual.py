@@ -43,17 +43,16 @@ class FeatureDistance(Objective):
         """What the distance is called in the journal."""
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
-        images = predicted_images(predictor, batch)
-        true = batch["target"].to(images.dtype)
+        images, true = predicted_images(predictor, batch)
         lead = images.shape[:-3]
         found = self.network(images.reshape(-1, *images.shape[-3:]).movedim(-1, 1))
-        wanted = self._features(true)
+        wanted = self._features(true.flatten(0, -4))
         distance = images.new_zeros(lead)
         for level, (one, other) in enumerate(zip(found, wanted, strict=True), 1 - len(found)):
             ours = one.unflatten(0, lead)
-            theirs = other.reshape(len(true), *[1] * (len(lead) - 1), *other.shape[1:])
+            theirs = other.unflatten(0, true.shape[:-3])
             distance = distance + 2.0**level * (ours - theirs).abs().mean((-3, -2, -1))
-        mean = each_alone(distance).sum() / max(1, len(true))
+        mean = each_alone(distance).sum() / max(1, len(images))
         self.told = {self.term: mean.detach()}
         return self.weight * mean
 

@@ -11,8 +11,12 @@ from framework.model import Predictor
 
 def predicted_images(
     predictor: Predictor, batch: Batch
-) -> Float[Tensor, "batch *member height width number"]:
-    """Means of the densities of the batch's inputs, in numbers as files hold them.
+) -> tuple[
+    Float[Tensor, "batch *member height width number"], Float[Tensor, "batch *_member height width number"]
+]:
+    """Means of the densities of the batch's inputs, in numbers as files hold them; and what they should be.
+
+    The latter have one member where all members see the same rows, and as many where each has rows of its own.
 
     Raises:
         ConfigError: the target is no image of red, green and blue.
@@ -26,4 +30,9 @@ def predicted_images(
             f"Targets are of shape {tuple(densities.event_shape)}; wanted images of three colours, (height, width, 3), "
             "which this objective compares. Leave it out, or choose other data."
         )
-    return densities.mean
+    images = densities.mean
+    count, *members = images.shape[:-3]
+    true = batch["target"].to(images.dtype)
+    if len(true) > count:  # those of the members one after the other
+        return images, true.unflatten(0, (*members, count)).movedim(len(members), 0)
+    return images, true.reshape(count, *[1] * len(members), *true.shape[1:])

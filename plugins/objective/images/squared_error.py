@@ -37,9 +37,7 @@ class SquaredError(Objective):
         self.weight = weight
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
-        images = predicted_images(predictor, batch)
-        true = batch["target"].to(images.dtype)
-        true = true.reshape(len(true), *[1] * (images.dim() - true.dim()), *true.shape[1:])
-        mean = each_alone((images - true).square().mean((-3, -2, -1))).sum() / max(1, len(true))
+        images, true = predicted_images(predictor, batch)
+        mean = each_alone((images - true).square().mean((-3, -2, -1))).sum() / max(1, len(images))
         self.told = {"squared_error": mean.detach()}
         return self.weight * mean

@@ -1,5 +1,6 @@
 """Losses of images beyond their contract: formulas written again, files of weights, what is kept, who learns what."""
 
+import copy
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,11 @@ from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 from torch.nn.functional import mse_loss
 
+from framework.configuration.schema import build, resolve
 from framework.errors import CheckpointError, ConfigError
-from framework.model import Predictor
+from framework.model import Model, Predictor, one_pass
+from framework.target import Target
+from framework.uncertainty import own_batches
 from plugins.objective.images.patch_gan import PatchGAN
 from plugins.objective.images.perceptual import Perceptual, RandomFeatures
 from plugins.objective.images.squared_error import SquaredError
@@ -40,6 +44,58 @@ def pair(*size: int) -> tuple[Given, dict[str, Tensor]]:
     torch.manual_seed(1)
     predictor = Given(torch.rand(3, *size, 3))
     return predictor, {"input": torch.arange(3), "target": torch.rand(3, *size, 3)}
+
+
+IMAGES = Target("image", ("red", "green", "blue"), size=(16, 16))
+
+
+def painter() -> Model:
+    config = {"name": "slim", "widths": [4, 6], "normalisation": "group", "crop": None}
+    encoder = build("encoder", resolve("encoder", config), input_shape=(3, 16, 16))
+    return Model([encoder], build("density_head", resolve("density_head", "laplace_image"), target=IMAGES))
+
+
+@pytest.mark.parametrize("wrapped", [False, True], ids=["ensemble", "temperature of an ensemble"])
+@pytest.mark.parametrize(
+    "make",
+    [SquaredError, lambda: RandomFeatures(width=4), lambda: PatchGAN(width=4, layers=1, scales=1)],
+    ids=["squared error", "random features", "discriminators"],
+)
+def test_each_member_of_an_ensemble_is_judged_by_the_images_of_its_own_rows(make, wrapped: bool) -> None:
+    """Value and gradients are those of models alone, each of which paints its own rows, and those once."""
+    torch.manual_seed(0)
+    alone = [painter() for _ in range(3)]
+    given = iter(copy.deepcopy(alone))
+    ensemble = resolve("uncertainty", {"name": "ensemble", "members": 3})
+    whole = build("uncertainty", ensemble, model=lambda: next(given), target=IMAGES)
+    members = [one for one in whole.modules() if isinstance(one, Model)]
+    if wrapped:
+        inner = whole
+        whole = build(
+            "uncertainty", resolve("uncertainty", "temperature"), model=lambda: inner, target=IMAGES
+        )
+    painted: list[int] = []
+    for member in members:
+        member.encoders[0].register_forward_hook(lambda module, inputs, output: painted.append(len(output)))
+    inputs, target = torch.rand(6, 3, 16, 16), torch.rand(6, 16, 16, 3)
+    objective = make()
+    with own_batches(whole), one_pass(whole):
+        whole.loss(inputs, target)
+        found = objective(whole, {"input": inputs, "target": target})
+    found.backward()
+    assert painted == [2, 2, 2]
+    apart = [
+        objective(one, {"input": given, "target": true})
+        for one, given, true in zip(alone, inputs.chunk(3), target.chunk(3), strict=True)
+    ]
+    torch.testing.assert_close(found, torch.stack(apart).mean())
+    sum(apart).backward()
+    for mine, theirs in zip(members, alone, strict=True):
+        for ours, wanted in zip(mine.parameters(), theirs.parameters(), strict=True):
+            torch.testing.assert_close(ours.grad, wanted.grad, rtol=1e-4, atol=1e-7)
+    together = objective(whole, {"input": inputs, "target": target})
+    each = torch.stack([objective(one, {"input": inputs, "target": target}) for one in alone])
+    torch.testing.assert_close(together, each.mean(), msg="all see all rows where none has its own")
 
 
 def torchvision(depth: Depth) -> nn.Sequential:

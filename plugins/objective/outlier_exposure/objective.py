@@ -15,7 +15,7 @@ from framework.datasets.fields import as_batch
 from framework.errors import ConfigError
 from framework.model import Predictor, each_alone
 from framework.objective import Objective
-from framework.uncertainty import rows_each
+from framework.uncertainty import own_batches, rows_each
 from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignorance, to_uniform
 
 
@@ -91,7 +91,7 @@ class OutlierExposure(Objective):
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
         if self.clearance > 0:
             drawn = drawn[clear_of(drawn, inputs, self.clearance)]
-        with flagged(predictor, BATCH_NORM, "training", False):
+        with flagged(predictor, BATCH_NORM, "training", False), own_batches(predictor, False):
             found = each_alone(self._divergences(predictor.training_densities(drawn)))
         return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
 

@@ -16,6 +16,7 @@ from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError
 from framework.model import Model, Predictor
 from framework.target import Target
+from framework.uncertainty import own_batches
 from plugins.objective.outlier_exposure.divergence import (
     DRAWS,
     from_uniform,
@@ -102,6 +103,21 @@ def test_the_penalty_is_lambda_times_the_mean_divergence():
     assert found == pytest.approx(0.4 * (math.log(3) - stats.entropy(p)), rel=1e-12)
     found = objective(**BOX, weight=0.4, divergence="cross_entropy")(predictor, given_batch()).item()
     assert found == pytest.approx(0.4 * stats.entropy(np.full(3, 1 / 3), p), rel=1e-12)
+
+
+def test_members_with_batches_of_their_own_see_the_same_outliers():
+    """As many as one member's batch has samples."""
+    built = iter([Model([], head("categorical", CLASSES), (2,)) for _ in range(3)])
+    wrapper = resolve("uncertainty", {"name": "ensemble", "members": 3})
+    whole = build("uncertainty", wrapper, model=lambda: next(built), target=CLASSES)
+    inputs = torch.randn(15, 2)
+    torch.manual_seed(0)
+    wanted = objective(**BOX)(whole, {"input": inputs[:5]})
+    torch.manual_seed(0)
+    with own_batches(whole):
+        found = objective(**BOX)(whole, {"input": inputs})
+        assert whole.own_batches
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
 
 
 def test_knowing_nothing_costs_nothing():

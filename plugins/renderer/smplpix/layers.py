@@ -78,7 +78,7 @@ class Layer(nn.Module):
     def _of_batch(self, maps: Tensor) -> Tensor:
         """By the moments of the batch; these enter the running ones."""
         with torch.no_grad():
-            # not torch.native_batch_norm, whose sums lose a third of their digits where channels lie last
+            # not torch.native_batch_norm: where channels lie last its sums lose digits to a large mean
             kind, count = self.gain.dtype, maps.numel() // maps.shape[1]
             mean = _sum(maps, kind) / count
             standard = maps - _channels(mean, maps)
@@ -117,8 +117,8 @@ class Layer(nn.Module):
 class FromGround(torch.autograd.Function):
     """relu(gain s + offset) less what that is on the empty ground, where maps are 0; s are the maps, standardised.
 
-    Autograd on the same formula takes five times as long: this reads the maps a few times, backwards too, and knows
-    that the moments, of the maps and of the ground, are functions of the maps.
+    Written by hand, since autograd of the same formula goes over the maps many times more. The moments, of the maps and
+    of the ground, are functions of the maps.
     """
 
     @staticmethod
@@ -156,7 +156,7 @@ def _channels(values: Tensor, maps: Tensor) -> Tensor:
 
 
 def _sum(maps: Tensor, kind: torch.dtype) -> Float[Tensor, " channels"]:
-    """Over all but channels; over rows it takes a third of the time where channels lie last."""
+    """Over all but channels; by rows, which lie one behind the other where channels lie last."""
     return maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]).sum(0, dtype=kind)
 
 

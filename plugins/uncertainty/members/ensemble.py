@@ -13,7 +13,7 @@ from framework.data import Batch
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError, UserError
-from framework.model import Model, Predictor, each_alone, of_its_own
+from framework.model import Kept, Model, Predictor, each_alone, of_its_own
 from framework.uncertainty import Joining, Several, Uncertainty
 from plugins.uncertainty.members.equal_mixture import equal_mixture
 from plugins.uncertainty.members.side_by_side import SideBySide
@@ -50,6 +50,7 @@ class Ensemble(Uncertainty, Joining, Several):
         self.trained = members
         self.members = members
         self.knobs = {"members": tuple(count for count in WORTH_TRYING if count <= members)}
+        self.kept: Kept[Sequence[Tensor]] = Kept()
         built = [model() for _ in range(members)]
         self.apart = nn.ModuleList()
         self.heads = nn.ModuleList()
@@ -93,13 +94,21 @@ class Ensemble(Uncertainty, Joining, Several):
     def _own_losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """Each member's of its own rows."""
         if self.together is None:
-            parts = zip(self._apart(), inputs.chunk(self.trained), target.chunk(self.trained), strict=True)
+            parts = zip(self._apart(), self._parts(inputs), target.chunk(self.trained), strict=True)
             return torch.cat([member.loss(given, wanted) for member, given, wanted in parts])
-        raw = self.together.own(inputs.unflatten(0, (self.trained, -1)))
+        raw = self._own_raw(inputs)
         wanted = target.unflatten(0, (self.trained, -1))
         if len(self.heads) == 1:
             return self._head(0).loss(raw, wanted).flatten()
         return torch.cat([self._head(index).loss(raw[index], wanted[index]) for index in range(self.trained)])
+
+    def _parts(self, inputs: Tensor) -> Sequence[Tensor]:
+        """Each member's own rows: the same tensors as long as `one_pass` keeps what is computed of them."""
+        return self.kept.of(inputs, lambda given: given.chunk(self.trained))
+
+    def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
+        assert self.together is not None
+        return self.together.own(inputs.unflatten(0, (self.trained, -1)))
 
     def clip_each(self, most: float) -> None:
         for member in self.apart:
@@ -109,8 +118,10 @@ class Ensemble(Uncertainty, Joining, Several):
 
     def training_densities(self, inputs: Tensor) -> Distribution:
         if self.together is not None:
-            return self._densities(self.together(inputs))
-        found = [member.training_densities(inputs) for member in self._apart()]
+            own = self.own_batches
+            return self._densities(self._own_raw(inputs).movedim(0, 1) if own else self.together(inputs))
+        parts = self._parts(inputs) if self.own_batches else [inputs] * self.trained
+        found = [member.training_densities(part) for member, part in zip(self._apart(), parts, strict=True)]
         return found[0] if len(found) == 1 else Stacked(found)
 
     @torch.no_grad()
