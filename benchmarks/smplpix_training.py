@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import smplpix_table as table
 from benchmarks.machine import machine
 from framework.configuration.loading import load, load_with_description, reader
 from framework.figures.style import GREEN, GREY, RED, titled_figure
@@ -73,13 +74,7 @@ METHODS = {
 DRAWN = {"points alone, 7k": RED, "over the mesh, 7k": GREEN}
 LINES = {"mesh, 7k": "-", "mesh, 27k": "--"}
 RIVAL = "mesh, 7k"
-COLUMNS = {
-    "psnr_db": ("PSNR, dB", 2),
-    "psnr_masked_db": ("inside", 2),
-    "ssim": ("SSIM", 4),
-    "ssim_masked": ("inside", 3),
-    "ms_ssim": ("MS-SSIM", 4),
-}
+COLUMNS = {key: told for key, told in table.COLUMNS.items() if not key.startswith("lpips")}
 
 
 def folder(method: Method, epochs: int, seed: int) -> Path:
@@ -187,6 +182,10 @@ def report(
             found = crossing([minutes(name, epochs) for epochs in budgets], curve, level)
             crossings.append(f"- {name}, {heading}: above the mesh of 7k {found}.")
     skins = [name for name in results if name.startswith("skins, ")]
+    missing = []
+    for name, method in METHODS.items():
+        left = [run for run in method.runs() if run not in results.get(name, {})]
+        missing += [f"{name}, {epochs} epochs, seed {seed}" for epochs, seed in left]
     return "\n".join(
         [
             "# Neural pixels against meshes, by training time (synthetic)",
@@ -208,8 +207,9 @@ def report(
             "From the left: photograph, mesh, points alone, network over the mesh (20 epochs); then where each is off.",
             "",
             *([f"## {SKINS}", "", *header, *rows(skins), ""] if skins else []),
+            *([f"Not run: {'; '.join(missing)}.", ""] if missing else []),
             f"{machine('torch', 'numpy')} Command: `python benchmarks/smplpix_training.py"
-            f"{' --skins <folder>' if skins else ''}`.",
+            f"{' --skins <folder>' if skins else ''}{' --there' if missing else ''}`.",
             "",
         ]
     )

@@ -159,6 +159,12 @@ def test_images_are_predicted_loaded_frozen_served_and_trained_further(
     assert len(parameters) > 10
     for name, weight in parameters.items():
         torch.testing.assert_close(further[name], weight, rtol=0, atol=1e-6)
+    other = framework(
+        *people(tmp_path), "encoder.slim.widths=[8,16]", f"checkpoint={done.folder}", folder="other"
+    )
+    assert other.code == 1
+    assert "belongs to another model" in other.out
+    assert not (other.folder / "run.json").exists()
 
 
 def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: Path) -> None:
