@@ -1,9 +1,8 @@
-"""The five heads on three classes of the embedded PASCAL3D+ (synthetic), as a committed table.
+"""Table 3.3 and the five heads on classes of the embedded PASCAL3D+ (synthetic), as a committed table.
 
-    python -m framework -m data.category=diningtable,bottle,car seed=0,1,2 threads=1 \\
-        experiment=pascal3d/fixed_kappa,pascal3d/von_mises,pascal3d/mixture,pascal3d/cvae,pascal3d/scvae \\
-        hydra.sweep.dir=outputs/sweeps/pascal3d
-    python benchmarks/pascal3d.py outputs/sweeps/pascal3d
+    python benchmarks/thesis_tables.py 3.3
+
+Or of sweeps that have run: `python benchmarks/pascal3d.py <their folders>`.
 
 The run time of one prediction is measured again by this script, every model alone on the machine: in a sweep the jobs
 disturb each other. Writes pascal3d.md beside this file.
@@ -56,7 +55,7 @@ def main() -> None:
     torch.set_num_threads(1)
     loaders: dict[str, Batches] = {}
     rows = []
-    for path in Path(sys.argv[1]).glob("*/results.json"):
+    for path in (path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")):
         row = json.loads(path.read_text(encoding="utf-8"))
         rows.append({**row, "milliseconds_per_sample": milliseconds(path.parent, loaders)})
     rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))

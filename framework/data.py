@@ -178,6 +178,22 @@ class Data(ABC):
         """One input as a person would see it: (height, width, 3) uint8."""
 
 
+class Mapped(ABC):
+    """What a data set derives from as well when the samples of one file are places (a volume's voxels), of which people
+    want maps."""
+
+    @abstractmethod
+    def write_maps(self, file: Path, point: Tensor, deviation: Tensor, folder: Path) -> Sequence[Path]:
+        """Write what is predicted for one file; called by `mode=predict`, after `read`. The files it wrote.
+
+        Args:
+            file: the user's.
+            point, deviation: (sample, number) of its samples in the order of `read`, in the target's unit: what is
+                predicted, and its standard deviation.
+            folder: where to write; exists, and others' maps may be there.
+        """
+
+
 def as_inputs(given: Any, shape: tuple[int, ...]) -> Tensor:
     """An array, or whatever NumPy makes one of, as a batch of inputs of `shape`; one input becomes a batch of one.
 

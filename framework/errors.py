@@ -25,6 +25,10 @@ class NonFiniteLoss(UserError):
     """The training loss became NaN or infinite; raised before the optimiser steps."""
 
 
+class NonFiniteAnswer(ValueError):
+    """Numbers that a network gives a density head hold NaN or infinity."""
+
+
 def shown(damage: object, most: int = 200) -> str:
     """What a file holds, or what a library says of it, for a message: cut, and without what steers a terminal."""
     text = " ".join(line.strip() for line in str(damage).splitlines())

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from functools import cached_property
 from typing import Literal
 
-from torch import Tensor
+from torch import Size, Tensor, stack
 from torch.distributions import Distribution
 
 from framework.data import Batch, Frame
@@ -90,6 +90,22 @@ class Prediction:
         """The prediction of least expected absolute deviation (eq. 3.23-3.24), shaped like the target."""
         with self._draw("point"):
             return median(self.density, self.samples)
+
+    def interval(self, mass: float, draws: int = 999) -> Tensor:
+        """The middle `mass` of the draws of each real, (2, batch, number): lower and upper ends."""
+        with self._draw("interval"):
+            drawn = self.density.sample(Size((draws,))).sort(0).values
+        # of n sorted draws the i-th is the quantile i / (n + 1)
+        below = min(draws // 2, max(0, round((1 - mass) / 2 * (draws + 1)) - 1))
+        return stack([drawn[below], drawn[-1 - below]])
+
+    def deviation(self, draws: int = 999) -> Tensor:
+        """The standard deviation of each real, (batch, number); of draws where the density does not know its own."""
+        try:
+            return self.density.stddev
+        except NotImplementedError:
+            with self._draw("deviation"):
+                return self.density.sample(Size((draws,))).std(0)
 
     def marginal(self, index: int) -> Distribution:
         """The density of one number of the target."""

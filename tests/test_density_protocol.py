@@ -182,17 +182,23 @@ def log_mixed(name: str, made: Made, log_prob) -> Tensor | None:
     simple = item_of(name, made, log_prob)
     if simple is not None:
         return simple
-    parts = torch.stack([log_prob(part, made.value) for part in made.parts], -1).exp()
+    logs = torch.stack([log_prob(part, made.value) for part in made.parts], -1)
+    parts = logs.exp()
+    top = logs.amax(
+        -1, keepdim=True
+    )  # far from every part a density is 0 in floating point, its logarithm is not
+    shifted = (logs - top).exp()
     match name:
         case "mixture":
-            return (share(made.weights) * parts).sum(-1).log()
+            return (share(made.weights) * shifted).sum(-1).log() + top[:, 0]
         case "mixture of mixtures":
-            inner = (share(made.weights) * parts).sum(-1)
+            inner = (share(made.weights) * shifted).sum(-1)
             outer = share(made.weights[:, :2])
-            return (outer[:, 0] * inner + outer[:, 1] * parts[:, 1]).log()
+            return (outer[:, 0] * inner + outer[:, 1] * shifted[:, 1]).log() + top[:, 0]
         case "mixture of a fold":
-            both = log_prob(made.parts[0], made.value[:2].repeat_interleave(2, 0)).reshape(2, 2).exp()
-            return (share(made.weights[:2, :2]) * both).sum(-1).log()
+            both = log_prob(made.parts[0], made.value[:2].repeat_interleave(2, 0)).reshape(2, 2)
+            top = both.amax(-1)
+            return (share(made.weights[:2, :2]) * (both - top.unsqueeze(-1)).exp()).sum(-1).log() + top
         case "floored":
             count = len(made.target.names)
             uniform = 1 / count if made.target.kind == "class" else everywhere(made.parts[0], made.value)
@@ -353,7 +359,8 @@ def errors(kind: str, made: Made, found) -> None:
     parts = [estimate(part, made.value) for part in made.parts]
     error = torch.stack([part.standard_error for part in parts], -1)
     count = torch.stack([part.samples for part in parts], -1)
-    term = torch.stack([part.log_mean for part in parts], -1).exp()
+    logs = torch.stack([part.log_mean for part in parts], -1)
+    term = logs.exp()
     if kind in ("itself", "with a set", "mixture of one", "moved there and back"):
         wanted, samples = error[:, 0], count[:, 0]
     elif kind == "stacked":
@@ -361,7 +368,7 @@ def errors(kind: str, made: Made, found) -> None:
     elif kind == "reshaped":
         wanted, samples = error[:, 0].reshape(2, 2), count[:, 0].reshape(2, 2)
     elif kind == "mixture":
-        term = share(made.weights) * term
+        term = share(made.weights) * (logs - logs.amax(-1, keepdim=True)).exp()
         wanted, samples = (term * error).square().sum(-1).sqrt() / term.sum(-1), count.sum(-1)
     elif kind == "floored":
         wanted, samples = 0.9 * term[:, 0] * error[:, 0] / found.log_mean.exp(), count[:, 0]

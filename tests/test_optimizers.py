@@ -2,13 +2,16 @@
 
 import copy
 import math
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import pytest
+import pytorch_lightning as pl
 import torch
+from pytorch_lightning.plugins.precision import MixedPrecision
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
+from framework.configuration.assembly import build_predictor, resolve_all
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch
@@ -19,7 +22,8 @@ from framework.model import FrozenFrontEnd, Model, Predictor, one_pass
 from framework.objective import Objective, Rival
 from framework.target import Target
 from framework.testing.wrappers import LENGTH, Plain
-from framework.training.module import Training
+from framework.training.batches import Batches
+from framework.training.module import FUSED, OPTIMIZERS, Training
 from framework.training.schedules import schedule, see
 
 
@@ -35,6 +39,7 @@ def test_settings_reach_the_optimiser(
     settings = OptimizerSettings(name=name, learning_rate=0.25, weight_decay=0.5, momentum=momentum)
     data = build("data", resolve("data", {"name": "moons"}))
     training = Training(Plain(Target("real", ("x",))), [], data, settings, 0, {})
+    training.trainer = pl.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     monkeypatch.setattr(training, "_planned_steps", lambda: (10, 5))
     made = training.configure_optimizers()["optimizer"]
     (group,) = made.param_groups
@@ -114,6 +119,7 @@ def test_a_rival_steps_as_by_an_optimiser_of_its_own(
     twins = copy.deepcopy((predictor, objective))
     settings = OptimizerSettings(name="adamw", learning_rate=0.01, weight_decay=0.1)
     training = Training(predictor, [objective], data, settings, 0, {})
+    training.trainer = pl.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     monkeypatch.setattr(training, "_planned_steps", lambda: (6, 3))
     made = training.configure_optimizers()
     first = torch.optim.AdamW(twins[0].parameters(), lr=0.01, weight_decay=0.1, fused=True)
@@ -231,3 +237,59 @@ def test_fixed_features_are_computed_once_a_step(direct: bool, wrapper: str | No
     front(inputs)
     front(inputs)
     assert first.calls == 4
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*lr_scheduler.step:UserWarning")
+@pytest.mark.parametrize("algorithm", ["norm", "value"])
+@pytest.mark.parametrize("precision", ["32-true", "64-true", "bf16-mixed", "16-mixed"])
+@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_gradients_are_clipped_in_every_precision(
+    name: str, members: int, precision: Any, algorithm: str
+) -> None:
+    """A step of SGD is as long as the clipped gradient; any other optimiser steps, and is fused where it may be."""
+    config = {
+        "data": "moons",
+        "encoder": {"mlp": {"name": "mlp", "widths": [8]}},
+        "density_head": "bernoulli",
+        "uncertainty": {"ensemble": {"name": "ensemble", "members": members}} if members > 1 else {},
+    }
+    resolved = resolve_all(config)
+    data = build("data", resolved["data"])
+    data.prepare()
+    most, rate = 1e-3, 0.5
+    training = Training(
+        build_predictor(resolved, data.target, (2,), 0),
+        [],
+        data,
+        OptimizerSettings(name=name, learning_rate=rate, weight_decay=0.0),  # pyright: ignore[reportArgumentType]
+        0,
+        {},
+    )
+    before = [parameter.detach().clone() for parameter in training.parameters()]
+    batches = Batches(data, batch_size=32, workers=0, seed=0)
+    scaled = MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        # by its name Lightning gives it to GPUs alone
+        **({"plugins": [scaled]} if precision == scaled.precision else {"precision": precision}),
+        max_steps=1,
+        gradient_clip_val=most,
+        gradient_clip_algorithm=algorithm,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        limit_val_batches=0,
+    )
+    batches.attach(trainer)
+    trainer.fit(training, datamodule=batches)
+    moved = [now.detach() - then for now, then in zip(training.parameters(), before, strict=True)]
+    assert any(bool(one.any()) for one in moved)
+    fused = name in FUSED and precision != scaled.precision
+    assert bool(trainer.optimizers[0].defaults.get("fused")) == fused
+    if name == "sgd" and algorithm == "value":
+        assert max(float(one.abs().max()) for one in moved) == pytest.approx(rate * most, rel=1e-3)
+    elif name == "sgd":
+        each = torch.cat([one.double().reshape(members, -1) for one in moved], 1).norm(dim=1)
+        torch.testing.assert_close(each, torch.full_like(each, rate * most), rtol=1e-3, atol=0)

@@ -1,12 +1,16 @@
 """`mode=check` finds every planted fault, and nothing in the sound heads that they are planted in."""
 
+import math
+
 import pytest
 import torch
+from torch.distributions import MultivariateNormal
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.target import Target
 from framework.testing.adaptive import boxes
+from framework.testing.densities import integral_by_draws
 from framework.testing.finding import Worst, require
 from framework.testing.heads import HeadSubject
 from framework.testing.precision import reference
@@ -35,6 +39,25 @@ def test_the_sound_head_passes_and_every_property_has_a_fault_of_its_own(target:
     findings = list(Fault("none", target, {}).findings())
     require(*findings)
     assert {finding.name for finding in findings} <= ALONE
+
+
+@pytest.mark.parametrize("size", [3, 15])
+def test_a_normal_of_many_numbers_integrates_to_one(size: int) -> None:
+    """And one that is a fiftieth off does not."""
+    torch.manual_seed(0)
+    root = torch.randn(6, size, size, dtype=torch.float64).tril(-1) + torch.eye(size)
+
+    def error(factor: float) -> float:
+        class Off(MultivariateNormal):
+            def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+                return super().log_prob(value) + math.log(factor)
+
+        worst = Worst()
+        integral_by_draws(Off(torch.zeros(6, size).double(), scale_tril=root), worst)
+        return worst.error
+
+    assert error(1.0) < 5
+    assert error(1.02) > 6
 
 
 @pytest.mark.parametrize("name", ["scvae", "cvae"])

@@ -494,3 +494,15 @@ def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: 
     resumed = framework(f"resume={killed.folder}")
     assert resumed.code == 2, resumed.out
     assert "If that is where you keep runs, say so: add logger.uri=https://attacker.example" in resumed.out
+
+
+def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> None:
+    """As in half precision, whose numbers end at 65,504."""
+    done = framework(
+        *("experiment=moons/vanilla_128", "debug=fast", "logger=none", "pictures=false"),
+        *("trainer.precision=16-true", "optimizer.learning_rate=1e3"),
+    )
+    assert done.code == 1
+    assert "the network's raw numbers are not finite in batch row" in done.out
+    assert "trainer.precision=32-true" in done.out
+    assert "Traceback" not in done.out

@@ -112,6 +112,22 @@ def test_what_prints_alike_is_equally_good() -> None:
     assert "**1.30**" not in text
 
 
+@pytest.mark.parametrize("suffix", ["_std", "_sem"])
+@pytest.mark.parametrize(("spreads", "bold"), [((0.1, 0.1), True), ((0.1, 0.2), False), ((0.3, 0.0), False)])
+def test_nothing_is_best_within_the_error_of_a_difference(
+    suffix: str, spreads: tuple[float, float], bold: bool
+) -> None:
+    first, second = spreads
+    rows = [
+        {"method": "a", "error": 1.0, f"error{suffix}": first},
+        {"method": "b", "error": 1.2, f"error{suffix}": second},
+        {"method": "c", "error": 9.0, f"error{suffix}": 0.1},
+    ]
+    for turned in (rows, rows[::-1]):
+        text = markdown(turned, {"method": "method", "error": "error"}, better={"error": "lower"})
+        assert ("**" in text) == bold
+
+
 def test_of_one_row_nothing_is_best() -> None:
     assert "**" not in markdown(ROWS[:1], COLUMNS, better={"log_likelihood": "higher"})
 

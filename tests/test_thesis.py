@@ -100,6 +100,12 @@ SAID = {
         "data.validation_share": 0,
         "encoder.voxnet.dropout": None,  # 0.8 and 0.6: PUBLISHED of the plugin
     },
+    "cest/mlp": {
+        "data.preset": "ten",
+        "encoder.mlp.widths": [100, 100],
+        "encoder.mlp.activation": "elu",
+        "density_head.name": "gaussian",
+    },
     "registration/large data.body=null": {
         "optimizer.name": "sgd",
         "optimizer.momentum": 0.9,

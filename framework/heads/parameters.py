@@ -6,21 +6,22 @@ import torch
 from torch import Tensor
 
 from framework.density_head import DensityHead
-from framework.errors import ConfigError
+from framework.errors import ConfigError, NonFiniteAnswer
 
 
 def require_finite(raw: Tensor, size: int) -> Tensor:
     """`raw` (*batch, size) itself, half precision upcast to float32.
 
     Raises:
-        ValueError: another last dimension, or a number that is not finite; names the first such batch row.
+        ValueError: another last dimension.
+        NonFiniteAnswer: a number that is not finite, also a ValueError; names the first such batch row.
     """
     if raw.shape[-1] != size:
         raise ValueError(f"raw numbers of shape {tuple(raw.shape)}; wanted {size} in the last dimension.")
     # a finite sum has no summand that is not; one pass, where heads of very many numbers notice a second
     if not math.isfinite(float(raw.detach().sum())) and not raw.isfinite().all():
         row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
-        raise ValueError(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
+        raise NonFiniteAnswer(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
     return raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
 
 

@@ -1,24 +1,26 @@
 """mode=predict: a CSV of point predictions and uncertainties for a user's own files, or for the test split; images as
-PNG files beside it."""
+PNG files beside it, and maps where the data set draws them."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
-from framework.data import Data
+from framework.data import Data, Mapped
 from framework.datasets.fields import as_batch
 from framework.datasets.png import png
 from framework.distributions.noise import Draw
 from framework.errors import DataError
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
-from framework.prediction import answers
+from framework.prediction import answers, named
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, to_read
@@ -27,24 +29,28 @@ from framework.training.batches import told
 
 
 class PredictOptions(Options):
-    """What to predict for: a file or a folder of files, or the test split."""
+    """What to predict for: a file or a folder of files, or the test split; and the mass of intervals of reals."""
 
     files: str | None = None
+    interval: Annotated[float, Field(gt=0, lt=1)] | None = None
 
 
 def run(config: Config) -> None:
     """Write predictions.csv into the run folder."""
-    wanted = config.options(PredictOptions).files
-    files = _files(Path(wanted).expanduser()) if wanted else []
+    options = config.options(PredictOptions)
+    files = _files(Path(options.files).expanduser()) if options.files else []
     session = for_trained(config, prepare=not files)
+    if options.interval:
+        session.target.require("real", by="mode.interval")
     bad: list[Path] = []
     if len(files) > 1:
         files, bad = to_read(session.data, files, session.parts["data"], session.console)
     with opened(session.config) as run:
         if bad:
             (run.folder / UNREADABLE).write_text("".join(f"{file}\n" for file in bad), encoding="utf-8")
-        rows = predictions(
-            session.predictor, session.data, session.target, files, session.settings, run.folder / "images"
+        images = run.folder / "images"
+        rows, mapped = predictions(
+            session.predictor, session.data, session.target, files, session.settings, images, options.interval
         )
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
@@ -53,6 +59,10 @@ def run(config: Config) -> None:
             writer.writerows(rows)
         run.tracker.log_artifact(path)
         session.console.print(f"{len(rows)} predictions in {path}", soft_wrap=True)
+        if isinstance(session.data, Mapped) and mapped:
+            for written in _maps(session.data, files, mapped, run.folder / "maps"):
+                run.tracker.log_artifact(written, "maps")
+            session.console.print(f"maps in {run.folder / 'maps'}", soft_wrap=True)
 
 
 def _files(path: Path) -> list[Path]:
@@ -74,8 +84,10 @@ def predictions(
     files: Sequence[Path],
     settings: Settings,
     images: Path,
-) -> list[dict[str, str]]:
-    """One row a sample: its name, the point prediction, and the entropy of the density in nats.
+    mass: float | None = None,
+) -> tuple[list[dict[str, str]], list[tuple[Tensor, Tensor]]]:
+    """One row a sample: its name, the point prediction, intervals of that mass, and the density's entropy in nats. And
+    of each batch, where maps are drawn, what is predicted with its standard deviation, (batch, number).
 
     Predicted images are written into the folder `images`; the row names the file.
     """
@@ -83,9 +95,16 @@ def predictions(
     loader = DataLoader(dataset, batch_size=BLOCK, collate_fn=as_batch)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
+    mapped: list[tuple[Tensor, Tensor]] = []
     for number, batch in enumerate(told(loader, "predicting")):
         prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
-        columns = answers(target, prediction.in_frame(data.frame(batch)))
+        prediction = prediction.in_frame(data.frame(batch))
+        columns = answers(target, prediction)
+        if isinstance(data, Mapped) and files:
+            mapped.append((prediction.point.cpu(), prediction.deviation().cpu()))
+        if mass:
+            for end, values in zip(("_low", "_high"), prediction.interval(mass), strict=True):
+                columns |= named(target, values, end)
         for row in range(len(batch["index"])):
             values = {key: _text(column[row]) for key, column in columns.items()}
             if target.kind == "class":
@@ -96,7 +115,17 @@ def predictions(
                 file.write_bytes(png(prediction.image("color")[row]))
                 values = {"image": f"{images.name}/{file.name}", **values}
             rows.append({"sample": names[len(rows)], **values})
-    return rows
+    return rows, mapped
+
+
+def _maps(
+    data: Mapped, files: Sequence[Path], mapped: Sequence[tuple[Tensor, Tensor]], folder: Path
+) -> Iterator[Path]:
+    folder.mkdir(exist_ok=True)
+    counts = [len(data.read([file])) for file in files]  # type: ignore[attr-defined]
+    parts = (torch.cat(part).split(counts) for part in zip(*mapped, strict=True))
+    for file, point, deviation in zip(files, *parts, strict=True):
+        yield from data.write_maps(file, point, deviation, folder)
 
 
 def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:

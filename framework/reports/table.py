@@ -22,7 +22,7 @@ Row = Mapping[str, object]
 were generated."""
 
 Better = Mapping[str, Literal["higher", "lower"]]
-"""Which way a column is better; its best value stands in bold."""
+"""Which way a column is better; its best value stands in bold where no other is within their ± together."""
 
 COST_COLUMNS = {
     "milliseconds_per_sample": "ms / sample",
@@ -191,9 +191,15 @@ def _lines(
         if key not in better or len(values) < 2:
             continue
         best = {"higher": max, "lower": min}[better[key]](values, key=values.__getitem__)
-        for place in values:
-            # what prints alike is equally good
-            if lines[place][index].plain == lines[best][index].plain:
+        # what prints alike is equally good
+        alike = [place for place in values if lines[place][index].plain == lines[best][index].plain]
+        spreads = [_spread(row, key) or 0.0 for row in rows]
+        if all(
+            abs(values[best] - value) > math.hypot(spreads[best], spreads[place])
+            for place, value in values.items()
+            if place not in alike
+        ):
+            for place in alike:
                 lines[place][index].stylize("bold")
     heads = [Text(head) for head in columns.values()]
     if origin:
@@ -211,9 +217,16 @@ def _cell(row: Row, key: str) -> str:
         return "yes" if value else "no"
     if not isinstance(value, SupportsFloat):
         return str(value)
-    spreads = [_number(row.get(key + suffix)) for suffix in SPREADS]
-    spread = next((spread for spread in spreads if spread is not None), math.nan)
-    return format_number(int(value) if isinstance(value, Integral) else float(value), spread)
+    spread = _spread(row, key)
+    return format_number(
+        int(value) if isinstance(value, Integral) else float(value), math.nan if spread is None else spread
+    )
+
+
+def _spread(row: Row, key: str) -> float | None:
+    """What stands behind ±."""
+    spreads = (_number(row.get(key + suffix)) for suffix in SPREADS)
+    return next((spread for spread in spreads if spread is not None), None)
 
 
 def _number(value: object) -> float | None:

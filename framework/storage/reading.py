@@ -67,13 +67,13 @@ def room(size: int) -> int:
 
 
 def inflated(data: bytes, most: int, *, part: bool = False) -> bytes:
-    """What zlib compressed; `part`: the first `most` bytes of it will do.
+    """What zlib or gzip compressed; `part`: the first `most` bytes of it will do.
 
     Raises:
         ValueError: it is cut short, or more than `most` bytes.
         zlib.error: it is damaged.
     """
-    unpacker = zlib.decompressobj()
+    unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)  # either header
     found = unpacker.decompress(data, most if part else most + 1)
     if not part and (len(found) > most or not unpacker.eof):
         raise ValueError(f"what is compressed is cut short, or unfolds to more than {most} bytes")

@@ -113,17 +113,18 @@ def integral(density: Distribution, worst: Worst) -> None:
 
 
 def integral_by_draws(density: Distribution, worst: Worst) -> None:
-    """E_p[q/(p + q)] over draws is E_q[p/(p + q)], q the normal of the draws' covariance; in standard errors.
+    """E_p[q/(p + q)] over draws is E_q[p/(p + q)], q the normal of other draws' covariance; in standard errors.
 
-    Both are ∫ pq/(p + q) if p is normalised and drawn from; what is averaged lies in [0, 1], whatever the tails.
+    Both are ∫ pq/(p + q) if p is normalised and drawn from; what is averaged lies in [0, 1], whatever the tails. Were
+    q fitted to the draws that are averaged, it would be too high there, by some standard errors of ten numbers.
     """
-    drawn = density.sample(torch.Size((DRAWS,))).double()
+    others, drawn = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
     support = density.support
     circular = isinstance(support, Circular)
-    center = density.mode.double() if circular else drawn.mean(0)
-    offset = wrap(drawn - center) if circular else drawn - center
-    shift = offset.mean(0)
-    _, root = torch.linalg.qr((offset - shift).movedim(0, 1) / DRAWS**0.5)  # (rows, numbers, numbers)
+    center = density.mode.double() if circular else others.mean(0)
+    offset, other = (wrap(part - center) if circular else part - center for part in (drawn, others))
+    shift = other.mean(0)
+    _, root = torch.linalg.qr((other - shift).movedim(0, 1) / DRAWS**0.5)  # (rows, numbers, numbers)
     normal = torch.randn(DRAWS, *offset.shape[1:], dtype=torch.float64)
     volume = root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
 from framework.distributions.noise import seed_step
-from framework.errors import NonFiniteLoss
+from framework.errors import NonFiniteAnswer, NonFiniteLoss
 from framework.model import FrozenFrontEnd, Predictor, one_pass
 from framework.objective import Objective, Rival
 from framework.tracking.signals import Stopper
@@ -23,14 +23,15 @@ from framework.training.ranks import Share, WholeBatch, gathered, share, summed
 from framework.training.schedules import schedule, see, smooth
 from framework.uncertainty import outermost, own_batches
 
-# fused: one pass over the memory of each parameter instead of several, half the time of a small network's step
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
-    "adam": partial(torch.optim.Adam, fused=True),
-    "adamw": partial(torch.optim.AdamW, fused=True),
-    "sgd": partial(torch.optim.SGD, fused=True),
+    "adam": torch.optim.Adam,
+    "adamw": torch.optim.AdamW,
+    "sgd": torch.optim.SGD,
     "nadam": torch.optim.NAdam,
     "radam": torch.optim.RAdam,
 }
+FUSED = ("adam", "adamw", "sgd")
+"""One pass over the memory of each parameter instead of several, half the time of a small network's step."""
 
 
 class Training(pl.LightningModule):
@@ -79,7 +80,7 @@ class Training(pl.LightningModule):
         own = own_batches(self.learner) if self._orders() > 1 else nullcontext()
         with WholeBatch(rows) if rows else own, one_pass(self.learner):
             batch = self.augment(batch)
-            losses = self.learner.loss(batch["input"], batch["target"])
+            losses = self._losses(batch)
             loss = losses.mean()
             for objective in self.objectives:
                 loss = loss + objective(self.learner, batch)
@@ -92,6 +93,16 @@ class Training(pl.LightningModule):
             raise NonFiniteLoss(self._blame(losses, batch, value))
         self.last_loss = value
         return loss
+
+    def _losses(self, batch: Batch) -> Tensor:
+        try:
+            return self.learner.loss(batch["input"], batch["target"])
+        except NonFiniteAnswer as answer:
+            raise NonFiniteLoss(
+                f"After step {self.global_step} (epoch {self.current_epoch}) the network's {answer} Earlier "
+                "checkpoints are kept. Lower optimizer.learning_rate, set trainer.gradient_clip_val, or train in "
+                "trainer.precision=32-true."
+            ) from answer
 
     def _orders(self) -> int:
         """How many models' batches a batch holds, one after the other (training.batches)."""
@@ -108,7 +119,7 @@ class Training(pl.LightningModule):
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         rows = self._share(batch)
         with WholeBatch(rows) if rows else nullcontext():
-            loss = self.learner.loss(batch["input"], batch["target"]).mean()
+            loss = self._losses(batch).mean()
         count = len(batch["target"])
         if rows:  # by rows here, since Lightning averages the ranks' numbers of rows as whole numbers
             loss, count = summed(loss * rows.count) / rows.whole, rows.whole
@@ -116,7 +127,12 @@ class Training(pl.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         chosen = self.optimizer_settings
-        momentum = {} if chosen.momentum is None else {"momentum": chosen.momentum}
+        more: dict[str, Any] = {} if chosen.momentum is None else {"momentum": chosen.momentum}
+        scaler = getattr(getattr(self.trainer, "precision_plugin", None), "scaler", None)
+        if (
+            chosen.name in FUSED and scaler is None
+        ):  # else a fused one would unscale gradients after they are clipped
+            more["fused"] = True
         groups: list[dict[str, Any]] = [{"params": self._own()}]
         groups += [
             {
@@ -128,7 +144,7 @@ class Training(pl.LightningModule):
             for one, rival in self._rivals()
         ]
         optimizer = OPTIMIZERS[chosen.name](
-            groups, lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **momentum
+            groups, lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **more
         )
         total, epoch = self._planned_steps()
         factors = [schedule(chosen, total, epoch)]
@@ -159,14 +175,15 @@ class Training(pl.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """As Lightning does, but each rival's gradients by themselves, and those of models that train together."""
-        several = outermost(self.predictor)
-        if several is not None and gradient_clip_val and gradient_clip_algorithm != "value":
-            several.clip_each(gradient_clip_val)
-        elif not self._rivals() or not gradient_clip_val:
-            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
+        """As Lightning does, but each rival's gradients by themselves, and those of models that train together; of
+        fused optimisers in mixed precision too, which Lightning refuses."""
+        if not gradient_clip_val:
             return
-        clipped = set(several.parameters()) if isinstance(several, nn.Module) else set()
+        clipped: set[nn.Parameter] = set()
+        several = outermost(self.predictor)
+        if isinstance(several, nn.Module) and gradient_clip_algorithm != "value":
+            several.clip_each(gradient_clip_val)
+            clipped = set(several.parameters())
         for group in optimizer.param_groups:
             if gradient_clip_algorithm == "value":
                 nn.utils.clip_grad_value_(group["params"], gradient_clip_val)

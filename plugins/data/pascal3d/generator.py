@@ -24,6 +24,8 @@ from plugins.data.pascal3d.scene import Shot, Thing, shoot
 VERSION = 1
 """Of the generator; a change in what it draws or writes takes a new number, and with it a new folder."""
 SHARES = {"imagenet_train": 0.4, "imagenet_val": 0.2, "pascal_train": 0.2, "pascal_val": 0.2}
+SAVING = Lock()
+"""SciPy's writers of MATLAB files share the tag that they write sizes with: two at once write each other's."""
 HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)  # SciPy's holds the date
 
 
@@ -100,7 +102,8 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
     from scipy.io import savemat  # a quarter of a second, for those alone who generate
 
     content = io.BytesIO()
-    savemat(content, {"record": record}, do_compression=True)
+    with SAVING:
+        savemat(content, {"record": record}, do_compression=True)
     (part / "Annotations" / folder / f"{name}.mat").write_bytes(HEADER + content.getvalue()[len(HEADER) :])
 
 

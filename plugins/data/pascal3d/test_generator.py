@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from framework.storage import generated
 from plugins.data.pascal3d import generator, shapes
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import CLASSES
-from plugins.data.pascal3d.scene import View, camera_of, draw, outline, shoot, window
+from plugins.data.pascal3d.scene import Shot, Thing, View, camera_of, draw, outline, shoot, window
 from plugins.data.pascal3d.shapes import Mesh
 from plugins.data.pascal3d.viewpoints import LEVELS, QUANTILES, viewpoint
 
@@ -368,3 +369,35 @@ def test_pictures_hold_what_the_protocol_leaves_out(renderer: Renderer) -> None:
         assert 0 <= left <= right < shot.pixels.shape[1]
         assert 0 <= top <= bottom < shot.pixels.shape[0]
         assert thing.symmetry == FAMILIES[thing.category].symmetry
+
+
+def test_annotations_written_at_once_are_those_written_one_after_the_other(
+    tmp_path: Path,
+) -> None:
+    """Threads change places every microsecond; SciPy's writers share a tag."""
+    pixels = np.zeros((8, 9, 3), np.uint8)
+    view = View(10.0, 20.0, 0.0, 3.0, 100.0, (4.0, 4.0))
+    things = [
+        Thing(name, view, (1, 2, 3, 4), False, False, False, True, 0) for name in ("car", "aeroplane", "tv")
+    ]
+    for when in ("alone", "together"):
+        for kind in ("Annotations", "Images"):
+            (tmp_path / when / kind / "car_pascal").mkdir(parents=True)
+
+    def save(when: str, number: int) -> None:
+        shot = Shot(pixels, things[: 1 + number % 3], 0.0)
+        generator._save(tmp_path / when, "car_pascal", f"{number:03d}", shot)
+
+    for number in range(240):
+        save("alone", number)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        generated.draw_all(240, lambda number: save("together", number), "annotations")
+    finally:
+        sys.setswitchinterval(before)
+    alone, together = (
+        sorted((tmp_path / when / "Annotations").rglob("*.mat")) for when in ("alone", "together")
+    )
+    assert len(alone) == 240
+    assert [file.read_bytes() for file in alone] == [file.read_bytes() for file in together]

@@ -12,12 +12,12 @@ from torch.distributions import Categorical, Distribution
 
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
+from framework.distributions.normals import IndependentNormals
 from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.trees.forest import frequencies, leaves
 from plugins.density_head.trees.heads_without_gradient import (
     FLOOR,
-    IndependentNormals,
     load_any_shape,
     require_fitted,
     require_no_angle,

@@ -6,38 +6,13 @@ from typing import Any
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
-from torch.distributions import Independent, Normal
 
-from framework.distributions.protocol import median
 from framework.errors import ConfigError, UserError
 from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FLOOR = 1e-4
 """The least standard deviation of a density over reals, in those of the training targets where `Target` has them."""
-
-
-class IndependentNormals(Independent):
-    """Normal densities of several reals, independent of one another; unlike torch's own also of an empty batch.
-
-    Args:
-        mean, scale: (*batch, number).
-    """
-
-    def __init__(self, mean: Tensor, scale: Tensor) -> None:
-        super().__init__(Normal(mean, scale, validate_args=False), 1, validate_args=False)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        return self.base_dist.log_prob(value).sum(-1)
-
-    def entropy(self) -> Tensor:
-        return self.base_dist.entropy().sum(-1)
-
-
-@median.register
-def _(density: IndependentNormals, samples: int) -> Tensor:
-    # each is symmetric about its mean
-    return density.mean
 
 
 def require_no_angle(target: Target, by: str) -> None:

@@ -9,13 +9,13 @@ from scipy import stats
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
+from framework.distributions.normals import IndependentNormals
 from framework.distributions.protocol import mahalanobis, marginal, median, normals, pick
 from framework.distributions.tempering import temper
 from framework.errors import ConfigError, UserError
 from framework.model import Model
 from framework.target import Target
 from plugins.density_head.trees.heads_without_gradient import (
-    IndependentNormals,
     load_any_shape,
     single,
     with_gradient_of_0,

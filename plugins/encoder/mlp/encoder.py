@@ -16,17 +16,18 @@ Probability = Annotated[float, Field(ge=0, lt=1)]
 
 
 class MLP(Encoder):
-    """Fully connected layers with ReLU; flattens whatever comes in.
+    """Fully connected layers; flattens whatever comes in.
 
-    Each layer is linear, batch norm where asked for, ReLU, dropout; with `batch_norm="after_relu"` linear, ReLU, batch
-    norm, dropout, the blocks of thesis §6.5.1.
+    Each layer is linear, batch norm where asked for, ReLU or ELU (Clevert et al. 2016), dropout; with
+    `batch_norm="after_relu"` linear, units, batch norm, dropout, the blocks of thesis §6.5.1.
 
     Args:
         input_shape: any; a sample is flattened.
         widths: output length of each layer; with an empty list the features are the flattened input.
         dropout: probability of dropping an output of a layer; one for all layers, or one for each.
-        batch_norm: whether to normalise over the batch, before ReLU or after it; training then needs batches of at
-            least two.
+        batch_norm: whether to normalise over the batch, before the units or after them; training then needs batches of
+            at least two.
+        activation: rectified, or exponential linear units.
 
     Raises:
         ConfigError: a sample holds no numbers, or there are more or fewer probabilities than layers.
@@ -48,6 +49,7 @@ class MLP(Encoder):
         widths: list[Width] = [512, 512],  # noqa: B006 - never written
         dropout: Probability | list[Probability] = 0.0,
         batch_norm: bool | Literal["after_relu"] = False,
+        activation: Literal["relu", "elu"] = "relu",
     ) -> None:
         super().__init__()
         length = math.prod(input_shape)
@@ -64,10 +66,11 @@ class MLP(Encoder):
             )
         layers: list[nn.Module] = []
         before, after = batch_norm is True, batch_norm == "after_relu"
+        units = {"relu": nn.ReLU, "elu": nn.ELU}[activation]
         for width, drop in zip(widths, drops, strict=True):
             layers.append(nn.Linear(length, width, bias=not before))  # batch norm behind it has its own
             layers += [nn.BatchNorm1d(width)] * before
-            layers.append(nn.ReLU(inplace=True))
+            layers.append(units(inplace=True))
             layers += [nn.BatchNorm1d(width)] * after
             layers.append(nn.Dropout(drop))
             length = width
@@ -77,7 +80,8 @@ class MLP(Encoder):
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         numbers = inputs.flatten(1)
-        dtype = next((parameter.dtype for parameter in self.parameters()), torch.get_default_dtype())
+        own = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
+        dtype = next((parameter.dtype for parameter in self.parameters()), own)
         if inputs.dtype == torch.uint8:
             numbers = numbers.to(dtype) / 255
         return self.layers(numbers.to(dtype))

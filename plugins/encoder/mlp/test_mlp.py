@@ -20,19 +20,21 @@ def by_hand(encoder, inputs):
             numbers = numbers * state[f"layers.{index}.weight"] + state[f"layers.{index}.bias"]
         elif isinstance(layer, torch.nn.ReLU):
             numbers = np.maximum(numbers, 0)
+        elif isinstance(layer, torch.nn.ELU):
+            numbers = np.where(numbers > 0, numbers, np.expm1(np.minimum(numbers, 0)))
     return numbers
 
 
+@pytest.mark.parametrize("activation, units", [("relu", "ReLU"), ("elu", "ELU")])
 @pytest.mark.parametrize("batch_norm", [False, True, "after_relu"])
 @pytest.mark.parametrize("shape, widths", [((7,), [5]), ((3, 4, 2), [16, 8, 4]), ((1,), [1]), ((2, 3), [])])
-def test_agrees_with_numpy(shape, widths, batch_norm):
+def test_agrees_with_numpy(shape, widths, batch_norm, activation, units):
     torch.manual_seed(0)
-    config = resolve("encoder", {"name": "mlp", "widths": widths, "batch_norm": batch_norm, "dropout": 0.3})
+    chosen = {"widths": widths, "batch_norm": batch_norm, "dropout": 0.3, "activation": activation}
+    config = resolve("encoder", {"name": "mlp", **chosen})
     encoder = build("encoder", config, input_shape=shape)
     kinds = [type(layer).__name__ for layer in encoder.layers]
-    order = {False: ["ReLU"], True: ["BatchNorm1d", "ReLU"], "after_relu": ["ReLU", "BatchNorm1d"]}[
-        batch_norm
-    ]
+    order = {False: [units], True: ["BatchNorm1d", units], "after_relu": [units, "BatchNorm1d"]}[batch_norm]
     assert kinds == ["Linear", *order, "Dropout"] * len(widths)
     encoder(torch.randn(50, *shape) * 3 + 1)  # gives the running moments something to hold
     inputs = torch.randn(6, *shape)

@@ -105,48 +105,69 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
         weights: by the squared distances of a point, and of the nearest one.
     """
     height, width = picture.shape[1:]
-    longest = len(weights)
-    radius = around[-1, 0]
-    away = np.empty(len(around), np.int64)
-    factor = np.empty(len(around))
-    for place in range(len(around)):
-        away[place] = around[place, 0] ** 2 + around[place, 1] ** 2
-        factor[place] = 1 + away[place] ** 0.5 / focal
-    # of the image and a border of `radius` pixels, so that no place about a pixel is beyond
-    first = np.full((height + 2 * radius, width + 2 * radius), np.inf)
-    square = np.full(first.shape, longest, np.int64)
-    behind = np.empty(first.shape)
-    total = np.zeros((*first.shape, 5))
-    near = np.zeros(first.shape, np.bool_)
+    longest, radius = len(weights), around[-1, 0]
+    border = max(radius, close[-1, 0] + 1)
+    filled[:] = 1.0
     seen = np.empty((height * width, 2), np.int64)
-    count = 0
+    count, least, most = 0, width, -1
     for row in range(height):
         for column in range(width):
             if picture[3, row, column] < 1:
                 seen[count, 0], seen[count, 1] = row, column
+                least, most = min(least, column), max(most, column)
                 count += 1
+    if count == 0:
+        return
+    # all below is of the points' box and a border, which holds their discs and what is beside the near places
+    top, left = seen[0, 0] - border, least - border
+    box = (seen[count - 1, 0] + border + 1 - top, most + border + 1 - left)
+    away, factor = np.empty(len(around), np.uint64), np.empty(len(around))
+    for place in range(len(around)):
+        away[place] = around[place, 0] ** 2 + around[place, 1] ** 2
+        factor[place] = 1 + np.float64(away[place]) ** 0.5 / focal
+    first = np.full(box, np.inf)
+    square = np.full(box, longest, np.uint64)
+    near = np.zeros(box, np.bool_)
     for point in range(count):
         row, column = seen[point]
         depth = nearest + span * np.float64(picture[3, row, column])
+        row, column = row - top, column - left
         for place in range(len(around)):
-            down, across = row + radius - around[place, 0], column + radius - around[place, 1]
+            # numbers without a sign are not checked for counting from the end
+            down, across = np.uint64(row + around[place, 0]), np.uint64(column + around[place, 1])
             cone = depth * factor[place]
             there = first[down, across]
             if cone <= there and (cone < there or away[place] < square[down, across]):
                 first[down, across] = cone
                 square[down, across] = away[place]
         for place in range(len(close)):
-            near[row + radius - close[place, 0], column + radius - close[place, 1]] = True
-    for row in range(first.shape[0]):
-        for column in range(first.shape[1]):
-            behind[row, column] = first[row, column] * (1 + thick / focal)
+            near[row + close[place, 0], column + close[place, 1]] = True
+    # the image's places that no point is near take their discs away: those beside a near one do for all
+    outside = np.zeros(box, np.bool_)
+    low, high = max(-top, 0), min(height - top, box[0])
+    start, stop = max(-left, 0), min(width - left, box[1])
+    for row in range(low, high):
+        for column in range(start, stop):
+            if not near[row, column] and (
+                (row > 0 and near[row - 1, column])
+                or (row + 1 < box[0] and near[row + 1, column])
+                or (column > 0 and near[row, column - 1])
+                or (column + 1 < box[1] and near[row, column + 1])
+            ):
+                for place in range(len(close)):
+                    down, across = row + close[place, 0], column + close[place, 1]
+                    if 0 <= down < box[0] and 0 <= across < box[1]:
+                        outside[down, across] = True
+    behind = np.where(near & ~outside, first * (1 + thick / focal), -np.inf)
+    total = np.zeros((*box, 5))
     for point in range(count):
         row, column = seen[point]
         red, green = np.float64(picture[0, row, column]), np.float64(picture[1, row, column])
         blue, far = np.float64(picture[2, row, column]), np.float64(picture[3, row, column])
         depth = nearest + span * far
+        row, column = row - top, column - left
         for place in range(len(around)):
-            down, across = row + radius - around[place, 0], column + radius - around[place, 1]
+            down, across = np.uint64(row + around[place, 0]), np.uint64(column + around[place, 1])
             if depth < behind[down, across]:
                 one = weights[away[place], square[down, across]]
                 pixel = total[down, across]
@@ -155,19 +176,12 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
                 pixel[2] += one * blue
                 pixel[3] += one * far
                 pixel[4] += one
-    filled[:] = 1.0
-    for row in range(height):
-        for column in range(width):
-            down, across = row + radius, column + radius
-            if square[down, across] < longest:
-                filled[4, row, column] = square[down, across] ** 0.5 / (radius + 1)
-            inside = near[down, across]
-            place = 0
-            while inside and place < len(close):
-                beside, along = row + close[place, 0], column + close[place, 1]
-                if 0 <= beside < height and 0 <= along < width:
-                    inside = near[beside + radius, along + radius]
-                place += 1
-            if inside:
+    for row in range(low, high):
+        for column in range(start, stop):
+            if square[row, column] < longest:
+                distance = np.float64(square[row, column]) ** 0.5
+                filled[4, row + top, column + left] = distance / (radius + 1)
+            if behind[row, column] > 0:
                 for channel in range(4):
-                    filled[channel, row, column] = total[down, across, channel] / total[down, across, 4]
+                    mean = total[row, column, channel] / total[row, column, 4]
+                    filled[channel, row + top, column + left] = mean

@@ -1,0 +1,271 @@
+"""Where a ball will be: physics, TVAE, LSTM and hybrid on simulated and on recorded flights (thesis Figure 4.3).
+
+    python benchmarks/ball_flights.py <folder of the laboratory's *.mat>
+
+Trains what is not yet in outputs/ball_flights, some ten minutes a method on one core, and writes ball_flights.md, .png
+and ball_flights_bundle.png beside this file. On recorded flights networks start from the weights of the simulated ones;
+flights, not windows, are split, by the seed.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import framework
+from benchmarks.machine import machine
+from framework.configuration.schema import build, resolve
+from framework.data import Data
+from framework.distributions.protocol import median
+from framework.figures.style import COLOURS, titled_figure
+from framework.prediction import Prediction
+from plugins.data.table_tennis.flight_error import DRAWS, FlightError, Shown
+from plugins.data.table_tennis.flight_picture import bundle, landing_places
+
+HERE = Path(__file__)
+RUNS = HERE.parent.parent / "outputs" / "ball_flights"
+METHODS = {"ballistic": "physics", "tvae": "TVAE", "lstm": "LSTM", "hybrid": "hybrid"}
+SEEDS = (0, 1, 2)
+SIMULATED = {"flights": 4000, "stride": 2}
+BRIEF = (
+    "optimizer.learning_rate=0.001",
+    "optimizer.warmup_steps=20",
+    "trainer.check_val_every_n_epoch=10",
+)
+EPOCHS = {"tvae": 600, "lstm": 150, "hybrid": 150}
+"""Three steps each; the TVAE's validation loss falls for longer."""
+MOST = 1000
+"""Test windows that are looked at."""
+BUNDLES = (0, 3, 5)
+"""Of the windows that `FlightError` keeps for its picture, those drawn."""
+AT = (1, 5, 10, 20, 35)
+"""Frames of the table."""
+Model = Any
+
+
+class Measured(NamedTuple):
+    """Mean error at each time (cm), `FlightError`'s numbers, and coverage of 90 % intervals before and after."""
+
+    growth: np.ndarray
+    numbers: dict[str, float]
+    before: float
+    after: float
+    metric: FlightError
+
+
+def trained(method: str, root: str | None, seed: int) -> Path:
+    """The folder of a run, which is made unless it is there."""
+    folder = RUNS / (f"{method}" if root is None else f"{method}_recorded_{seed}")
+    if not (folder / "results.json").exists():
+        further = [f"seed={seed}"]
+        if root is not None:
+            further += [f"data.root={root}", f"data.data_seed={seed}"]
+            if method != "ballistic":
+                further += [f"checkpoint={RUNS / method}", f"trainer.max_epochs={EPOCHS[method]}", *BRIEF]
+        command = [sys.executable, "-m", "framework", f"experiment=table_tennis/{method}", "threads=1"]
+        command += ["logger=none", "pictures=false", f"hydra.run.dir={folder}", *further]
+        subprocess.run(command, check=True, cwd=HERE.parent.parent)
+    return folder
+
+
+def split_of(data: Data, name: str) -> dict[str, torch.Tensor]:
+    """Evenly chosen windows."""
+    fields = getattr(data.splits(), name).fields
+    rows = torch.linspace(0, len(fields["input"]) - 1, min(MOST, len(fields["input"]))).round().long()
+    return {key: value[rows] for key, value in fields.items()}
+
+
+@torch.no_grad()
+def ranks(model: Model, batch: dict[str, torch.Tensor]) -> tuple[Prediction, torch.Tensor]:
+    """The prediction, and the share of draws below each recorded coordinate, (window, number)."""
+    density = model(batch["input"])
+    prediction = Prediction(density, batch, samples=200)
+    drawn = density.sample((DRAWS,))
+    return prediction, (drawn < batch["target"]).sum(0) / (DRAWS + 1)
+
+
+def measured(model: Model, data: Data) -> Measured:
+    """On the test split; intervals are calibrated on the validation split, for each coordinate and time by itself.
+
+    The middle m of the draws holds 90 % of the validation windows' truths (distributional conformal prediction:
+    Chernozhukov, Wüthrich & Zhu 2021), and so of the test's as far as windows are exchangeable.
+    """
+    torch.manual_seed(0)
+    metric = FlightError(data.target)
+    _, held = ranks(model, split_of(data, "validation"))
+    prediction, found = ranks(model, split_of(data, "test"))
+    metric.update(prediction)
+    off = (held - 0.5).abs()
+    rank = min(len(off), int(np.ceil(0.9 * (len(off) + 1)))) - 1
+    reach = off.sort(0).values[rank]
+    after = float(((found - 0.5).abs() <= reach).double().mean())
+    numbers = {key: float(value) for key, value in metric.compute().items()}
+    return Measured(metric.growth.numpy(), numbers, numbers["interval_90"], after, metric)
+
+
+def latency(folder: Path, data: Data) -> str:
+    """Median ms of one prediction with 30 draws in frozen form and in torch; the largest difference of the two."""
+    model, form = framework.load(folder), framework.freeze(folder)
+    inputs = split_of(data, "test")["input"]
+    extreme = torch.cat(
+        [inputs[:20], 1e3 * torch.randn(20, inputs.shape[1]), torch.zeros(2, inputs.shape[1])]
+    )
+    points = []
+    for asked in (form.density, model):
+        torch.manual_seed(0)
+        with torch.no_grad():
+            points.append(median(asked(extreme), 30))
+    apart = float(((points[0] - points[1]).abs() / (1 + points[1].abs())).max())
+    one = inputs[:1]
+    taken = {}
+    for name, asked in {"torch": model, "frozen": form.density}.items():
+        times = []
+        for _ in range(60):
+            began = time.perf_counter()
+            with torch.no_grad():
+                asked(one).sample((30,))
+            times.append(1e3 * (time.perf_counter() - began))
+        taken[name] = statistics.median(times[10:])
+    return f"{taken['frozen']:.2f} | {taken['torch']:.2f} | {apart:.0e}"
+
+
+def prepared(root: str | None, seed: int = 0) -> Data:
+    changes = SIMULATED if root is None else {"root": root, "stride": 2, "data_seed": seed}
+    data = build("data", resolve("data", {"name": "table_tennis", **changes}))
+    data.prepare()
+    return data
+
+
+def table(found: dict[str, list[Measured]]) -> list[str]:
+    moments = " | ".join(f"{16 * frame} ms" for frame in AT)
+    lines = [
+        f"| method | {moments} | mean | 90 % before | after | landing CRPS cm | landing in 90 % |",
+        "|---|" + "---|" * (len(AT) + 5),
+    ]
+    for method, several in found.items():
+        growth = np.mean([one.growth for one in several], 0)
+        numbers = {key: np.nanmean([one.numbers[key] for one in several]) for key in several[0].numbers}
+        cells = [f"{growth[frame - 1]:.2f}" for frame in AT] + [f"{growth.mean():.2f}"]
+        cells += [
+            f"{100 * np.mean([getattr(one, key) for one in several]):.1f}" for key in ("before", "after")
+        ]
+        cells += [f"{numbers['landing_crps_cm']:.2f}", f"{100 * numbers['landing_cover_90']:.1f}"]
+        lines.append(f"| {METHODS[method]} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def drawn(everything: dict[str, dict[str, list[Measured]]]) -> None:
+    figure = titled_figure((10, 4.2), "Error of predicted flights against time into the future", False)
+    for place, (title, found) in enumerate(everything.items(), 1):
+        axes = figure.add_subplot(1, 2, place)
+        for (method, several), color in zip(found.items(), COLOURS, strict=False):
+            growth = np.stack([one.growth for one in several])
+            times = 16 * np.arange(1, growth.shape[1] + 1)
+            axes.plot(times, growth.mean(0), color=color, label=METHODS[method])
+            if len(growth) > 1:
+                axes.fill_between(times, growth.min(0), growth.max(0), color=color, alpha=0.15, linewidth=0)
+        axes.set(xlabel="time into the future (ms)", ylabel="mean error (cm)", ylim=(0, None))
+        axes.set_title(title, fontsize=10)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(HERE.with_suffix(".png"), dpi=130)
+
+
+def bundles(found: dict[str, Measured]) -> None:
+    """The same windows by each method, in space, and where they land, in the same colours."""
+    title = "30 drawn flights of three windows, and where all draws come down"
+    figure = titled_figure((4 * len(found), 7.6), title, True)
+    first = None
+    for place, (method, one) in enumerate(found.items(), 1):
+        space: Any = figure.add_subplot(2, len(found), place, projection="3d")
+        shown: list[Shown] = [one.metric.shown[number] for number in BUNDLES]
+        for flight, color in zip(shown, COLOURS, strict=False):
+            bundle(space, flight, color)
+        space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+        space.set_box_aspect((1, 2.2, 0.9), zoom=0.95)
+        space.set(xlim=(-0.2, 1.0), ylim=(-4, 0.2), zlim=(-1.1, -0.2), xticks=[0, 0.8], yticks=[-3, -1])
+        space.view_init(elev=18, azim=-35)
+        space.set_title(f"{METHODS[method]}: seen (dots), true (black), drawn (thin)", fontsize=9)
+        axes = figure.add_subplot(2, len(found), len(found) + place, sharex=first, sharey=first)
+        first = first or axes
+        landing_places(axes, shown, one.metric.height)
+        axes.set_aspect("equal", adjustable="box")
+    figure.savefig(HERE.with_name("ball_flights_bundle.png"), dpi=110)
+
+
+def main(root: str | None) -> None:
+    torch.set_num_threads(1)
+    data = prepared(None)
+    simulated = {method: [measured(framework.load(trained(method, None, 0)), data)] for method in METHODS}
+    recorded: dict[str, list[Measured]] = {}
+    if root is not None:
+        recorded = {
+            method: [
+                measured(framework.load(trained(method, root, seed)), prepared(root, seed)) for seed in SEEDS
+            ]
+            for method in METHODS
+        }
+    latencies = [f"| {METHODS[method]} | {latency(trained(method, None, 0), data)} |" for method in METHODS]
+    write(simulated, recorded, latencies)
+
+
+def write(
+    simulated: dict[str, list[Measured]], recorded: dict[str, list[Measured]], latencies: list[str]
+) -> None:
+    """The page and both pictures."""
+    text = [
+        "# Where a ball will be", "",
+        "![Error against time](ball_flights.png)", "",
+        "Mean distance (cm) of the point prediction from the ball, against time into the future; share (%) of recorded "
+        "coordinates within 90 % intervals, before and after calibration on the validation windows; continuous ranked "
+        "probability score of the landing place, and share of true places in the ellipse that holds 90 %.", "",
+        f"## Simulated flights (synthetic): 4,000, one seed, {MOST:,} test windows", "", *table(simulated), "",
+        "The truth is the flight without noise. Physics is the model that simulated them, its constants found from "
+        "training windows. The TVAE is within 1.3 times its error from 64 ms on, but not before, where a bounce in the "
+        "next or in the last frames changes most.", "", f"TVAE by physics: {ratios(simulated, 'tvae')}.", "",
+        f"Hybrid by physics: {ratios(simulated, 'hybrid')}.", "",
+        "![Drawn flights](ball_flights_bundle.png)", "",
+        "A flight begins where the ball was seen last, and may come down before the first predicted frame. Learned "
+        "densities put fewer than 90 % of the true places in their ellipse.", "",
+    ]  # fmt: skip
+    if recorded:
+        text += [
+            f"## Recorded flights: 40 long enough of 82, split by flight, {len(SEEDS)} seeds", "", *table(recorded), "",
+            "28 flights train, 4 validate, 8 test. Networks start from the weights of the simulated flights and go on "
+            f"for {EPOCHS['lstm']} epochs of three steps, the TVAE for {EPOCHS['tvae']}; physics finds its constants. "
+            "The truth is the recording itself, noise and all. The LSTM is best, for reasons not "
+            "looked into. The TVAE is better than physics until half a second and worse "
+            "after it; that it outperforms both (Figure 4.3b) is not found with so few flights.", "",
+        ]  # fmt: skip
+    text += [
+        "## Latency", "", "One prediction with 30 drawn flights on one core, median ms, and the largest relative "
+        "difference of the point prediction between the two forms, extreme inputs included:", "",
+        "| method | frozen | in torch | apart |", "|---|---|---|---|", *latencies, "",
+        f"{machine('torch', 'numpy')} One thread. Command: `python benchmarks/ball_flights.py <folder>`.",
+    ]  # fmt: skip
+    HERE.with_suffix(".md").write_text("\n".join(text) + "\n", encoding="utf-8")
+    both = {"simulated flights (synthetic)": simulated, "recorded flights (WAM laboratory)": recorded}
+    drawn({title: found for title, found in both.items() if found})
+    bundles({method: several[0] for method, several in simulated.items()})
+
+
+def ratios(found: dict[str, list[Measured]], method: str) -> str:
+    """Of errors, at some times, and the largest."""
+    by = found[method][0].growth / found["ballistic"][0].growth
+    frames = sorted({1, 2, 3, 4, *AT})
+    said = ", ".join(f"{by[frame - 1]:.2f} at {16 * frame} ms" for frame in frames)
+    return f"{said}; at most {by.max():.2f}, at {16 * (int(by.argmax()) + 1)} ms"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1] if len(sys.argv) > 1 else None)

@@ -1,0 +1,192 @@
+"""Tables 2.1, 3.1 to 3.3 and 6.1 to 6.4 of the thesis from one command, as pages beside this file:
+
+    python benchmarks/thesis_tables.py [2.1 3.3 ...] [--seeds 5] [--jobs 2]
+
+Without numbers all of them. What has run in outputs/thesis_tables does not run again, so that the same command goes on
+where it was stopped. Each table's own script writes its page; thesis_tables.md says what ran and for how long.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.machine import machine
+
+HERE = Path(__file__).resolve()
+ROOT = HERE.parents[1]
+FOLDER = ROOT / "outputs/thesis_tables"
+SAID = ("pictures=false", "logger=none", "threads=1")
+BFLOAT16 = "trainer.precision=bf16-mixed"
+"""For convolutions: half as long again without it, on a processor that has its instructions."""
+CLASSES = (
+    "aeroplane,bicycle,boat,bottle,bus,car,chair,diningtable,motorbike,sofa,train,tvmonitor"  # Table 3.3's
+)
+MODELNET = sorted(
+    path.stem for path in (ROOT / "conf/experiment/modelnet40").glob("*.yaml") if path.stem != "base"
+)
+
+
+class Table(NamedTuple):
+    """Runs and the page that is made of them.
+
+    Attributes:
+        about: what it is, where other than the thesis's.
+        sweeps: arguments of each multirun, by its folder.
+        script: beside this file; it is given the folders of its sweeps, or of the only run where `alone`.
+        seeds: most that are run; those of one are told in the sweep itself.
+        alone: whether there is one run.
+    """
+
+    about: str
+    sweeps: dict[str, tuple[str, ...]]
+    script: str
+    seeds: int = 5
+    alone: bool = False
+
+
+def methods(group: str, *names: str) -> str:
+    return "experiment=" + ",".join(f"{group}/{name}" for name in names)
+
+
+TABLES = {
+    "2.1": Table(
+        "uncertainty on two moons",
+        {
+            "moons": (
+                methods(
+                    "moons",
+                    *("vanilla_128", "vanilla_512", "temperature", "platt", "mc_dropout", "ensemble"),
+                    *("outlier_exposure", "adversarial", "everything"),
+                ),
+            )
+        },
+        "moons",
+    ),
+    "3.1-3.2": Table(
+        "head poses of synthetic people in the layouts of IDIAP, CAVIAR and TownCentre",
+        {
+            "idiap": (
+                methods("idiap", "fixed_kappa", "von_mises", "cvae"),
+                "data.angles=[pan],[tilt],[roll]",
+                BFLOAT16,
+            ),
+            "caviar": (methods("caviar", "fixed_kappa", "von_mises", "mixture"), BFLOAT16),
+            "towncentre": (methods("towncentre", "fixed_kappa", "von_mises", "mixture"), BFLOAT16),
+        },
+        "head_pose",
+    ),
+    "3.3": Table(
+        "viewpoints of generated objects in PASCAL3D+'s layout",
+        {
+            "pascal3d": (
+                methods("pascal3d", "fixed_kappa", "von_mises", "scvae"),
+                f"data.category={CLASSES}",
+                BFLOAT16,
+            ),
+            "pascal3d_more": (
+                methods("pascal3d", "mixture", "cvae"),
+                "data.category=bottle,car,diningtable",
+                BFLOAT16,
+            ),
+        },
+        "pascal3d",
+        seeds=3,
+    ),
+    "6.1-6.3": Table(
+        "classes of generated CAD models",
+        {"modelnet40": (methods("modelnet40", *MODELNET), BFLOAT16)},
+        "modelnet40",
+        seeds=1,
+    ),
+    "6.4": Table(
+        "registration of generated scans: vertices, not FAUST's correspondences, which cannot be had here",
+        {"registration": ("experiment=registration/quick",)},
+        "registration",
+        seeds=1,
+        alone=True,
+    ),
+}
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    arguments.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)}; none: all")
+    arguments.add_argument("--seeds", type=int, default=5, help="at most, for each table")
+    arguments.add_argument("--jobs", type=int, default=2, help="runs at once")
+    arguments.add_argument("--tell", action="store_true", help="print the commands, run nothing")
+    given = arguments.parse_args()
+    unknown = [name for name in given.tables if name not in TABLES]
+    if unknown:
+        arguments.error(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
+    for name in given.tables or TABLES:
+        for command in commands(name, given.seeds, given.jobs):
+            sys.stdout.write(" ".join(command[1:]) + "\n")
+            sys.stdout.flush()
+            if not given.tell:
+                subprocess.run(command, cwd=ROOT, check=True)
+    if not given.tell:
+        HERE.with_suffix(".md").write_text(report(), encoding="utf-8")
+
+
+def commands(name: str, seeds: int, jobs: int) -> list[list[str]]:
+    """Of a table: its sweeps, and the page at last."""
+    table = TABLES[name]
+    drawn = "seed=" + ",".join(str(seed) for seed in range(min(seeds, table.seeds)))
+    found = [
+        [
+            *(sys.executable, "-m", "framework", "-m", *words, drawn, *SAID),
+            *(f"hydra.launcher.jobs={jobs}", f"hydra.sweep.dir={folder_of(sweep)}"),
+        ]
+        for sweep, words in table.sweeps.items()
+    ]
+    folders = [folder_of(sweep) + ("/0" if table.alone else "") for sweep in table.sweeps]
+    return [*found, [sys.executable, f"benchmarks/{table.script}.py", *folders]]
+
+
+def folder_of(sweep: str) -> str:
+    return os.path.relpath(FOLDER / sweep, ROOT)
+
+
+def report() -> str:
+    lines = []
+    whole = 0.0
+    for name, table in TABLES.items():
+        spent = [took for sweep in table.sweeps for took in seconds(FOLDER / sweep)]
+        whole += sum(spent)
+        lines.append(
+            f"| {name} | {table.about} | [{table.script}.md]({table.script}.md) | {len(spent) or 'not run'} | "
+            f"{sum(spent) / 60:.0f} |"
+        )
+    return "\n".join(
+        [
+            "# The thesis's tables, run (synthetic data)",
+            "",
+            "Commands: `python benchmarks/thesis_tables.py --tell` prints them. Minutes: of all runs' clocks, which "
+            "run two at a time on a core each, so that half of it passes; pages take some minutes more.",
+            "",
+            "| table | data | page | runs | minutes |",
+            "|---|---|---|---:|---:|",
+            *lines,
+            "",
+            f"Together {whole / 3600:.1f} hours of one core. {machine('torch', 'pytorch-lightning')}",
+            "",
+        ]
+    )
+
+
+def seconds(sweep: Path) -> Sequence[float]:
+    """Wall clock of each completed job of a sweep."""
+    jobs = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(sweep.glob("*/job.json"))]
+    return [job["ended"] - job["started"] for job in jobs if job["status"] == "completed"]
+
+
+if __name__ == "__main__":
+    main()

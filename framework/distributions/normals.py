@@ -1,0 +1,52 @@
+"""Normal densities of several numbers, independent of one another or not; unlike torch's own also of an empty batch."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.distributions import Independent, MultivariateNormal, Normal
+
+from framework.distributions.protocol import median
+
+
+class IndependentNormals(Independent):
+    """Normal densities of numbers that are independent of one another.
+
+    Args:
+        mean, scale: (*batch, number).
+    """
+
+    def __init__(self, mean: Tensor, scale: Tensor) -> None:
+        super().__init__(Normal(mean, scale, validate_args=False), 1, validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.base_dist.log_prob(value).sum(-1)
+
+    def entropy(self) -> Tensor:
+        return self.base_dist.entropy().sum(-1)
+
+
+@median.register
+def _(density: IndependentNormals, samples: int) -> Tensor:
+    # each is symmetric about its mean
+    return density.mean
+
+
+class JointNormal(MultivariateNormal):
+    """The normal density of a covariance R Rᵀ.
+
+    Args:
+        mean: (*batch, number).
+        root: R, (*batch, number, number), lower triangular with a diagonal above 0.
+    """
+
+    def __init__(self, mean: Tensor, root: Tensor) -> None:
+        self.root = root
+        super().__init__(mean, scale_tril=root, validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        residual = (value - self.loc).unsqueeze(-1)
+        root = self.root.expand(*residual.shape[:-2], *self.root.shape[-2:])
+        standard = torch.linalg.solve_triangular(root, residual, upper=False).squeeze(-1)
+        scale = self.root.diagonal(dim1=-2, dim2=-1)
+        return -(standard.square() / 2 + scale.log() + math.log(2 * math.pi) / 2).sum(-1)

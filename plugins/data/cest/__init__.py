@@ -1,0 +1,1 @@
+"""CEST brain imaging: Z-spectra, fitted by sums of Lorentzian lines or predicted by networks."""

@@ -1,0 +1,103 @@
+"""Lorentzian lines fitted to each Z-spectrum, as a density head that needs no gradient."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.density_head import DensityHead, Fitted
+from framework.distributions.normals import JointNormal
+from framework.errors import ConfigError
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.data.cest.fit import Fit, fit
+from plugins.data.cest.protocol import offsets_of
+from plugins.data.cest.spectrum import PRESETS, Parameters
+
+
+class LorentzianHead(DensityHead, Fitted):
+    """Least squares of each spectrum (plugins.data.cest.fit), with the covariance of its Jacobian.
+
+    Reads spectra of `data=cest` as they are, without an encoder, and needs no training: what the target asks for says
+    which preset is fitted. The density's gradient in the spectrum is said to be 0.
+
+    Attributes:
+        steps: most steps of a fit (a knob).
+
+    Args:
+        steps: the same.
+        offsets: of the data, ppm.
+
+    Raises:
+        ConfigError: a target of other numbers.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30, 100)}
+    bibtex = """@article{zaiss2011quantitative,
+  author  = {Zaiss, Moritz and Schmitt, Benjamin and Bachert, Peter},
+  title   = {Quantitative separation of {CEST} effect from magnetization transfer and spillover effects by
+             {Lorentzian}-line-fit analysis of z-spectra},
+  journal = {Journal of Magnetic Resonance},
+  volume  = {211},
+  pages   = {149--155},
+  year    = {2011}
+}"""
+    offsets: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        steps: Annotated[int, Field(ge=1, le=10_000)] = 300,
+        offsets: list[float] | None = None,
+    ) -> None:
+        super().__init__()
+        target.require("real", by="density_head lorentzian")
+        self.wanted = parameters_of(target.names, by="density_head lorentzian")
+        self.steps = steps
+        self.scaled = bool(target.scale)
+        self.register_buffer("offsets", torch.tensor(offsets_of(offsets), dtype=torch.float64), False)
+        self.size = len(self.offsets)
+
+    def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        """Nothing: each spectrum is fitted by itself."""
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        raw = require_finite(raw, self.size)
+        found = fit(raw.reshape(-1, self.size), self.offsets, self.wanted, most=self.steps)
+        zero = (raw * 0).sum(-1, keepdim=True)
+        zero = zero.double() if self.scaled else zero
+        return density(found, self.wanted.told, raw.shape[:-1], zero)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Nothing: the residuals of each fit say how sure it is."""
+
+
+def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
+    """The preset whose target has these names.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for preset in PRESETS.values():
+        if preset.target == names:
+            return preset
+    known = " or ".join(str(len(preset.target)) for preset in PRESETS.values())
+    raise ConfigError(
+        f"{by} fits Lorentzian lines, {known} numbers such as {', '.join(PRESETS['ten'].target[:2])}; the data's are "
+        f"{', '.join(names[:10])}. Choose data=cest."
+    )
+
+
+def density(found: Fit, told: int, shape: torch.Size | tuple[int, ...], zero: Tensor) -> Distribution:
+    """The Gaussian over the first `told` parameters, of the type of `zero` (*shape, 1), which is added to its mean: of
+    a lower Cholesky factor the first rows are their marginal's."""
+    mean = found.parameters[:, :told].reshape(*shape, told).to(zero) + zero
+    return JointNormal(mean, found.root[:, :told, :told].reshape(*shape, told, told).to(zero))

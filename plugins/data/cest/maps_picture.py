@@ -1,0 +1,60 @@
+"""Contrast maps of a slice in a picture, standard deviations below them."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from framework.figures.style import titled_figure
+
+SHOWN = {
+    "amide_amplitude": "amide, 3.5 ppm",
+    "noe_amplitude": "NOE, -3.5 ppm",
+    "mt_amplitude": "MT, -2.5 ppm",
+    "amine_amplitude": "amine, 2 ppm",
+    "water_amplitude": "water",
+}
+"""Which numbers are mapped, with their headings; the asymmetry of the spectra beside them."""
+Maps = Mapping[str, tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"] | None]]
+"""Of each name its map and that of its standard deviation, NaN outside the brain."""
+SIZE = 2.1
+"""Of a map, inches."""
+
+
+def pictured(methods: Mapping[str, Maps], title: str) -> Figure:
+    """Two rows a method, what is predicted and its standard deviation, in percent of the unsaturated signal.
+
+    Contrasts have the field's rainbow, asymmetry a scale about 0, standard deviations one of one colour. A column's
+    methods share their scales, which end at the 1 % and 99 % quantiles of the first.
+    """
+    columns = list(next(iter(methods.values())))
+    figure = titled_figure((SIZE * len(columns) + 0.8, (SIZE + 0.35) * 2 * len(methods) + 0.4), title, False)
+    axes = figure.subplots(2 * len(methods), len(columns), squeeze=False)
+    first = next(iter(methods.values()))
+    for place, name in enumerate(columns):
+        for number, (method, maps) in enumerate(methods.items()):
+            for row, (values, scale) in enumerate(zip(maps[name], first[name], strict=True)):
+                axis = axes[2 * number + row, place]
+                axis.set(xticks=[], yticks=[])
+                axis.set_frame_on(False)
+                if place == 0:
+                    said = ("predicted", "standard deviation")[row]
+                    axis.set_ylabel(f"{method}\n{said}" if method else said, fontsize=8)
+                if values is None or scale is None:
+                    axis.set_axis_off()
+                    continue
+                shown = axis.imshow(100 * values, **_scale(name in SHOWN, row, 100 * scale))
+                figure.colorbar(shown, ax=axis, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
+        axes[0, place].set_title(f"{SHOWN.get(name, 'asymmetry, 3.5 ppm')}, %", fontsize=8)
+    return figure
+
+
+def _scale(contrast: bool, row: int, values: np.ndarray) -> dict[str, object]:
+    low, high = np.nanquantile(values, (0.01, 0.99))
+    if row:
+        return {"cmap": "magma", "vmin": 0.0, "vmax": high}
+    if contrast:
+        return {"cmap": "turbo", "vmin": low, "vmax": high}
+    most = max(abs(low), abs(high))
+    return {"cmap": "RdBu_r", "vmin": -most, "vmax": most}

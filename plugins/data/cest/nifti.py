@@ -1,0 +1,46 @@
+"""Z-spectra and maps in NIfTI, through nibabel (the extra `nifti`), which nothing else needs."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import nibabel
+import numpy as np
+
+from framework.errors import DataError
+from framework.storage.reading import inflated, read_bytes, room
+
+PACKED = b"\x1f\x8b"
+
+
+def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
+    """Images of `file` and their `affine`; `offsets` of `<name>.offsets.txt` and `mask` of `<name>.mask.nii.gz` beside
+    it, this if it is there.
+
+    Raises:
+        DataError: no offsets are beside it.
+        Exception: what nibabel raises on damage.
+    """
+    name = file.name.split(".nii")[0]
+    beside, mask = file.with_name(f"{name}.offsets.txt"), file.with_name(f"{name}.mask.nii.gz")
+    images = _read(file)
+    found = {"spectra": np.asarray(images.dataobj, np.float64), "affine": np.asarray(images.affine)}
+    if not beside.is_file():
+        raise DataError(
+            f"no {beside.name} beside it; wanted the offsets in ppm, one a line, as many as images."
+        )
+    found["offsets"] = np.array([float(line) for line in beside.read_text(encoding="utf-8").split()])
+    if mask.is_file():
+        found["mask"] = np.asarray(_read(mask).dataobj, np.float64)
+    return found
+
+
+def write_nifti(file: Path, maps: np.ndarray, affine: np.ndarray) -> None:
+    """Maps (x, y, z, map), float32, that lie where the spectra lay."""
+    nibabel.Nifti1Image(maps.astype(np.float32), affine).to_filename(file)
+
+
+def _read(file: Path) -> nibabel.Nifti1Image:
+    content = read_bytes(file)
+    if content.startswith(PACKED):
+        content = inflated(content, room(len(content)))
+    return nibabel.Nifti1Image.from_bytes(content)

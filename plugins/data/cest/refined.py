@@ -1,0 +1,87 @@
+"""Least squares that start from a network's answer, as an uncertainty wrapper."""
+
+from collections.abc import Callable, Iterable
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.data import Batch
+from framework.distributions.protocol import median
+from framework.errors import ConfigError
+from framework.model import Predictor
+from framework.uncertainty import Uncertainty
+from plugins.data.cest.fit import fit
+from plugins.data.cest.head import density
+from plugins.data.cest.protocol import offsets_of
+from plugins.data.cest.spectrum import PRESETS
+
+DRAWS = 100
+"""For the point of a density that does not know it."""
+
+
+class Refined(Uncertainty):
+    """Fits Lorentzian lines to each spectrum from where the wrapped model says they are (the neural start).
+
+    The density is that of the fit (plugins.data.cest.fit), where the wrapped model's own only says where to begin. A
+    wrapper, since a network and a fit are both wanted in one experiment: it is trained, stored and compared as any
+    model, and wraps any, an ensemble too. With `steps=0` it is what it wraps.
+
+    Attributes:
+        steps: most steps of a fit (a knob).
+
+    Args:
+        steps: the same.
+        offsets: of the data, ppm.
+    """
+
+    bibtex = """@article{levenberg1944method,
+  author  = {Levenberg, Kenneth},
+  title   = {A method for the solution of certain non-linear problems in least squares},
+  journal = {Quarterly of Applied Mathematics},
+  volume  = {2},
+  pages   = {164--168},
+  year    = {1944}
+}"""
+    offsets: Tensor
+
+    def __init__(
+        self,
+        model: Callable[[], Predictor],
+        *,
+        steps: Annotated[int, Field(ge=0, le=10_000)] = 300,
+        offsets: list[float] | None = None,
+    ) -> None:
+        super().__init__()
+        self.knobs = {"steps": (0, 1, 2, 3, 5, 10, 30)}
+        self.model = model()
+        self.steps = steps
+        self.register_buffer("offsets", torch.tensor(offsets_of(offsets), dtype=torch.float64), False)
+
+    def forward(self, inputs: Tensor) -> Distribution:
+        start = self.model(inputs)
+        if self.steps == 0:
+            return start
+        wanted = next((one for one in PRESETS.values() if (one.told,) == start.event_shape), None)
+        if wanted is None or inputs.shape[1:].numel() != len(self.offsets):
+            raise ConfigError(
+                f"uncertainty refined fits {len(self.offsets)} offsets by 10 or 15 numbers, but the data have inputs "
+                f"of {inputs.shape[1:].numel()} and targets of {start.event_shape.numel()}. Choose data=cest."
+            )
+        point = median(start, DRAWS)
+        spectra = inputs.flatten(1)
+        found = fit(spectra, self.offsets, wanted, start=point, most=self.steps)
+        zero = (spectra * 0).sum(-1, keepdim=True).to(point.dtype)
+        return density(found, wanted.told, start.batch_shape, zero)
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        return self.model.loss(inputs, target)
+
+    def training_densities(self, inputs: Tensor) -> Distribution:
+        return self.model.training_densities(inputs)
+
+    def calibrate(self, batches: Iterable[Batch]) -> None:
+        self.model.calibrate(batches)

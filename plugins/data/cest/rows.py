@@ -1,0 +1,70 @@
+"""Rows of the contract: a small slice, generated and in MATLAB's and NumPy's files; fits of both presets."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.io import savemat
+
+from framework.target import Target
+from framework.testing.rows import DAMAGES, DataRow, HeadRow, WrapperRow
+from plugins.data.cest.generator import write_slice
+from plugins.data.cest.protocol import OFFSETS
+from plugins.data.cest.spectrum import PRESETS
+
+TEN, FIFTEEN = (Target("real", PRESETS[preset].target) for preset in ("ten", "fifteen"))
+FEW = [-20.0, -5.0, -3.5, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0, 3.5, 5.0, 20.0]
+
+
+def slice_of(folder: Path, data_seed: int = 0) -> dict[str, np.ndarray]:
+    write_slice(folder, side=32, noise=0.01, shift=0.05, data_seed=data_seed)
+    with np.load(folder / "brain.npz") as held:
+        return dict(held)
+
+
+def as_numpy(folder: Path) -> Mapping[str, str]:
+    slice_of(folder)
+    return {"root": str(folder / "brain.npz")}
+
+
+def as_matlab(folder: Path) -> Mapping[str, str]:
+    held = slice_of(folder)
+    (folder / "brain.npz").unlink()
+    savemat(
+        folder / "brain.mat", {"rawData": held["spectra"][:, :, None], "offsets": held["offsets"][:, None]}
+    )
+    return {"root": str(folder / "brain.mat")}
+
+
+def files(folder: Path) -> Sequence[Path]:
+    """A piece of one slice in NumPy's file, one of another in MATLAB's."""
+    first, second = (slice_of(folder, seed)["spectra"][8:16, 8:16] for seed in (1, 2))
+    (folder / "brain.npz").unlink()
+    np.savez(folder / "mine_1.npz", spectra=first, offsets=OFFSETS)
+    savemat(folder / "mine_2.mat", {"spectra": second, "offsets": OFFSETS})
+    return [folder / "mine_1.npz", folder / "mine_2.mat"]
+
+
+NO_GRADIENT = {"loss gradient": "a fit claims no gradient in its spectrum"}
+BY_DRAWS = "of ten numbers; the head's rows integrate them by draws"
+TEN_NUMBERS = {"integral": BY_DRAWS, "samples follow log_prob": BY_DRAWS}
+SMALL = {"band": 3, "side": 32}
+ROWS = {
+    "cest": (
+        DataRow(
+            "generated", SMALL, synthetic=True, files=files, changes={"data_seed": 1, "preset": "fifteen"}
+        ),
+        DataRow(
+            "NumPy's file", SMALL, as_numpy, False, files, fragile={"brain.npz": DAMAGES}, changes={"band": 4}
+        ),
+        DataRow("MATLAB's file", SMALL, as_matlab, False, files, fragile={"brain.mat": DAMAGES}),
+    ),
+    "lorentzian": (
+        HeadRow("ten", TEN, {"offsets": FEW, "steps": 3}, leave_out=NO_GRADIENT),
+        HeadRow("fifteen", FIFTEEN, {"offsets": FEW, "steps": 3}, leave_out=NO_GRADIENT),
+    ),
+    "refined": (
+        WrapperRow("no step", TEN, {"steps": 0}, identity={"steps": 0}, leave_out=TEN_NUMBERS),
+        WrapperRow("a fit", TEN, {"steps": 10, "offsets": FEW[3:9]}, leave_out=TEN_NUMBERS),
+    ),
+}

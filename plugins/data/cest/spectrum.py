@@ -1,0 +1,152 @@
+"""Z-spectra as one minus a sum of Lorentzian lines, one for each pool of protons, with first and second derivatives.
+
+Z(Δω) = 1 - Σ_i A_i (w_i/2)² / ((w_i/2)² + (Δω - δ_i)²), offsets Δω, widths w (at half maximum) and centres δ in ppm
+(Zaiss et al. 2011; Windschuh et al. 2015). The centre of water is the shift of the static field B0, and the others'
+centres are counted from it.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+POOLS = ("water", "amide", "noe", "mt", "amine")
+COUNT = len(POOLS)
+CENTRES = (0.0, 3.5, -3.5, -2.5, 2.0)
+"""Of the pools, ppm from water."""
+Preset = Literal["ten", "fifteen"]
+
+
+class Parameters(NamedTuple):
+    """What is fitted: the parameters' names, their box and where the search starts; and how many are a target.
+
+    Attributes:
+        names: with units; amplitudes are shares of the unsaturated signal.
+        told: the first so many are the target, whatever follows is fitted beside them.
+    """
+
+    names: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    start: tuple[float, ...]
+    told: int
+
+    @classmethod
+    def of(cls, preset: Preset) -> "Parameters":
+        """Of five pools: ten amplitudes and widths beside the shift of water, with the others' centres fixed
+        (thesis §4.1); or with these fifteen numbers and nothing fixed."""
+        return PRESETS[preset]
+
+    @property
+    def elsewhere(self) -> tuple[float, ...]:
+        """Another start."""
+        return tuple(ELSEWHERE.get(name, at) for name, at in zip(self.names, self.start, strict=True))
+
+    @property
+    def target(self) -> tuple[str, ...]:
+        return self.names[: self.told]
+
+
+def _parameters(free: bool) -> Parameters:
+    columns = (
+        *((f"{pool}_amplitude", 0.0, 1.0, start) for pool, start in zip(POOLS, AMPLITUDES, strict=True)),
+        *((f"{pool}_width_ppm", *box) for pool, box in zip(POOLS, WIDTHS, strict=True)),
+        *((f"{pool}_centre_ppm", *box) for pool, box in zip(POOLS, PLACES, strict=True)),
+    )
+    chosen = columns if free else columns[: 2 * COUNT + 1]
+    names, lower, upper, start = zip(*chosen, strict=True)
+    return Parameters(names, lower, upper, start, len(chosen) if free else 2 * COUNT)
+
+
+AMPLITUDES = (0.75, 0.02, 0.1, 0.15, 0.1)
+WIDTHS = ((0.2, 8.0, 1.0), (0.3, 8.0, 0.6), (0.5, 12.0, 4.0), (8.0, 200.0, 50.0), (0.3, 8.0, 6.0))
+PLACES = ((-1.0, 1.0, 0.0), (3.0, 4.0, 3.5), (-4.5, -2.5, -3.5), (-4.5, 0.5, -2.5), (1.2, 2.8, 2.0))
+"""Least, most and start, ppm; wide, so that few fits end at a bound."""
+ELSEWHERE = {"amide_amplitude": 0.03, "amide_width_ppm": 1.2, "amine_amplitude": 0.05, "amine_width_ppm": 2.0}
+"""A second start: the sharper of the two lines that overlap is the other one."""
+PRESETS: dict[Preset, Parameters] = {"ten": _parameters(False), "fifteen": _parameters(True)}
+
+
+def centres(parameters: Float[Tensor, "batch p"]) -> Float[Tensor, "batch pool"]:
+    """Where the lines lie, ppm."""
+    shift = parameters[:, 2 * COUNT : 2 * COUNT + 1]
+    fixed = parameters.new_tensor(CENTRES)
+    if parameters.shape[1] == 2 * COUNT + 1:
+        return shift + fixed
+    return torch.cat((shift, shift + parameters[:, 2 * COUNT + 1 :]), 1)
+
+
+def spectrum(
+    parameters: Float[Tensor, "batch p"], offsets: Float[Tensor, "offset"]
+) -> Float[Tensor, "batch offset"]:
+    """Z, of either preset's parameters."""
+    amplitude, width = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None]
+    square = (width / 2).square()
+    lines = amplitude * square / (square + (offsets - centres(parameters).unsqueeze(-1)).square())
+    return 1 - lines.sum(1)
+
+
+class Misfit:
+    """The residuals of many spectra, Z(parameters) - measured, for framework.heads.least_squares.
+
+    Args:
+        measured: (spectrum, offset), NaN where nothing was measured.
+        offsets: (offset,), ppm.
+    """
+
+    def __init__(self, measured: Float[Tensor, "spectrum offset"], offsets: Float[Tensor, "offset"]) -> None:
+        self.measured = measured
+        self.offsets = offsets
+
+    def __call__(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals (batch, offset) and their Jacobian (batch, offset, p), written in few passes over the numbers."""
+        amplitude, half = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None] / 2
+        # with e = 1 / (h² + d²): ∂Z/∂A = -h² e, ∂Z/∂w = -A h d² e², ∂Z/∂δ = -2 A h² d e²
+        distance = self.offsets - centres(parameters).unsqueeze(-1)
+        square = distance.square()
+        inverse = (square + half.square()).reciprocal_()
+        jacobian = parameters.new_empty(*parameters.shape, len(self.offsets))
+        lines = jacobian[:, :COUNT]
+        torch.mul(inverse, -half.square(), out=lines)
+        residuals = torch.bmm(amplitude.mT, lines).squeeze(1).add_(1).sub_(self.measured[rows])
+        inverse.square_().mul_(amplitude * half)
+        torch.mul(square.neg_(), inverse, out=jacobian[:, COUNT : 2 * COUNT])
+        moved = distance.mul_(inverse).mul_(-2 * half)
+        jacobian[:, 2 * COUNT] = moved.sum(1)
+        if parameters.shape[1] > 2 * COUNT + 1:
+            jacobian[:, 2 * COUNT + 1 :] = moved[:, 1:]
+        return residuals, jacobian.mT
+
+    def curvature(self, parameters: Tensor, rows: Tensor, residuals: Tensor) -> Tensor:
+        """Σ residual ∇²Z, (batch, p, p), from five sums over the offsets."""
+        amplitude, half = parameters[:, :COUNT], parameters[:, COUNT : 2 * COUNT] / 2
+        square = half.square()
+        distance = self.offsets - centres(parameters).unsqueeze(-1)
+        first = torch.addcmul(square.unsqueeze(-1), distance, distance).reciprocal_()  # e
+        second = first.square()
+        third = second * first
+        weights = residuals.unsqueeze(-1)
+        e, e2, e3 = (torch.bmm(part, weights).squeeze(-1) for part in (first, second, third))
+        de2 = torch.bmm(second.mul_(distance), weights).squeeze(-1)
+        de3 = torch.bmm(third.mul_(distance), weights).squeeze(-1)
+        # d² = 1/e - h²
+        dde2, dde3 = e - square * e2, e2 - square * e3
+        within = parameters.new_zeros(len(parameters), 3, 3, COUNT)  # amplitude, width, centre of each pool
+        within[:, 0, 1] = within[:, 1, 0] = -half * dde2
+        within[:, 0, 2] = within[:, 2, 0] = -2 * square * de2
+        within[:, 1, 1] = amplitude * (4 * square * dde3 - dde2) / 2
+        within[:, 1, 2] = within[:, 2, 1] = amplitude * half * (4 * square * de3 - 2 * de2)
+        within[:, 2, 2] = amplitude * square * (2 * e2 - 8 * dde3)
+        return _spread(within, parameters.shape[1])
+
+
+def _spread(within: Float[Tensor, "batch 3 3 pool"], size: int) -> Float[Tensor, "batch size size"]:
+    """Second derivatives of each pool alone as those by all parameters, the shift of water moving every centre."""
+    whole = within.new_zeros(len(within), 3, COUNT, 3, COUNT)
+    whole.diagonal(dim1=2, dim2=4).copy_(within)
+    whole = whole.reshape(len(within), 3 * COUNT, 3 * COUNT)
+    shift = 2 * COUNT
+    whole[:, :, shift] = whole[:, :, shift:].sum(2)
+    whole[:, shift] = whole[:, shift:].sum(1)
+    return whole[:, :size, :size]

@@ -1,0 +1,242 @@
+"""Z-spectra: derivatives, fits against SciPy, files that are read and refused, splits without neighbours."""
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from scipy import optimize
+
+from framework.errors import DataError
+from framework.target import Target
+from plugins.data.cest.data import CEST
+from plugins.data.cest.fit import fit
+from plugins.data.cest.generator import write_slice
+from plugins.data.cest.head import LorentzianHead
+from plugins.data.cest.maps import ASYMMETRY, write_maps
+from plugins.data.cest.protocol import OFFSETS, resampled
+from plugins.data.cest.spectrum import PRESETS, Misfit, Parameters, spectrum
+from plugins.data.cest.volumes import read_volume
+
+PLACES = torch.tensor(OFFSETS, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def brain(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("brain")
+    write_slice(folder, side=40, noise=0.01, shift=0.08, data_seed=0)
+    return folder / "brain.npz"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_derivatives_are_autograds(preset):
+    wanted = Parameters.of(preset)
+    at = torch.tensor([wanted.start, wanted.elsewhere], dtype=torch.float64) * 1.05
+    at[:, 10] = 0.07
+    measured = torch.rand(2, len(PLACES), dtype=torch.float64)
+    misfit, rows = Misfit(measured, PLACES), torch.arange(2)
+    residuals, jacobian = misfit(at, rows)
+    torch.testing.assert_close(residuals, spectrum(at, PLACES) - measured, rtol=0, atol=1e-14)
+    curved = misfit.curvature(at, rows, residuals)
+    for row in range(2):
+
+        def alone(x):
+            return spectrum(x[None], PLACES)[0]
+
+        exact = torch.autograd.functional.jacobian(alone, at[row])
+        torch.testing.assert_close(jacobian[row], exact, rtol=1e-11, atol=1e-13)
+        second = torch.autograd.functional.hessian(lambda x, r=row: alone(x) @ residuals[r], at[row])
+        torch.testing.assert_close(curved[row], second, rtol=1e-9, atol=1e-11)
+        step = 1e-6 * torch.eye(len(at[row]), dtype=torch.float64)
+        slope = (spectrum(at[row] + step, PLACES) - spectrum(at[row] - step, PLACES)).T / 2e-6
+        torch.testing.assert_close(jacobian[row], slope, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_each_spectrum_is_fitted_as_scipy_fits_it_or_better(preset, brain):
+    wanted = Parameters.of(preset)
+    measured = torch.from_numpy(read_volume(brain).spectra[::97][:12])
+    found = fit(measured, PLACES, wanted)
+    misfit, same = Misfit(measured, PLACES), 0
+    for row in range(len(measured)):
+
+        def both(x, row=row):
+            return misfit(torch.tensor(x)[None], torch.tensor([row]))
+
+        other = optimize.least_squares(
+            lambda x: both(x)[0][0].numpy(),
+            wanted.start,
+            lambda x: both(x)[1][0].numpy(),
+            bounds=(wanted.lower, wanted.upper),
+            **dict.fromkeys(("ftol", "xtol", "gtol"), 1e-14),
+        )
+        assert found.cost[row] <= other.cost * (1 + 1e-9)
+        if found.cost[row] >= other.cost * (1 - 1e-9):
+            same += 1
+            np.testing.assert_allclose(found.parameters[row].numpy(), other.x, rtol=1e-5, atol=1e-6)
+    assert same >= 6
+    sides = torch.tensor(wanted.upper).double() - torch.tensor(wanted.lower).double()
+    residuals, jacobian = misfit(found.parameters, torch.arange(len(measured)))
+    variance = residuals.square().sum(-1) / (len(PLACES) - len(sides))
+    for row in range(len(measured)):
+        covariance = exact_covariance(jacobian[row], float(variance[row]), sides)
+        deviation = np.sqrt(np.diag(covariance))
+        mine = (found.root[row] @ found.root[row].mT).numpy()
+        np.testing.assert_allclose(np.sqrt(np.diag(mine)), deviation, rtol=1e-6)
+        # as correlations: of numbers that nearly cancel a share of themselves says nothing
+        np.testing.assert_allclose(
+            mine / np.outer(deviation, deviation),
+            covariance / np.outer(deviation, deviation),
+            rtol=0,
+            atol=1e-6,
+        )
+
+
+def exact_covariance(jacobian, variance, sides):
+    """(JᵀJ / s² + diag 12 / side²)⁻¹ with 60 digits."""
+    with mpmath.workdps(60):
+        rows = mpmath.matrix(jacobian.tolist())
+        normal = rows.T * rows / variance
+        for index, side in enumerate(sides.tolist()):
+            normal[index, index] += 12 / mpmath.mpf(side) ** 2
+        return np.array((normal**-1).tolist(), dtype=float)
+
+
+def test_what_says_nothing_is_as_wide_as_its_box():
+    flat = torch.ones(3, len(PLACES)).double()
+    flat[1] = 0.0
+    flat[2, 5] = 40.0  # a spike
+    found = fit(flat, PLACES, Parameters.of("fifteen"))
+    for part in found:
+        assert bool(part.isfinite().all())
+    deviation = found.root.square().sum(-1).sqrt()
+    wanted = Parameters.of("fifteen")
+    side = torch.tensor(wanted.upper[5:10]) - torch.tensor(wanted.lower[5:10])
+    gone = found.parameters[0, :5] < 1e-9
+    assert bool(gone.any())
+    torch.testing.assert_close(
+        (deviation[0, 5:10] / side.double())[gone], torch.full((int(gone.sum()),), 12**-0.5).double()
+    )
+
+
+def test_truth_is_found_again_without_noise():
+    wanted = Parameters.of("fifteen")
+    truth = torch.tensor([wanted.start]).double() * torch.tensor([[1.02], [0.97]]).double()
+    truth[:, 10] = torch.tensor([0.1, -0.2])
+    found = fit(spectrum(truth, PLACES), PLACES, wanted)
+    torch.testing.assert_close(found.parameters, truth, rtol=1e-6, atol=1e-7)
+
+
+def test_bands_have_no_neighbour_in_another_split(brain):
+    data = CEST(root=str(brain), band=3)
+    data.prepare()
+    rows = [set(part.fields["place"][:, 0].tolist()) for part in data.splits()]
+    for one in range(3):
+        for other in range(3):
+            if one != other:
+                assert min(abs(a - b) for a in rows[one] for b in rows[other]) > 1
+    assert data.groups == ("healthy", "tumour") and data.target.names[0] == "water_amplitude"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_training_sees_shifted_lines_with_the_noise_of_the_spectrum(preset, brain):
+    data = CEST(root=str(brain), preset=preset, band=3, noise=0.0, shift=0.3)
+    data.prepare()
+    batch = data.splits().train.__getitems__(range(50))
+    found = data.augment(batch)
+    moved = found["lines"][:, 10] - batch["lines"][:, 10]
+    assert 0.2 < float(moved.abs().max()) <= 0.3
+    noise = batch["input"] - spectrum(batch["lines"], PLACES.float())
+    lines = batch["lines"].clone()
+    lines[:, 10] += moved
+    torch.testing.assert_close(found["input"], spectrum(lines, PLACES.float()) + noise, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found["target"], lines[:, : found["target"].shape[1]])
+    assert torch.equal(batch["lines"][:, :10], found["lines"][:, :10])
+
+
+def test_other_offsets_are_resampled_or_refused():
+    at = torch.tensor([Parameters.of("ten").start], dtype=torch.float64)
+    dense = np.linspace(-41, 41, 1641)
+    given = spectrum(at, torch.from_numpy(dense)).numpy()
+    found = resampled(given, dense, OFFSETS, "scan.npz")
+    np.testing.assert_allclose(found, spectrum(at, PLACES).numpy(), atol=1e-4)
+    with pytest.raises(DataError, match="reach from -30 to 41 ppm"):
+        resampled(given[:, 220:], dense[220:], OFFSETS, "scan.npz")
+    with pytest.raises(DataError, match="follows no line"):
+        resampled(given[:, ::41], dense[::41], OFFSETS, "scan.npz")
+
+
+def broken(**changes):
+    held = {"spectra": np.full((4, 5, 6), 0.5), "offsets": np.array([-5.0, -2.0, 0.0, 2.0, 5.0, 9.0])}
+    held |= changes
+    return {name: part for name, part in held.items() if part is not None}
+
+
+@pytest.mark.parametrize(
+    ("held", "said"),
+    [
+        (broken(offsets=None), "it holds spectra. Wanted"),
+        (broken(spectra=np.ones((4, 5, 7))), "for 6 offsets"),
+        (broken(offsets=np.array([0.0, 0, 1, 2, 3, 4])), "stand there twice"),
+        (broken(offsets=np.array([-500.0, -200, -100, 100, 200, 900])), "not in Hz"),
+        (broken(spectra=np.full((4, 5, 6), np.nan)), "no voxel of 20"),
+        (broken(spectra=np.full((4, 5, 6), 900.0)), "not divided by M0"),
+        (broken(mask=np.zeros((4, 5))), "no voxel of 0"),
+        (broken(region=np.full((4, 5), 7)), "regions 7 to 7"),
+    ],
+)
+def test_bad_volumes_get_a_sentence(held, said, tmp_path):
+    np.savez(tmp_path / "scan.npz", **held)
+    with pytest.raises(DataError, match=said):
+        read_volume(tmp_path / "scan.npz")
+
+
+def test_m0_divides_and_voxels_with_gaps_are_counted(tmp_path):
+    spectra = np.full((4, 5, 7), 400.0)
+    spectra[..., 0] = 800.0
+    spectra[1, 2, 3] = np.nan
+    offsets = np.array([-300.0, 9.0, 5.0, 2.0, 0.0, -2.0, -5.0])
+    np.savez(tmp_path / "scan.npz", spectra=spectra, offsets=offsets)
+    found = read_volume(tmp_path / "scan.npz")
+    assert found.offsets.tolist() == [-5, -2, 0, 2, 5, 9] and found.dropped == 1
+    np.testing.assert_array_equal(found.spectra, np.full((19, 6), 0.5))
+
+
+def test_nifti_is_read_with_its_offsets(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    spectra = np.random.default_rng(0).uniform(0.3, 0.9, (3, 4, 1, 6)).astype(np.float32)
+    nibabel.save(nibabel.Nifti1Image(spectra, np.eye(4)), tmp_path / "scan.nii")
+    with pytest.raises(DataError, match=r"no scan\.offsets\.txt beside it"):
+        read_volume(tmp_path / "scan.nii")
+    (tmp_path / "scan.offsets.txt").write_text("-5\n-2\n0\n2\n5\n9\n")
+    found = read_volume(tmp_path / "scan.nii")
+    np.testing.assert_array_equal(found.spectra, spectra.reshape(12, 6))
+
+
+def test_maps_of_a_nifti_file_lie_where_it_lies(tmp_path, brain):
+    nibabel = pytest.importorskip("nibabel")
+    with np.load(brain) as held:
+        spectra, offsets, mask = held["spectra"][:, :, None], held["offsets"], held["mask"][:, :, None]
+    affine = np.diag([1.5, 1.5, 3.0, 1.0])
+    affine[:3, 3] = -20, 10, 5
+    nibabel.save(nibabel.Nifti1Image(spectra, affine), tmp_path / "scan.nii.gz")
+    nibabel.save(nibabel.Nifti1Image(mask.astype(np.uint8), affine), tmp_path / "scan.mask.nii.gz")
+    (tmp_path / "scan.offsets.txt").write_text("\n".join(map(str, offsets)))
+    names = PRESETS["ten"].target
+    point = torch.rand(int(mask.sum()), 10)
+    written = write_maps(tmp_path / "scan.nii.gz", names, point, point / 10, tmp_path, synthetic=False)
+    assert [file.name for file in written] == [
+        f"scan_maps{end}" for end in (".npz", ".nii.gz", ".txt", ".png")
+    ]
+    images = nibabel.load(tmp_path / "scan_maps.nii.gz")
+    np.testing.assert_array_equal(images.affine, affine)
+    told = (tmp_path / "scan_maps.txt").read_text().split()
+    values = np.asarray(images.dataobj)
+    np.testing.assert_array_equal(values[mask, told.index("noe_amplitude")], point[:, 2].numpy())
+    left, right = (spectra[mask][:, np.argmin(np.abs(offsets - at))] for at in (-3.5, 3.5))
+    np.testing.assert_allclose(values[mask, told.index(ASYMMETRY)], left - right, atol=1e-6)
+    assert np.isnan(values[~mask]).all()
+
+
+def test_the_head_holds_nothing_that_was_fitted():
+    head = LorentzianHead(Target("real", PRESETS["ten"].target))
+    assert not head.state_dict()

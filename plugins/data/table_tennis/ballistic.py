@@ -1,0 +1,206 @@
+"""The physics as a density head: the state from what was seen, its flight, and how sure either is."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.density_head import DensityHead, Fitted
+from framework.distributions.density import Mixture
+from framework.distributions.normals import IndependentNormals, JointNormal
+from framework.errors import ConfigError
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.data.table_tennis.estimation import Estimate, Prior, Seen, estimated, root, seen_of
+from plugins.data.table_tennis.flying import flown, flown_with_slopes
+from plugins.data.table_tennis.identification import found_of, identified, with_found
+from plugins.data.table_tennis.physics import Constants
+from plugins.data.table_tennis.windows import PARTS
+
+WINDOWS = 32
+"""From which `fit` finds the constants at most, evenly chosen."""
+LEAST_NOISE = 1e-4
+"""Metres."""
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class BallisticHead(DensityHead, Fitted):
+    """A ball's flight by its differential equation (thesis §4.2, "physics-based"; Mülling et al. 2011).
+
+    Position, velocity and spin at the first frame come from the frames by robust least squares, and the equation is
+    integrated to the times asked for, through a bounce where there is one. `fit` finds the constants of ball and table,
+    and the noise, that make whole training windows likeliest; `calibrate` a factor for the spread of each number.
+
+    The density is that of the state, N(found, (JᵀJ)⁻¹), carried to the future: `linearised`, a normal density, or
+    `sampled`, a mixture of as many flights as there are samples, which can go to either side of a table's edge.
+    Input and target are in metres; no gradient is given.
+
+    Args:
+        observed, step: of the data.
+        density: how the state's uncertainty is carried.
+        samples: flights of the mixture; may be set at any time.
+        spin: standard deviation believed of each component of the spin, rad/s.
+        noise: of a coordinate, m; what `fit` starts from.
+        steps: most steps of the search for a state; real flights take some ten.
+        identify: whether `fit` finds the constants, or those of the config are believed.
+        constants: of the ball and the table; what `fit` starts from.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 3, 10, 30, 100)}
+    bibtex = """@article{mulling2011biomimetic,
+  author  = {M{\\"u}lling, Katharina and Kober, Jens and Peters, Jan},
+  title   = {A Biomimetic Approach to Robot Table Tennis},
+  journal = {Adaptive Behavior},
+  volume  = {19},
+  number  = {5},
+  pages   = {359--376},
+  year    = {2011}
+}"""
+
+    found: Tensor
+    noise: Tensor
+    spread: Tensor
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        observed: Annotated[int, Field(ge=3, le=1000)] = 20,
+        step: Positive = 0.016,
+        density: Literal["linearised", "sampled"] = "linearised",
+        samples: Annotated[int, Field(ge=1)] = 30,
+        spin: Positive = 60.0,
+        noise: Positive = 0.003,
+        steps: Annotated[int, Field(ge=1)] = 40,
+        identify: bool = True,
+        constants: Constants,
+    ) -> None:
+        super().__init__()
+        self.future = future_of(target, "density_head ballistic")
+        self.observed, self.step = observed, step
+        self.density: Literal["linearised", "sampled"] = density
+        self.samples = samples
+        self.prior = Prior(spin=spin)
+        self.steps = steps
+        self.identify = identify
+        self.given = constants
+        self.size = observed * len(PARTS)
+        self.register_buffer("found", found_of(constants))
+        self.register_buffer("noise", torch.tensor(noise).double())
+        self.register_buffer("spread", torch.ones(3 * self.future, dtype=torch.float64))
+
+    @property
+    def constants(self) -> Constants:
+        """Those of the config, with what `fit` found."""
+        return with_found(self.given, self.found)
+
+    @torch.no_grad()
+    def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        """Constants and noise that make whole windows likeliest (identification.py)."""
+        chosen = torch.linspace(0, len(features) - 1, min(WINDOWS, len(features))).round().long()
+        seen = seen_of(features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        after = self._after(seen)
+        future = target[chosen].double().cpu().unflatten(-1, (self.future, 3))
+        whole = Seen(
+            torch.cat([seen.times, after], 1),
+            torch.cat([seen.places, torch.where(future.abs() < 50, future, torch.nan)], 1),
+        )
+        estimate = estimated(whole, self.constants, float(self.noise), self.prior, most=self.steps)
+        self._measure_noise(whole, estimate.state)
+        if self.identify:
+            numbers, states = identified(whole, self.constants, estimate.state, float(self.noise), self.prior)
+            self.found.copy_(numbers)
+            self._measure_noise(whole, states)
+
+    def _measure_noise(self, seen: Seen, states: Tensor) -> None:
+        apart = flown(states, seen.times, self.constants)[..., :3] - seen.places
+        left = apart[~apart.isnan()].abs()
+        if len(left):  # the median of |r| is 0.6745 of a normal's standard deviation
+            self.noise.copy_((left.median() / 0.6745).clamp(LEAST_NOISE, 1.0))
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        raw = require_finite(raw, self.size)
+        flat = raw.detach().reshape(math.prod(raw.shape[:-1]), self.size)
+        seen = seen_of(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        estimate = estimated(seen, self.constants, float(self.noise), self.prior, most=self.steps)
+        build = self._linearised if self.density == "linearised" else self._sampled
+        # no gradient is claimed: a search ends where it ends
+        return build(seen, estimate, raw, (raw * 0).sum(-1, keepdim=True))
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    @torch.no_grad()
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """The variance of each number by the factor that makes its squared residuals what they are."""
+        self.spread.fill_(1.0)
+        seen = seen_of(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        estimate = estimated(seen, self.constants, float(self.noise), self.prior, most=self.steps)
+        mean, factor = self._carried(seen, estimate)
+        variance = factor.square().sum(-1) + float(self.noise) ** 2
+        ratio = (target.double().cpu() - mean).square() / variance
+        if len(ratio):
+            # a count of squares has a relative error √(2/n); of few windows the factor of all counts with
+            weight = len(ratio) / (len(ratio) + 20)
+            self.spread.copy_((weight * ratio.mean(0) + (1 - weight) * ratio.mean()).sqrt().clamp(0.1, 1e3))
+
+    def _after(self, seen: Seen) -> Float[Tensor, "flight time"]:
+        moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
+        return moments.expand(len(seen.times), -1)
+
+    def _whole(self, seen: Seen) -> Float[Tensor, "flight time"]:
+        return torch.cat([seen.times, self._after(seen)], 1)
+
+    def _carried(self, seen: Seen, estimate: Estimate) -> tuple[Tensor, Tensor]:
+        """Mean of the future (flight, number), and a factor F of its covariance F Fᵀ (flight, number, 9)."""
+        places, slopes = flown_with_slopes(estimate.state, self._whole(seen), self.constants)
+        mean = places[:, -self.future :].flatten(1)
+        return mean, slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)
+
+    def _linearised(self, seen: Seen, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
+        mean, factor = self._carried(seen, estimate)
+        spread = self.spread.cpu()
+        factor = spread.unsqueeze(-1) * factor
+        covariance = factor @ factor.mT + torch.diag((float(self.noise) * spread).square())
+        scale = torch.linalg.cholesky(covariance)
+        shape = raw.shape[:-1]
+        joint = scale.reshape(*shape, *scale.shape[-2:]).to(raw)
+        return JointNormal(mean.reshape(*shape, mean.shape[-1]).to(raw) + zero, joint)
+
+    def _sampled(self, seen: Seen, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
+        count, flights = self.samples, len(estimate.state)
+        # the same points whenever asked: the density is one, and no estimate of one
+        points = torch.quasirandom.SobolEngine(9, scramble=True, seed=0).draw(count, dtype=torch.float64)
+        noise = torch.special.ndtri(points.clamp(1e-9, 1 - 1e-9))
+        states = estimate.state.unsqueeze(1) + noise @ root(estimate.covariance).mT
+        times = self._whole(seen).repeat_interleave(count, 0)
+        places = flown(states.reshape(-1, 9), times, self.constants)[:, -self.future :, :3]
+        places = places.reshape(flights, count, 3 * self.future)
+        middle = places.mean(1, keepdim=True)
+        places = middle + self.spread.cpu() * (places - middle)
+        shape = (*raw.shape[:-1], count)
+        mean = places.reshape(*shape, 3 * self.future).to(raw) + zero.unsqueeze(-2)
+        scale = (float(self.noise) * self.spread).to(raw).expand_as(mean)
+        weights = torch.zeros(shape, dtype=raw.dtype, device=raw.device)
+        return Mixture(weights, IndependentNormals(mean, scale))
+
+
+def future_of(target: Target, by: str) -> int:
+    """How many frames are to be predicted.
+
+    Raises:
+        ConfigError: the target is not x, y and z at several times.
+    """
+    target.require("real", by=by)
+    axes = [name.partition("_")[0] for name in target.names]
+    if not axes or axes != list("xyz") * (len(axes) // 3):
+        raise ConfigError(
+            f"{by} predicts x, y and z at one time after the other, but the target is {target.told}. Choose "
+            "data=table_tennis."
+        )
+    return len(axes) // 3

@@ -1,0 +1,203 @@
+"""Flights of a table-tennis ball; the contract is framework.data's."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.data import Batch, Data, Splits
+from framework.datasets.fields import Fields
+from framework.errors import DataError
+from framework.geometry.meshes import stream
+from framework.storage.generated import read_mark
+from framework.target import Target
+from plugins.data.table_tennis.physics import Constants
+from plugins.data.table_tennis.picture import side_view
+from plugins.data.table_tennis.recordings import SUFFIXES, Flight, distinct, flights_of, irregular, listed
+from plugins.data.table_tennis.simulator import Simulation, simulated
+from plugins.data.table_tennis.windows import PARTS, Grid, Window, prefix, windows
+
+Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
+
+
+class TableTennis(Data):
+    """Where a ball will be, from where it was seen (thesis §4.2): simulated where no root is given.
+
+    An input is `observed` frames of `PARTS`, flattened; the target the positions at the next `future` multiples of the
+    step, metres, as they were recorded. Batches hold "truth" too, shaped like the target: of simulated flights the
+    positions without noise, of recorded ones the target itself; and "flight", the flight's number.
+
+    A flight's windows are all in one split; a flight that is recorded twice counts once.
+
+    Args:
+        root: a folder of flights, or one file: *.csv with the columns t (s), x, y, z (m), or *.mat of the WAM
+            laboratory. None: simulated flights.
+        grid: what is read and predicted.
+        validation, test: shares of the flights, drawn at random.
+        data_seed: of that draw, whatever the seed of the run.
+        forget: share of the seen frames that are hidden from each training window anew.
+        unreadable: what becomes of files that cannot be read.
+        simulation: what is simulated.
+        constants: of the ball and the table that are simulated.
+    """
+
+    bibtex = """@article{gomez2020real,
+  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
+  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
+  journal = {IEEE Robotics and Automation Letters},
+  volume  = {5},
+  number  = {2},
+  pages   = {970--976},
+  year    = {2020}
+}"""
+    groups = ("table_tennis",)
+    suffixes = SUFFIXES
+
+    def __init__(
+        self,
+        *,
+        root: str | None = None,
+        grid: Grid,
+        validation: Share = 0.1,
+        test: Share = 0.2,
+        data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
+        forget: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0,
+        unreadable: Literal["error", "skip"] = "error",
+        simulation: Simulation,
+        constants: Constants,
+    ) -> None:
+        self.root = root
+        self.grid = grid
+        self.shares = (validation, test)
+        self.data_seed = data_seed
+        self.forget = forget
+        self.varies = forget > 0
+        self.unreadable = unreadable
+        self.simulation = simulation
+        self.constants = constants
+        self.input_shape = (self.grid.observed * len(PARTS),)
+
+    def prepare(self) -> None:
+        if self.root is None:
+            root = simulated(self.simulation, self.constants, self.grid.step)
+        else:
+            root = Path(self.root).expanduser()
+        found, left_out = self._found(root)
+        flights, self.repeated = distinct(found)
+        held = [windows(flight, self.grid) for flight in flights]
+        whole = [number for number, windows_of in enumerate(held) if windows_of]
+        self.short = len(flights) - len(whole)
+        if len(whole) < 3:
+            raise DataError(
+                f"{root} has {len(flights)} flights, of which {len(whole)} are long enough for {self.grid.least} "
+                f"frames to read and {self.grid.future} to predict without a gap; wanted three or more. Lower "
+                "data.future "
+                "or data.least, or give more flights."
+            )
+        self.lost = sum(irregular(flight, self.grid.step) for flight in flights)
+        order = stream(self.data_seed, "splits").permutation(len(whole))
+        cuts = [max(1, round(share * len(whole))) for share in self.shares]
+        if sum(cuts) >= len(whole):
+            raise DataError(
+                f"data.validation + data.test = {sum(self.shares):g} leaves none of {len(whole)} flights for training; "
+                "lower them."
+            )
+        chosen = np.split(order, [len(whole) - sum(cuts), len(whole) - cuts[1]])
+        self._tables = {
+            name: _table([(whole[n], window) for n in sorted(part.tolist()) for window in held[whole[n]]])
+            for name, part in zip(Splits._fields, chosen, strict=True)
+        }
+        train = self._tables["train"].fields["target"].double()
+        scale = train.std(0, unbiased=False).clamp(min=1e-3)
+        self.target = Target("real", self.grid.names, tuple(train.mean(0).tolist()), tuple(scale.tolist()))
+        self.synthetic = read_mark(root) is not None if root.is_dir() else False
+        self.skipped = left_out
+
+    def _found(self, root: Path) -> tuple[list[Flight], int]:
+        flights, left_out = [], 0
+        for file in listed(root):
+            try:
+                flights += flights_of(file, self.grid.step)
+            except DataError:
+                if self.unreadable == "error":
+                    raise
+                left_out += 1
+        return flights, left_out
+
+    def splits(self) -> Splits:
+        return Splits(**self._tables)
+
+    def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        """Of each flight what is read at its last frame: the next frames are predicted."""
+        if not files:
+            raise DataError(
+                "No file was given; wanted a flight as CSV with the columns t, x, y, z, or as *.mat."
+            )
+        flights = [flight for file in files for flight in flights_of(Path(file), self.grid.step)]
+        return Fields(
+            input=torch.stack([self._last(flight) for flight in flights]), index=torch.arange(len(flights))
+        )
+
+    def _last(self, flight: Flight) -> Tensor:
+        found = prefix(flight, len(flight.times) - 1, self.grid)
+        if found is None:
+            raise DataError(
+                f"{flight.name} has fewer than {self.grid.least} frames in its last "
+                f"{self.grid.observed * self.grid.step:g} s; wanted as many, to predict from. Give a longer recording."
+            )
+        return torch.from_numpy(found).float()
+
+    def inputs(self, given: Any) -> Tensor:
+        """Of files, of one flight as an array (frame, 4) of t, x, y, z, or of inputs as they are."""
+        if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == 4:
+            table = given.astype(float)
+            return self._last(Flight("the given flight", table[:, 0], table[:, 1:]))[None]
+        return Data.inputs(self, given)
+
+    def augment(self, batch: Batch) -> Batch:
+        """Hide frames; the last one stays."""
+        if not self.forget:
+            return batch
+        inputs = batch["input"].unflatten(-1, (self.grid.observed, len(PARTS)))
+        kept = torch.rand(inputs.shape[:2]).to(inputs.device) >= self.forget
+        kept[:, -1] = True
+        return {**batch, "input": (inputs * kept[..., None]).flatten(1)}
+
+    def fingerprint(self) -> Mapping[str, str]:
+        digest = hashlib.sha256()
+        for table in self._tables.values():
+            for name in ("input", "target"):
+                digest.update(table.fields[name].numpy().tobytes())
+        return {
+            "root": str(self.root),
+            "version": "table_tennis 1",
+            **{name: str(len(table)) for name, table in self._tables.items()},
+            "flights": " ".join(str(len(table.fields["flight"].unique())) for table in self._tables.values()),
+            "repeated": str(self.repeated),
+            "too short": str(self.short),
+            "frames missing": str(self.lost),
+            "sha256": digest.hexdigest(),
+        }
+
+    def picture(self, inputs: Tensor) -> np.ndarray:
+        return side_view(inputs.unflatten(-1, (self.grid.observed, len(PARTS))).detach().cpu().numpy())
+
+
+def _table(held: Sequence[tuple[int, Window]]) -> Fields:
+    single = [
+        torch.from_numpy(np.stack(part)).float() for part in list(zip(*(w for _, w in held), strict=True))[:3]
+    ]
+    return Fields(
+        input=single[0],
+        target=single[1],
+        truth=single[2],
+        group=torch.zeros(len(held), dtype=torch.int64),
+        flight=torch.tensor([flight for flight, _ in held]),
+        index=torch.arange(len(held)),
+    )

@@ -1,0 +1,91 @@
+"""Pictures of predicted flights: how the error grows, bundles of flights in space, and where they land."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from framework.figures.style import BLUE, COLOURS, GREY, RED, titled_figure
+
+if TYPE_CHECKING:
+    from plugins.data.table_tennis.flight_error import Shown
+
+BUNDLE = 30
+"""Flights of a bundle that are drawn."""
+
+
+def flights(
+    moments: Sequence[float],
+    growth: np.ndarray,
+    shown: "Sequence[Shown]",
+    height: float,
+    title: str,
+    *,
+    synthetic: bool,
+) -> Figure:
+    """Error against time into the future; two predictions in space; where all that are shown land.
+
+    Args:
+        moments: milliseconds.
+        growth: mean error at these, cm.
+        height: of the plane through which landing balls come down, m.
+    """
+    figure = titled_figure((13.5, 4.8), title, synthetic)
+    grid = figure.add_gridspec(1, 3, width_ratios=(1, 1.35, 1))
+    axes = figure.add_subplot(grid[0])
+    axes.plot(moments, growth, color=BLUE, marker="o", markersize=3)
+    axes.set(xlabel="time into the future (ms)", ylabel="mean error (cm)", ylim=(0, None))
+    axes.grid(alpha=0.3)
+    axes.set_title("error of the point prediction", fontsize=10)
+    space: Any = figure.add_subplot(grid[1], projection="3d")
+    for number, one in enumerate(shown[: min(3, len(shown))]):
+        bundle(space, one, COLOURS[number])
+    space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    space.set_box_aspect((1, 2.2, 0.9), zoom=0.9)
+    space.locator_params(axis="x", nbins=3)
+    space.locator_params(axis="y", nbins=4)
+    space.locator_params(axis="z", nbins=4)
+    space.view_init(elev=18, azim=-35)
+    space.set_title("seen (dots), true (black), drawn (thin)", fontsize=10)
+    landing_places(figure.add_subplot(grid[2]), shown, height)
+    return figure
+
+
+def bundle(axes: Any, one: "Shown", color: str) -> None:
+    """One prediction in space."""
+    axes.plot(*one.read.numpy().T, linestyle="", marker="o", markersize=2.5, color=GREY)
+    for draw in one.draws[:BUNDLE].numpy():
+        axes.plot(*draw.T, color=color, alpha=0.25, linewidth=0.7)
+    axes.plot(*one.future.numpy().T, color="black", linewidth=1.4)
+
+
+def landing_places(axes: Any, shown: "Sequence[Shown]", height: float) -> None:
+    """Seen from above: the true places as crosses, those of the draws as dots with the ellipse that holds 90 %."""
+    from plugins.data.table_tennis.flight_error import crossing
+
+    some = False
+    for number, one in enumerate(shown):
+        last = one.read[-1:]
+        place, lands = crossing(torch.cat([last, one.future]), height)
+        drawn, there = crossing(torch.cat([last.expand(len(one.draws), -1, -1), one.draws], 1), height)
+        if not bool(lands) or int(there.sum()) < 10:
+            continue
+        some = True
+        color = COLOURS[number % len(COLOURS)]
+        points = drawn[there].numpy()
+        axes.plot(*points.T, linestyle="", marker=".", markersize=2, alpha=0.35, color=color)
+        values, vectors = np.linalg.eigh(np.cov(points.T))
+        width, tall = 2 * np.sqrt(4.605 * values.clip(0))
+        angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+        axes.add_patch(Ellipse(points.mean(0), width, tall, angle=angle, fill=False, color=color, lw=1.2))
+        axes.plot(*place.numpy(), marker="x", color="black", markersize=7, markeredgewidth=1.6)
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+    axes.set_title(f"landing at z = {height:g} m (true ×)", fontsize=10)
+    if some:
+        axes.set_aspect("equal", adjustable="datalim")
+    else:
+        axes.text(0.5, 0.5, "none of those shown lands", ha="center", color=RED, transform=axes.transAxes)
+    axes.grid(alpha=0.3)

@@ -1,0 +1,106 @@
+"""Many flights at once, in torch: Runge-Kutta steps, and bounces that are found inside them."""
+
+from typing import no_type_check
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from plugins.data.table_tennis.physics import Constants, bounced
+
+NEWTON = 4
+"""Steps to the time of a bounce; from a parabola's root the error falls below rounding in three."""
+
+
+@no_type_check  # called for every step
+def free(
+    state: Float[Tensor, "flight 9"], time: Float[Tensor, "flight"], constants: Constants
+) -> Float[Tensor, "flight 9"]:
+    """The state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
+
+    Of 16 ms at 6 m/s its error is below 1e-8 m (test_physics.py). Spin decays whatever the ball does, so only the
+    velocity has stages: those of the place are the velocity's own, and those of the spin are powers of the decay.
+    """
+    h = time.unsqueeze(-1)
+    place, velocity, spin = state[:, :3], state[:, 3:6], state[:, 6:]
+    gravity = state.new_tensor([0.0, 0.0, constants.gravity])
+    lift, decay = constants.lift * spin, constants.spin_decay * h
+
+    def faster(velocity: Tensor, left: Tensor | float) -> Tensor:
+        """physics.acceleration, of vectors; `left` of the spin."""
+        drag = constants.drag * (velocity.square().sum(-1, keepdim=True) + 1e-24).sqrt()
+        return torch.linalg.cross(left * lift, velocity) - drag * velocity - gravity
+
+    halved = 1 - decay / 2
+    twice = 1 - decay / 2 * halved
+    third = 1 - decay * twice
+    a = faster(velocity, 1.0)
+    b = faster(velocity + h / 2 * a, halved)
+    c = faster(velocity + h / 2 * b, twice)
+    d = faster(velocity + h * c, third)
+    arrived = place + h * velocity + h.square() / 6 * (a + b + c)
+    rest = 1 - decay / 6 * (1 + 2 * halved + 2 * twice + third)
+    return torch.cat([arrived, velocity + h / 6 * (a + 2 * b + 2 * c + d), rest * spin], -1)
+
+
+def step(
+    state: Float[Tensor, "flight 9"], time: Float[Tensor, "flight"], constants: Constants
+) -> Float[Tensor, "flight 9"]:
+    """The state after `time` seconds, with at most one bounce on the way; one that follows at once lays the ball on
+    the table, so that no number of bounces can go on for ever."""
+    after = free(state, time, constants)
+    touching = constants.touching
+    hits = (after[:, 2] < touching) & (state[:, 2] >= touching - 1e-9)
+    rows = hits.nonzero()[:, 0]
+    if not len(rows):
+        return after
+    before, whole = state[rows], time[rows]
+    # of the parabola the later root, then Newton's steps along the flight itself
+    height, climb = before[:, 2] - touching, before[:, 5]
+    root = (climb.square() + 2 * constants.gravity * height.clamp(min=0) + 1e-18).sqrt()
+    until = torch.minimum(((climb + root) / constants.gravity).clamp(min=0), whole)
+    for _ in range(NEWTON):
+        there = free(before, until, constants)
+        until = until - (there[:, 2] - touching) / there[:, 5].clamp(max=-1e-3)
+        until = torch.minimum(until.clamp(min=0), whole)
+    there = free(before, until, constants)
+    u, v, w, a, b, c = there[:, 3:].unbind(-1)
+    velocity, spin = bounced((u, v, w), (a, b, c), constants)
+    level = torch.full_like(u, touching)
+    left = torch.stack([there[:, 0], there[:, 1], level, *velocity, *spin], -1)
+    risen = free(left, whole - until, constants)
+    lies = (risen[:, 2] < touching) & (risen[:, 1] < constants.far)
+    risen = torch.where(lies.unsqueeze(-1) & (torch.arange(9) == 2), risen.clamp(min=touching), risen)
+    risen = torch.where(lies.unsqueeze(-1) & (torch.arange(9) == 5), risen.clamp(min=0), risen)
+    over = (there[:, 1] > constants.near) & (there[:, 1] < constants.far)
+    return after.index_put((rows,), torch.where(over.unsqueeze(-1), risen, after[rows]))
+
+
+def flown(
+    start: Float[Tensor, "flight 9"], times: Float[Tensor, "flight time"], constants: Constants
+) -> Float[Tensor, "flight time 9"]:
+    """The states of flights at `times`, seconds, not decreasing, of which the first is that of `start`.
+
+    One step leads from each time to the next: they should be no more than some 20 ms apart.
+    """
+    states = [start]
+    for number in range(1, times.shape[1]):
+        states.append(step(states[-1], times[:, number] - times[:, number - 1], constants))
+    return torch.stack(states, 1)
+
+
+def flown_with_slopes(
+    start: Float[Tensor, "flight 9"], times: Float[Tensor, "flight time"], constants: Constants
+) -> tuple[Float[Tensor, "flight time 3"], Float[Tensor, "flight time 3 9"]]:
+    """Positions, and their derivatives by the state at the start.
+
+    By central differences, all states at once: of float64 they have nine digits (test_physics.py), and take a hundredth
+    of the time that torch's forward mode takes to interpret each of some ten thousand small operations.
+    """
+    flights, time = times.shape
+    shift = torch.diag(start.new_tensor([1e-5] * 6 + [1e-3] * 3))
+    states = torch.cat([start[:, None], start[:, None] + shift, start[:, None] - shift], 1)  # (flight, 19, 9)
+    found = flown(states.reshape(-1, 9), times.repeat_interleave(19, 0), constants)[..., :3]
+    found = found.reshape(flights, 19, time, 3)
+    change = (found[:, 1:10] - found[:, 10:]) / (2 * shift.diagonal()[:, None, None])
+    return found[:, 0], change.permute(0, 2, 3, 1)

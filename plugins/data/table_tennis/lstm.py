@@ -1,0 +1,111 @@
+"""A recurrent network that predicts a flight frame by frame, each from the one that it predicted before."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from framework.density_head import DensityHead
+from framework.distributions.normals import IndependentNormals
+from framework.heads.parameters import require_finite
+from framework.target import Target
+from plugins.data.table_tennis.ballistic import future_of
+from plugins.data.table_tennis.windows import PARTS
+
+FARTHEST = 100.0
+"""Metres, or seconds; numbers that are read are cut off here."""
+LEAST, WIDEST = 1e-4, 1e3
+"""Standard deviations, metres."""
+
+
+class LSTMHead(DensityHead):
+    """LSTM over the frames that were seen, and on over those to come (Hochreiter & Schmidhuber 1997; thesis [121]).
+
+    At each frame the network says how far the ball moves until the next, and how sure that is; where the next frame is
+    missing, or is to come, the place it said is read in its stead. So errors add up with time, which is what it is here
+    to show. A frame's coordinates are independent normals; it is trained by their likelihood.
+
+    Args:
+        observed: frames of an input, as the data says.
+        hidden: width of the network.
+    """
+
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    direct = True
+    bibtex = """@article{hochreiter1997long,
+  author  = {Hochreiter, Sepp and Schmidhuber, J{\\"u}rgen},
+  title   = {Long Short-Term Memory},
+  journal = {Neural Computation},
+  volume  = {9},
+  number  = {8},
+  pages   = {1735--1780},
+  year    = {1997}
+}"""
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        observed: Annotated[int, Field(ge=2, le=1000)] = 20,
+        hidden: Annotated[int, Field(ge=1)] = 64,
+    ) -> None:
+        super().__init__()
+        self.future = future_of(target, "density_head lstm")
+        self.observed = observed
+        self.size = observed * len(PARTS)
+        self.cell = nn.LSTMCell(7, hidden)  # place, last move, and whether it was seen
+        self.out = nn.Linear(hidden, 6)
+
+    def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        raw = require_finite(raw, self.size)
+        flat = (
+            raw.reshape(math.prod(raw.shape[:-1]), self.size)
+            .to(self.out.weight.dtype)
+            .clamp(-FARTHEST, FARTHEST)
+        )
+        frames = flat.unflatten(-1, (self.observed, len(PARTS)))
+        place, move = frames.new_zeros(len(flat), 3), frames.new_zeros(len(flat), 3)
+        begun = frames.new_zeros(len(flat), 1)
+        state = None
+        for frame in frames.unbind(1):
+            there = (frame[:, 4:] > 0.5).to(frames.dtype)
+            expected = place + move
+            now = torch.where(there > 0, frame[:, 1:4], expected)
+            # of the first frame that is seen no move is known
+            moved = begun * (now - place)
+            begun = torch.maximum(begun, there)
+            place = begun * now
+            move, _, state = self._next(place, moved, there, state)
+            move = begun * move
+        places, widths = [], []
+        unseen = torch.zeros_like(begun)
+        for _ in range(self.future):
+            place = (place + move).clamp(-FARTHEST, FARTHEST)
+            places.append(place)
+            last, width, state = self._next(place, move, unseen, state)
+            move = last
+            widths.append(width)
+        shape = (*raw.shape[:-1], 3 * self.future)
+        mean, scale = (torch.stack(part, 1).reshape(shape) for part in (places, widths))
+        return IndependentNormals(mean, scale)
+
+    def _next(
+        self, place: Tensor, move: Tensor, there: Tensor, state: tuple[Tensor, Tensor] | None
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
+        """The next move (batch, 3), its width, and the network's state."""
+        hidden, memory = self.cell(torch.cat([place, 10 * move, there], -1), state)
+        numbers = self.out(hidden)
+        # a frame's move is a tenth of a metre; the ball goes on as it did, and the network says what changes
+        width = (0.05 * nn.functional.softplus(numbers[:, 3:])).clamp(max=WIDEST) + LEAST
+        return move + 0.1 * numbers[:, :3], width, (hidden, memory)
+
+    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        pass  # everything is trained

@@ -1,0 +1,135 @@
+"""The physics of a table-tennis ball: flight with drag, Magnus force and spin decay, and its contact with the table.
+
+Formulas are written over single components with arithmetic alone, so that they serve plain floats (SciPy's solvers
+call them a hundred thousand times, too often for the type checks that tests switch on) and batches of tensors (the
+estimation) alike. Units: metres, seconds, rad/s; z is
+up; y runs along the table.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, no_type_check
+
+from pydantic import Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = tuple[Any, Any, Any]
+"""x, y and z, each a float or a tensor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Constants:
+    """What a ball and a table are like; the values are those of the WAM laboratory's simulator where it has them.
+
+    Attributes:
+        gravity: m/s².
+        drag: k of the deceleration k |v| v, 1/m (Mülling et al. 2011, eq. 1).
+        lift: m of the Magnus acceleration m ω × v, dimensionless: 1/2 ρ A r c / mass with a lift coefficient of 0.6.
+        spin_decay: share of the spin that the air takes, 1/s.
+        restitution: speed upwards after the bounce, by that downwards before it.
+        friction: Coulomb's coefficient of ball and table.
+        radius: of the ball, m.
+        surface: height of the table, m, in the frame of the recordings.
+        near, far: y where the table begins and ends, m. Beyond them the ball falls on.
+    """
+
+    gravity: Positive = 9.802
+    drag: NotNegative = 0.1414
+    lift: NotNegative = 0.0033
+    spin_decay: NotNegative = 0.2
+    restitution: Annotated[float, Field(gt=0, le=1)] = 0.88
+    friction: NotNegative = 0.1
+    radius: Positive = 0.02
+    surface: Finite = -0.95
+    near: Finite = -3.9
+    far: Finite = -1.1
+
+    @property
+    def touching(self) -> float:
+        """Height of the ball's centre when it touches the table, m."""
+        return self.surface + self.radius
+
+
+@no_type_check
+def acceleration(velocity: Vector, spin: Vector, constants: Constants) -> Vector:
+    """v' = g - k |v| v + m ω × v, m/s² (Mülling, Kober & Peters 2011, eq. 1, with Magnus's term)."""
+    (u, v, w), (a, b, c) = velocity, spin
+    # the least square keeps the root differentiable where the ball rests
+    drag = constants.drag * (u * u + v * v + w * w + 1e-24) ** 0.5
+    lift = constants.lift
+    return (
+        lift * (b * w - c * v) - drag * u,
+        lift * (c * u - a * w) - drag * v,
+        lift * (a * v - b * u) - drag * w - constants.gravity,
+    )
+
+
+@no_type_check
+def slip(velocity: Vector, spin: Vector, radius: float) -> tuple[Any, Any]:
+    """Velocity of the ball's lowest point along the table, v + ω × (-r ẑ), m/s."""
+    return velocity[0] - radius * spin[1], velocity[1] + radius * spin[0]
+
+
+@no_type_check
+def bounced(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vector, Vector]:
+    """Velocity and spin after a bounce in no time (Nakashima et al. 2010, for a hollow sphere, I = 2/3 m r²).
+
+    The table's friction stops the slip where it can: an impulse of 2/5 of the slip a unit of mass does. It can give no
+    more than μ times the impulse upwards, (1 + e) |w|; then the ball goes on sliding.
+
+    Args:
+        least: of two numbers the smaller; of tensors torch.minimum.
+    """
+    u, v, w = velocity
+    along, across = slip(velocity, spin, constants.radius)
+    speed = (along * along + across * across + 1e-24) ** 0.5
+    up = (1 + constants.restitution) * abs(w)
+    most = constants.friction * up / speed
+    share = (most + 0.4 - abs(most - 0.4)) / 2  # the smaller of the two, of floats and tensors alike
+    push, pull = -share * along, -share * across
+    turn = 1.5 / constants.radius
+    after = (u + push, v + pull, constants.restitution * abs(w))
+    return after, (spin[0] + turn * pull, spin[1] - turn * push, spin[2])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spring:
+    """The table as a spring and a damper: contact in a short time, not in none.
+
+    The ball is pushed up while it is inside the table and the push is upwards: N = max(0, Ω² p + 2 ζ Ω p'), where p is
+    how far inside it is. While it touches, the height has the eigenvalues Ω (-ζ ± √(ζ² - 1)): with Ω of 1e8/s
+    the contact is 1e8 times as fast as a flight of a second.
+
+    Attributes:
+        frequency: Ω, 1/s.
+        damping: ζ; at 1 the contact is critically damped.
+        grip: slip below which friction is less than Coulomb's, m/s, so that its sign needs no jump.
+    """
+
+    frequency: Positive = 3000.0
+    damping: NotNegative = 0.04
+    grip: Positive = 0.01
+
+
+@no_type_check
+def push(height: Any, climb: Any, spring: Spring) -> Any:
+    """Push upwards per mass of a ball that is inside the table, m/s², before it is cut at 0.
+
+    Args:
+        height: of its centre above where it touches, m; negative inside.
+        climb: its velocity upwards, m/s.
+    """
+    return -(spring.frequency**2) * height - 2 * spring.damping * spring.frequency * climb
+
+
+@no_type_check
+def pressed(
+    velocity: Vector, spin: Vector, up: Any, constants: Constants, spring: Spring
+) -> tuple[Vector, Vector]:
+    """Change of velocity and of spin, per second, by a push upwards and the friction that comes with it."""
+    along, across = slip(velocity, spin, constants.radius)
+    share = constants.friction * up / (along * along + across * across + spring.grip**2) ** 0.5
+    push_x, push_y = -share * along, -share * across
+    turn = 1.5 / constants.radius
+    return (push_x, push_y, up), (turn * push_y, -turn * push_x, 0.0)

@@ -1,0 +1,167 @@
+"""Recorded flights, from CSV files and from MATLAB files of the WAM laboratory; checked, each flight once."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from framework.datasets.csv_columns import numbers, read_columns, require
+from framework.datasets.matlab import read_variables
+from framework.errors import DataError
+
+COLUMNS = ("t", "x", "y", "z")
+TRUE = ("true_x", "true_y", "true_z")
+SUFFIXES = (".csv", ".mat")
+ALIKE = 1e-4
+"""Metres by which frames of one flight in two recordings may differ."""
+COMPARED = 8
+"""Frames from the beginning by which a flight is known again."""
+FARTHEST = 100.0
+"""Metres from the origin within which a ball is believed to be."""
+
+
+class Flight(NamedTuple):
+    """One flight.
+
+    Attributes:
+        name: the file, and the flight's number in it where it holds several.
+        times: (frame,), s, rising.
+        places: (frame, 3), m.
+        truth: the same without noise, where the flight was simulated; else None.
+    """
+
+    name: str
+    times: Float[np.ndarray, "frame"]
+    places: Float[np.ndarray, "frame 3"]
+    truth: Float[np.ndarray, "frame 3"] | None = None
+
+
+def listed(root: Path) -> list[Path]:
+    """The files of flights of a folder, by name; or the one file itself.
+
+    Raises:
+        DataError: there is none.
+    """
+    if root.is_file():
+        return [root]
+    if not root.is_dir():
+        raise DataError(
+            f"{root}: no such file or folder; wanted a folder of flights, *.csv with the columns t, x, y, z or *.mat "
+            "of the WAM laboratory. Mend data.root, or leave it out: flights are simulated then."
+        )
+    found = sorted(file for file in root.iterdir() if file.suffix.lower() in SUFFIXES)
+    if not found:
+        raise DataError(f"{root} holds no *.csv and no *.mat file; wanted recorded flights. Mend data.root.")
+    return found
+
+
+def flights_of(file: Path, step: float) -> list[Flight]:
+    """The flights of one file: of a CSV file one, of a MATLAB file all.
+
+    Args:
+        step: seconds between two frames, as the config says.
+
+    Raises:
+        DataError: the file is damaged, or a flight's times or places are wrong; says which and where.
+    """
+    if file.suffix.lower() == ".mat":
+        return [_checked(flight, step) for flight in _from_matlab(file)]
+    columns = read_columns(file)
+    require(columns, COLUMNS, "data.root")
+    times, *places = (numbers(columns, name, missing="") for name in COLUMNS)
+    truth = None
+    if all(name in columns.cells for name in TRUE):
+        truth = np.stack([numbers(columns, name, missing="") for name in TRUE], -1)
+    flight = Flight(str(file), times, np.stack(places, -1), truth)
+    return [_checked(flight, step, columns.lines)]
+
+
+def _from_matlab(file: Path) -> list[Flight]:
+    """`ballTrain.data` of cells (frame, 4), or `time` and `ball` of cells (frame,) and (frame, 3)."""
+    found = read_variables(file)
+    held: Any = found.get("ballTrain")
+    if isinstance(held, Mapping) and "data" in held:
+        tables = [np.asarray(one, float) for one in np.atleast_1d(held["data"])]
+    elif "time" in found and "ball" in found:
+        pairs = zip(np.atleast_1d(found["time"]), np.atleast_1d(found["ball"]), strict=False)
+        tables = [_joined(time, ball) for time, ball in pairs]
+    else:
+        raise DataError(
+            f"{file} holds {', '.join(found) or 'nothing'}; wanted ballTrain with a field data, or time and ball, as "
+            "the WAM laboratory's flights. Or write each flight as CSV with the columns t, x, y, z."
+        )
+    for number, table in enumerate(tables):
+        if table.ndim != 2 or table.shape[1] != 4:
+            raise DataError(
+                f"{file} flight {number}: an array of {'×'.join(map(str, table.shape))} numbers; wanted rows of t, x, "
+                "y, z. Take the flight out."
+            )
+    return [Flight(f"{file} flight {number}", one[:, 0], one[:, 1:]) for number, one in enumerate(tables)]
+
+
+def _joined(time: Any, ball: Any) -> np.ndarray:
+    time, ball = np.atleast_1d(np.asarray(time, float)), np.atleast_2d(np.asarray(ball, float))
+    same = time.ndim == 1 and ball.ndim == 2 and len(time) == len(ball)
+    return np.column_stack([time, ball]) if same else ball
+
+
+def _checked(flight: Flight, step: float, lines: Sequence[int] | None = None) -> Flight:
+    """The flight itself.
+
+    Raises:
+        DataError: fewer than two frames; a number that is not finite, or far from any table; times that do not rise;
+            frames at another rate than `step`.
+    """
+    name, times, places, _ = flight
+
+    def where(row: int) -> str:
+        return f"{name} line {lines[row]}" if lines else f"{name}, frame {row}"
+
+    if len(times) < 2:
+        raise DataError(f"{name} has {len(times)} frames; wanted two or more. Take the flight out.")
+    wrong = ~(np.isfinite(times) & (np.abs(places) <= FARTHEST).all(1))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise DataError(
+            f"{where(row)}: t, x, y, z = {times[row]:g}, {', '.join(f'{one:g}' for one in places[row])}; wanted "
+            f"seconds, and metres within {FARTHEST:g} of the origin. Mend the frame or take it out."
+        )
+    gaps = np.diff(times)
+    if (gaps <= 0).any():
+        row = int((gaps <= 0).argmax()) + 1
+        raise DataError(
+            f"{where(row)}: the time {times[row]:g} s comes after {times[row - 1]:g} s; wanted times that rise. Sort "
+            "the frames, or take repeated ones out."
+        )
+    usual = float(np.median(gaps))
+    if not 0.6 < usual / step < 1.6:
+        raise DataError(
+            f"{name} has a frame every {1000 * usual:.3g} ms; data.step says one every {1000 * step:.3g} ms. Set "
+            f"data.step={usual:.4g}."
+        )
+    return flight
+
+
+def distinct(flights: Sequence[Flight]) -> tuple[list[Flight], int]:
+    """The flights without repetitions, in their order, and how many repetitions there were.
+
+    One that begins with the same places is the same flight, wherever it is recorded; the longest recording is kept.
+    """
+    kept: list[Flight] = []
+    for flight in sorted(flights, key=lambda one: -len(one.times)):
+        if not any(_same(flight, other) for other in kept):
+            kept.append(flight)
+    chosen = {id(flight) for flight in kept}
+    return [flight for flight in flights if id(flight) in chosen], len(flights) - len(kept)
+
+
+def _same(one: Flight, other: Flight) -> bool:
+    count = min(len(one.places), len(other.places), COMPARED)
+    return bool((np.abs(one.places[:count] - other.places[:count]) <= ALIKE).all())
+
+
+def irregular(flight: Flight, step: float) -> int:
+    """How many frames are missing, by the times of those that are there."""
+    return int(np.maximum(np.rint(np.diff(flight.times) / step) - 1, 0).sum())

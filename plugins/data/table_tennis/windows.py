@@ -1,0 +1,122 @@
+"""What a model reads and predicts: the frames of a flight until now, and where the ball is at fixed times after it."""
+
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from pydantic import Field
+
+from plugins.data.table_tennis.recordings import Flight
+
+PARTS = ("time", "x", "y", "z", "seen")
+"""What is read of each frame: seconds from now (not above 0), metres, and 1 where there is a frame, 0 where it misses;
+the other numbers of a missing one are 0."""
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """What is read and predicted of a flight.
+
+    Attributes:
+        observed: most frames that are read; earlier ones are forgotten.
+        future: frames that are predicted.
+        least: frames that must be there of those that are read.
+        stride: frames from one window of a flight to the next.
+        step: seconds from frame to frame.
+        gap: seconds between two frames of the flight across which a position that is to be predicted may be
+            interpolated; a window with a wider gap in its future is left out.
+        outlier: metres from what its neighbours say beyond which a frame is no truth to predict. It is still read.
+    """
+
+    observed: Annotated[int, Field(ge=3, le=1000)] = 20
+    future: Annotated[int, Field(ge=1, le=1000)] = 35
+    least: Annotated[int, Field(ge=3, le=1000)] = 8
+    stride: Annotated[int, Field(ge=1, le=1000)] = 4
+    step: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.016
+    gap: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.04
+    outlier: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.12
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers that are predicted, frame by frame: "x_16ms", in metres."""
+        moments = [f"{1000 * self.step * frame:g}ms" for frame in range(1, self.future + 1)]
+        return tuple(f"{axis}_{moment}" for moment in moments for axis in "xyz")
+
+
+class Window(NamedTuple):
+    """One sample: (observed × 5,) read, (future × 3,) to predict, the same without noise where known; the frame."""
+
+    inputs: Float[np.ndarray, "number"]
+    target: Float[np.ndarray, "number"]
+    truth: Float[np.ndarray, "number"]
+    frame: int
+
+
+def prefix(flight: Flight, now: int, grid: Grid) -> Float[np.ndarray, "number"] | None:
+    """What is read at frame `now`; None where fewer frames than `least` are there.
+
+    Each frame has a place of its own, the nearest multiple of `step` before now. Where two want the same, the nearer
+    has it.
+    """
+    since = flight.times[: now + 1] - flight.times[now]
+    place = np.rint(since / grid.step).astype(int)
+    near = np.abs(since - place * grid.step)
+    read = np.zeros((grid.observed, len(PARTS)))
+    for frame in np.argsort(-near, kind="stable"):
+        slot = grid.observed - 1 + place[frame]
+        if slot >= 0:
+            read[slot] = [since[frame], *flight.places[frame], 1]
+    return read.ravel() if read[:, -1].sum() >= grid.least else None
+
+
+def windows(flight: Flight, grid: Grid) -> list[Window]:
+    """Those of a flight, every `stride` frames; none of a flight that is too short."""
+    good = believed(flight, grid.outlier)
+    times, places = flight.times[good], flight.places[good]
+    truth = places if flight.truth is None else flight.truth[good]
+    found = []
+    for now in range(grid.least - 1, len(flight.times), grid.stride):
+        inputs = prefix(flight, now, grid)
+        asked = flight.times[now] + grid.step * np.arange(1, grid.future + 1)
+        after = np.searchsorted(times, asked)
+        if inputs is None or after[-1] >= len(times) or after[0] == 0:
+            continue
+        if (times[after] - times[after - 1]).max() > grid.gap:
+            continue
+        target, exact = (between(times, some, asked, after).ravel() for some in (places, truth))
+        found.append(Window(inputs, target, exact, now))
+    return found
+
+
+def between(
+    times: Float[np.ndarray, "frame"],
+    places: Float[np.ndarray, "frame 3"],
+    asked: Float[np.ndarray, "time"],
+    after: np.ndarray,
+) -> Float[np.ndarray, "time 3"]:
+    """Places at the times asked for: straight between two frames, and in z on the parabola of a free fall."""
+    left, right = times[after - 1], times[after]
+    share = ((asked - left) / (right - left))[:, None]
+    found = (1 - share) * places[after - 1] + share * places[after]
+    found[:, 2] += GRAVITY / 2 * (asked - left) * (right - asked)
+    return found
+
+
+def believed(flight: Flight, farthest: float) -> Bool[np.ndarray, "frame"]:
+    """Which frames are no outliers: while one is farther than so many metres from what its neighbours say, the worst
+    goes. The first and the last have but one neighbour and stay."""
+    kept = np.arange(len(flight.times))
+    while len(kept) > 2:
+        times, places = flight.times[kept], flight.places[kept]
+        share = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
+        straight = (1 - share) * places[:-2] + share * places[2:]
+        straight[:, 2] += GRAVITY / 2 * (times[1:-1] - times[:-2]) * (times[2:] - times[1:-1])
+        apart = np.linalg.norm(places[1:-1] - straight, axis=1)
+        if apart.max() <= farthest:
+            break
+        kept = np.delete(kept, int(apart.argmax()) + 1)
+    good = np.zeros(len(flight.times), bool)
+    good[kept] = True
+    return good
