@@ -28,8 +28,9 @@ class Decays:
         jacobian = torch.stack((decay, -a * TIMES * decay, torch.ones_like(decay)), -1)
         return a * decay + c - self.measured[rows], jacobian
 
-    def curvature(self, parameters, rows, residuals):
+    def curvature(self, parameters, rows):
         a, b, _ = parameters.unsqueeze(-1).unbind(1)
+        residuals = self(parameters, rows)[0].nan_to_num(0.0)
         moved = -TIMES * torch.exp(-b * TIMES) * residuals
         found = parameters.new_zeros(len(parameters), 3, 3)
         found[:, 0, 1] = found[:, 1, 0] = moved.sum(-1)

@@ -30,7 +30,7 @@ from plugins.data.cest.spectrum_picture import curve
 from plugins.data.cest.volumes import SUFFIXES, read_volume
 
 NotNegative = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-GENERATED, FITTED = "1", "2"
+GENERATED, FITTED = "1", "3"
 """Versions of the generator, and of the fit whose results are kept."""
 FILE = "brain.npz"
 """Of a folder."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from framework.heads.least_squares import least_squares
 from framework.heads.least_squares_solution import Solution, Status
-from plugins.data.cest.spectrum import Misfit, Parameters
+from plugins.data.cest.spectrum import COUNT, Misfit, Parameters
 
 CUT = 10.0
 """Beyond this a measured number is no Z, which lies between 0 and about 1, and is cut off."""
@@ -16,6 +16,8 @@ DECREASE = 1e-10
 """Newton's last step leaves the square of the share of the cost that it gains."""
 CAREFUL, BOLD = 1e-1, 1e-3
 """Damping at the first step from the preset's start, and from one that is near."""
+DOUBTFUL = 1e-4
+"""Least pivot of a scaled inverse covariance from which its factor has eight right digits."""
 LEAST_SHARE = 1e-9
 """The least standard error, in sides of the box: of a spectrum without noise."""
 
@@ -49,14 +51,16 @@ def fit(
     anywhere in its box.
 
     Where a pool has vanished (amplitude 0), it has no width that could lead it back: such spectra are fitted once more
-    from another start, and the better fit is kept.
+    from another start, and the better fit is kept. So are all where centres are free, unless a start is given: the line
+    of amide may be the sharp or the broad one of two, and in a brain one spectrum in seven has its least cost there.
 
     Args:
         measured: NaN where nothing was measured.
         start: (spectrum, p), or without the parameters that are no target.
         most: steps tried.
     """
-    measured = measured.detach().double().clamp(-CUT, CUT)
+    device = measured.device
+    measured = measured.detach().cpu().double().clamp(-CUT, CUT)
     offsets = offsets.to(measured)
     lower, upper, first, second = (
         measured.new_tensor(side) for side in (wanted.lower, wanted.upper, wanted.start, wanted.elsewhere)
@@ -74,6 +78,7 @@ def fit(
             begin,
             lower,
             upper,
+            normal=misfit.normal,
             curvature=misfit.curvature,
             most=most,
             decrease=DECREASE,
@@ -82,34 +87,55 @@ def fit(
 
     found = search(measured, begin, damping)
     parameters, cost, status = found.parameters, found.cost, found.status
-    if len(lost := (status == Status.ILL_POSED).nonzero().squeeze(1)):
+    again = status == Status.ILL_POSED
+    if start is None and wanted.told > 2 * COUNT:
+        again = status != Status.NOT_FINITE
+    if len(lost := again.nonzero().squeeze(1)):
         again = search(measured[lost], second.expand(len(lost), -1), CAREFUL)
         better = again.cost < cost[lost]
         kept = lost[better]
         parameters[kept], cost[kept] = again.parameters[better], again.cost[better]
         status[kept] = again.status[better]
-    return Fit(parameters, _root(Misfit(measured, offsets), parameters, upper - lower), cost, status)
+    root = _root(Misfit(measured, offsets), parameters, upper - lower)
+    return Fit(*(part.to(device) for part in (parameters, root, cost, status)))
 
 
-def _root(misfit: Misfit, parameters: Tensor, sides: Tensor, together: int = 512) -> Tensor:
+def _root(misfit: Misfit, parameters: Tensor, sides: Tensor) -> Tensor:
     """The covariance's Cholesky factor; of sides of the box, in which numbers are of one size."""
-    count, size = parameters.shape
-    root = parameters.new_empty(count, size, size)
-    for begin in range(0, count, together):
-        rows = torch.arange(begin, min(begin + together, count), device=parameters.device)
-        residuals, jacobian = misfit(parameters[rows], rows)
-        present = ~residuals.isnan()
-        residuals = residuals.where(present, 0.0)
-        jacobian = jacobian.where(present.unsqueeze(-1), 0.0) * sides
-        variance = residuals.square().sum(-1) / (present.sum(-1) - size).clamp(min=1)
-        variance = variance.clamp(min=LEAST_SHARE**2)[:, None, None]
-        # triangle R with RᵀR = JᵀJ + 12 s²; the covariance is s² R⁻¹ R⁻ᵀ, whose factor follows from another triangle
-        prior = (12 * variance).sqrt() * torch.eye(size, dtype=root.dtype, device=root.device)
-        triangle = torch.linalg.qr(torch.cat((jacobian, prior), 1), mode="r").R
-        inverse = torch.linalg.solve_triangular(
-            triangle, torch.eye(size, dtype=root.dtype, device=root.device).expand_as(triangle), upper=True
+    size = parameters.shape[1]
+    rows = torch.arange(len(parameters))
+    cost, _, gram, there = misfit.normal(parameters, rows)
+    variance = (2 * cost / (there - size).clamp(min=1)).clamp(min=LEAST_SHARE**2)
+    # of the inverse covariance A = Uᵀ U with a lower triangle U, so that U⁻¹ is the lower factor of A⁻¹
+    precision = gram * (sides.unsqueeze(-1) * sides) / variance[:, None, None]
+    precision.diagonal(dim1=-2, dim2=-1).add_(12)
+    length = precision.diagonal(dim1=-2, dim2=-1).sqrt()
+    scaled = precision / (length.unsqueeze(-1) * length.unsqueeze(-2))
+    upper, failed = torch.linalg.cholesky_ex(scaled.flip(-1, -2))
+    triangle = upper.flip(-1, -2).mT
+    doubtful = ((failed > 0) | ~(upper.diagonal(dim1=-2, dim2=-1).amin(-1) > DOUBTFUL)).nonzero().squeeze(1)
+    identity = torch.eye(size, dtype=parameters.dtype)
+    triangle[doubtful] = identity
+    root = torch.linalg.solve_triangular(triangle, identity.expand_as(triangle), upper=False)
+    root = root / length.unsqueeze(-1)
+    if len(doubtful):
+        root[doubtful] = _careful_root(
+            misfit, parameters[doubtful], rows[doubtful], variance[doubtful], sides
         )
-        lower = torch.linalg.qr(inverse.mT, mode="r").R.mT * variance.sqrt()
-        lower = lower * lower.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)
-        root[rows] = sides.unsqueeze(-1) * lower
-    return root
+    return sides.unsqueeze(-1) * root
+
+
+def _careful_root(
+    misfit: Misfit, parameters: Tensor, rows: Tensor, variance: Tensor, sides: Tensor
+) -> Tensor:
+    """The same with the Jacobian itself, whose square has lost digits."""
+    size = parameters.shape[1]
+    residuals, jacobian = misfit(parameters, rows)
+    jacobian = jacobian.where(~residuals.isnan().unsqueeze(-1), 0.0) * sides
+    # triangle R with RᵀR = JᵀJ + 12 s²; the covariance is s² R⁻¹ R⁻ᵀ, whose factor follows from another triangle
+    identity = torch.eye(size, dtype=parameters.dtype)
+    prior = (12 * variance).sqrt()[:, None, None] * identity
+    triangle = torch.linalg.qr(torch.cat((jacobian, prior), 1), mode="r").R
+    inverse = torch.linalg.solve_triangular(triangle, identity.expand_as(triangle), upper=True)
+    lower = torch.linalg.qr(inverse.mT, mode="r").R.mT * variance.sqrt()[:, None, None]
+    return lower * lower.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)

@@ -7,9 +7,12 @@ centres are counted from it.
 
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from plugins.data.cest import compiled
 
 POOLS = ("water", "amide", "noe", "mt", "amine")
 COUNT = len(POOLS)
@@ -91,12 +94,12 @@ class Misfit:
     """The residuals of many spectra, Z(parameters) - measured, for framework.heads.least_squares.
 
     Args:
-        measured: (spectrum, offset), NaN where nothing was measured.
-        offsets: (offset,), ppm.
+        measured: (spectrum, offset) float64, NaN where nothing was measured.
+        offsets: (offset,) float64, ppm.
     """
 
     def __init__(self, measured: Float[Tensor, "spectrum offset"], offsets: Float[Tensor, "offset"]) -> None:
-        self.measured = measured
+        self.measured = measured.contiguous()
         self.offsets = offsets
 
     def __call__(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,35 +121,26 @@ class Misfit:
             jacobian[:, 2 * COUNT + 1 :] = moved[:, 1:]
         return residuals, jacobian.mT
 
-    def curvature(self, parameters: Tensor, rows: Tensor, residuals: Tensor) -> Tensor:
-        """Σ residual ∇²Z, (batch, p, p), from five sums over the offsets."""
-        amplitude, half = parameters[:, :COUNT], parameters[:, COUNT : 2 * COUNT] / 2
-        square = half.square()
-        distance = self.offsets - centres(parameters).unsqueeze(-1)
-        first = torch.addcmul(square.unsqueeze(-1), distance, distance).reciprocal_()  # e
-        second = first.square()
-        third = second * first
-        weights = residuals.unsqueeze(-1)
-        e, e2, e3 = (torch.bmm(part, weights).squeeze(-1) for part in (first, second, third))
-        de2 = torch.bmm(second.mul_(distance), weights).squeeze(-1)
-        de3 = torch.bmm(third.mul_(distance), weights).squeeze(-1)
-        # d² = 1/e - h²
-        dde2, dde3 = e - square * e2, e2 - square * e3
-        within = parameters.new_zeros(len(parameters), 3, 3, COUNT)  # amplitude, width, centre of each pool
-        within[:, 0, 1] = within[:, 1, 0] = -half * dde2
-        within[:, 0, 2] = within[:, 2, 0] = -2 * square * de2
-        within[:, 1, 1] = amplitude * (4 * square * dde3 - dde2) / 2
-        within[:, 1, 2] = within[:, 2, 1] = amplitude * half * (4 * square * de3 - 2 * de2)
-        within[:, 2, 2] = amplitude * square * (2 * e2 - 8 * dde3)
-        return _spread(within, parameters.shape[1])
+    def normal(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Half the sum of squared residuals (batch,), the gradient (batch, p) and normal matrix (batch, p, p) of their
+        Jacobian, and how many offsets were measured (batch,); on the processor."""
+        gram = parameters.new_empty(*parameters.shape, parameters.shape[1])
+        cost, gradient, there = (
+            gram.new_empty(len(gram)),
+            torch.empty_like(parameters),
+            torch.empty_like(rows),
+        )
+        compiled.summed(
+            *self._arrays(parameters, rows), *(part.numpy() for part in (cost, gradient, gram, there))
+        )
+        return cost, gradient, gram, there
 
+    def curvature(self, parameters: Tensor, rows: Tensor) -> Tensor:
+        """Σ residual ∇²Z, (batch, p, p), on the processor."""
+        found = parameters.new_empty(*parameters.shape, parameters.shape[1])
+        compiled.curved(*self._arrays(parameters, rows), found.numpy())
+        return found
 
-def _spread(within: Float[Tensor, "batch 3 3 pool"], size: int) -> Float[Tensor, "batch size size"]:
-    """Second derivatives of each pool alone as those by all parameters, the shift of water moving every centre."""
-    whole = within.new_zeros(len(within), 3, COUNT, 3, COUNT)
-    whole.diagonal(dim1=2, dim2=4).copy_(within)
-    whole = whole.reshape(len(within), 3 * COUNT, 3 * COUNT)
-    shift = 2 * COUNT
-    whole[:, :, shift] = whole[:, :, shift:].sum(2)
-    whole[:, shift] = whole[:, shift:].sum(1)
-    return whole[:, :size, :size]
+    def _arrays(self, *given: Tensor) -> tuple[np.ndarray, ...]:
+        parameters, rows = (part.contiguous().numpy() for part in given)
+        return parameters, rows, self.measured.numpy(), self.offsets.numpy(), np.array(CENTRES)

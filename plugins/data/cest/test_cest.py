@@ -36,7 +36,14 @@ def test_derivatives_are_autograds(preset):
     misfit, rows = Misfit(measured, PLACES), torch.arange(2)
     residuals, jacobian = misfit(at, rows)
     torch.testing.assert_close(residuals, spectrum(at, PLACES) - measured, rtol=0, atol=1e-14)
-    curved = misfit.curvature(at, rows, residuals)
+    curved = misfit.curvature(at, rows)
+    cost, gradient, gram, there = misfit.normal(at, rows)
+    torch.testing.assert_close(cost, residuals.square().sum(-1) / 2, rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        gradient, torch.einsum("nrp,nr->np", jacobian, residuals), rtol=1e-11, atol=1e-12
+    )
+    torch.testing.assert_close(gram, jacobian.mT @ jacobian, rtol=1e-11, atol=1e-12)
+    assert there.tolist() == [len(PLACES)] * 2
     for row in range(2):
 
         def alone(x):
@@ -49,6 +56,22 @@ def test_derivatives_are_autograds(preset):
         step = 1e-6 * torch.eye(len(at[row]), dtype=torch.float64)
         slope = (spectrum(at[row] + step, PLACES) - spectrum(at[row] - step, PLACES)).T / 2e-6
         torch.testing.assert_close(jacobian[row], slope, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_offsets_that_were_not_measured_are_as_if_never_asked_for(preset):
+    wanted = Parameters.of(preset)
+    at = torch.tensor([wanted.start, wanted.elsewhere], dtype=torch.float64)
+    measured, kept = torch.rand(2, len(PLACES), dtype=torch.float64), torch.arange(len(PLACES)) % 3 > 0
+    holes, rows = measured.where(kept, torch.nan), torch.tensor([1, 0])
+    fewer, some = Misfit(measured[:, kept], PLACES[kept]), Misfit(holes, PLACES)
+    for one, other in zip(some.normal(at, rows), fewer.normal(at, rows), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-13)
+    torch.testing.assert_close(some.curvature(at, rows), fewer.curvature(at, rows), rtol=1e-11, atol=1e-13)
+    for one, other in zip(
+        fit(holes, PLACES, wanted)[:3], fit(measured[:, kept], PLACES[kept], wanted)[:3], strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
