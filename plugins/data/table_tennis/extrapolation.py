@@ -3,6 +3,7 @@
 import math
 from typing import Annotated
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from pydantic import Field
@@ -11,16 +12,11 @@ from torch import Tensor
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from plugins.data.table_tennis.estimation import Seen, seen_of
+from plugins.data.table_tennis.parabolas_compiled import parabolas
 from plugins.data.table_tennis.windows import GRAVITY, PARTS
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
 """Shares of the frames that a parabola is laid through: the longest that it fits counts, a bounce is left behind."""
-FITS, STRANGE = 5.0, 2
-"""Noises from the parabola beyond which a frame is strange; of a span that it fits no more are."""
-ROUNDS = 8
-"""Of weights and parabola."""
-BELIEF = (10.0, 10.0, 4.0)
-"""Standard deviations of place, velocity and acceleration beyond gravity before anything is seen: m, m/s, m/s²."""
 GROWTH = (0.5, 0.5, 6.0)
 """By which the features' unit grows with the square of time, m/s²: z is reversed by a bounce."""
 FURTHER = 24
@@ -92,34 +88,15 @@ class ExtrapolationEncoder(Encoder):
 
     def _parabolas(self, seen: Seen) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The coefficients (flight, 3, axis) of the longest span that fits, and of the shortest; the covariance of an
-        axis's (flight, 3, 3); and which span it is (flight, span), one-hot."""
-        frames = seen.times.shape[1]
-        places, there = torch.where(seen.there.unsqueeze(-1), _fallen(seen), 0.0), seen.there.double()
-        powers = _powers(seen.times)
-        belief = torch.diag(
-            torch.tensor(BELIEF, dtype=torch.float64, device=places.device).square().reciprocal()
-        )
-        # (flight, span, frame): all spans at once, since one flight's latency counts
-        first = torch.tensor(
-            [frames - max(3, round(share * frames)) for share in SPANS], device=places.device
-        )
-        inside = there.unsqueeze(1) * (torch.arange(frames, device=places.device) >= first.unsqueeze(-1))
-        powers, places = powers.unsqueeze(1), places.unsqueeze(1)
-        weight, parabola, precision, apart = inside, places, belief, inside
-        for number in range(ROUNDS):
-            scaled = powers.mT * (weight / self.noise**2).unsqueeze(-2)
-            precision = scaled @ powers + belief
-            parabola = torch.linalg.solve(precision, scaled @ places)
-            apart = (places - powers @ parabola).square().sum(-1).sqrt() / self.noise
-            # wide at first, so that the first parabola does not say which frames are strange
-            weight = inside / (1 + (apart / (3 * 3.0 ** max(0, 4 - number))).square())
-        # the longest that fits, or else the shortest
-        fits = ((apart > FITS) * inside).sum(-1) <= STRANGE
-        fits[:, -1] = True
-        chosen = fits.double().argmax(1)
-        row = torch.arange(len(chosen), device=chosen.device)
-        span = torch.nn.functional.one_hot(chosen, len(SPANS))
-        return parabola[row, chosen], parabola[:, -1], torch.linalg.inv(precision[row, chosen]), span
+        axis's (flight, 3, 3); and which span it is (flight, span), one-hot. Computed on the processor."""
+        device, (flights, frames) = seen.times.device, seen.times.shape
+        spans = np.array([max(3, round(share * frames)) for share in SPANS])
+        long, short, spread = (torch.empty(flights, 3, 3, dtype=torch.float64) for _ in range(3))
+        span = torch.empty(flights, dtype=torch.int64)
+        given = (part.contiguous().cpu().numpy() for part in (seen.times, _fallen(seen), seen.there))
+        parabolas(*given, spans, self.noise, *(part.numpy() for part in (long, short, spread, span)))
+        one_hot = torch.nn.functional.one_hot(span, len(SPANS))
+        return long.to(device), short.to(device), spread.to(device), one_hot.to(device)
 
 
 def frames_of(input_shape: tuple[int, ...], by: str) -> int:

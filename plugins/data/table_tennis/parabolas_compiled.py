@@ -1,0 +1,111 @@
+"""Robust parabolas through the last frames of many flights, on one CPU core; a compiled function on NumPy arrays."""
+
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+
+from framework.storage.kernels import compiler, kept_in
+
+compiled = compiler(kept_in("parabolas", [Path(__file__)]))
+FITS, STRANGE = 5.0, 2
+"""Noises from the parabola beyond which a frame is strange; of a span that it fits no more are."""
+ROUNDS = 8
+"""Of weights and parabola."""
+BELIEF = (10.0, 10.0, 4.0)
+"""Standard deviations of place, velocity and acceleration beyond gravity before anything is seen: m, m/s, m/s²."""
+
+
+@compiled
+@no_type_check
+def factored(matrix):
+    """Cholesky's lower triangle of a positive definite 3 × 3 matrix, in its place."""
+    for row in range(3):
+        for column in range(row + 1):
+            total = matrix[row, column]
+            for inner in range(column):
+                total -= matrix[row, inner] * matrix[column, inner]
+            matrix[row, column] = np.sqrt(total) if row == column else total / matrix[column, column]
+
+
+@compiled
+@no_type_check
+def solved(triangle, right):
+    """Solve L Lᵀ X = right (3, columns) in place."""
+    for column in range(right.shape[1]):
+        for row in range(3):
+            for inner in range(row):
+                right[row, column] -= triangle[row, inner] * right[inner, column]
+            right[row, column] /= triangle[row, row]
+        for row in range(2, -1, -1):
+            for inner in range(row + 1, 3):
+                right[row, column] -= triangle[inner, row] * right[inner, column]
+            right[row, column] /= triangle[row, row]
+
+
+@compiled
+@no_type_check
+def parabolas(times, places, there, spans, noise, long, short, spread, span):
+    """Lay parabolas through the last frames, by least squares with Cauchy's weights (Holland & Welsch 1977).
+
+    Args:
+        times: (flight, frame), s.
+        places: (flight, frame, 3), m; any number where none was seen.
+        there: (flight, frame), whether one was.
+        spans: how many of the last frames count, the most first.
+        noise: of a coordinate, m.
+        long: to be filled: coefficients of 1, t and t²/2 (flight, 3, axis) of the longest span that fits.
+        short: the same of the last span.
+        spread: covariance of an axis's coefficients of `long`, (flight, 3, 3).
+        span: which span it is, (flight,).
+    """
+    count = times.shape[1]
+    power, weight, apart = np.empty((count, 3)), np.empty(count), np.empty(count)
+    precision = np.empty((3, 3))
+    for flight in range(times.shape[0]):
+        chosen = False
+        power[:, 0] = 1.0
+        power[:, 1] = times[flight]
+        power[:, 2] = times[flight] ** 2 / 2
+        for number in range(len(spans)):
+            first = count - spans[number]
+            weight[:] = 1.0
+            found = short[flight]
+            for turn in range(ROUNDS):
+                precision[:] = 0.0
+                found[:] = 0.0
+                for row in range(3):
+                    precision[row, row] = 1 / BELIEF[row] ** 2
+                for frame in range(first, count):
+                    if there[flight, frame]:
+                        share = weight[frame] / noise**2
+                        for row in range(3):
+                            for column in range(3):
+                                precision[row, column] += share * power[frame, row] * power[frame, column]
+                                found[row, column] += (
+                                    share * power[frame, row] * places[flight, frame, column]
+                                )
+                factored(precision)
+                solved(precision, found)
+                # wide at first, so that the first parabola does not say which frames are strange
+                width = 3 * 3.0 ** max(0, 4 - turn)
+                strange = 0
+                for frame in range(first, count):
+                    if there[flight, frame]:
+                        square = 0.0
+                        for axis in range(3):
+                            off = places[flight, frame, axis]
+                            for row in range(3):
+                                off -= power[frame, row] * found[row, axis]
+                            square += off * off
+                        apart[frame] = np.sqrt(square) / noise
+                        weight[frame] = 1 / (1 + (apart[frame] / width) ** 2)
+                        strange += apart[frame] > FITS
+            if not chosen and (strange <= STRANGE or number == len(spans) - 1):
+                chosen = True
+                span[flight] = number
+                long[flight] = found
+                spread[flight] = 0.0
+                for row in range(3):
+                    spread[flight, row, row] = 1.0
+                solved(precision, spread[flight])
