@@ -276,9 +276,8 @@ with residuals and an analytic Jacobian in lean NumPy. Commands in `cest.py`.
 
 {markdown(rows, AGREEMENT)}
 
-Within 1e-6: |difference| ≤ 1e-6 of the number, or of 1 % of its box where that is more. The machine had other work:
-processor times of the same code differ by up to a factor of two between runs, ratios of three runs were 21 to 29 (ten)
-and 20 to 24 (fifteen).
+Within 1e-6: |difference| ≤ 1e-6 of the number, or of 1 % of its box where that is more. Fifteen numbers are fitted from
+two starts and the better fit is kept; SciPy has the first of them. The machine had other work.
 
 ## Error against run time, ten numbers
 
