@@ -12,7 +12,7 @@ from torch import Tensor
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from plugins.data.table_tennis.estimation import Seen, seen_of
-from plugins.data.table_tennis.parabolas_compiled import parabolas
+from plugins.data.table_tennis.parabolas_compiled import described
 from plugins.data.table_tennis.windows import GRAVITY, PARTS
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
@@ -68,35 +68,20 @@ class ExtrapolationEncoder(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         seen = seen_of(inputs.double().unflatten(-1, (-1, len(PARTS))), self.step)
-        there = seen.there.unsqueeze(-1)
-        long, short, spread, span = self._parabolas(seen)
-        moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64, device=inputs.device)
-        powers = _powers(moments)
-        mean = powers @ long
-        mean[..., 2] -= GRAVITY / 2 * moments.square()
-        deviation = torch.einsum("ti,bij,tj->bt", powers, spread, powers).clamp(min=0).sqrt()
-        growth = torch.tensor(GROWTH, dtype=torch.float64, device=inputs.device)
-        unit = self.noise + growth * moments.square().unsqueeze(-1)
-        off = torch.where(there, _fallen(seen) - _powers(seen.times) @ long, 0.0)
-        # both finely and coarsely: a bounce's path is metres from the parabola, a frame's noise millimetres
-        features = [
-            mean.clamp(-100, 100), unit.log().expand_as(mean), long / 5, short / 5,
-            span, deviation[:, [0, -1]].unsqueeze(-1).log() / 3,
-            torch.tanh(off / (2 * self.noise)), torch.tanh(off / 0.1), there,
-        ]  # fmt: skip
-        return torch.cat([part.flatten(1).double() for part in features], 1).clamp(-1e4, 1e4).to(dtype)
-
-    def _parabolas(self, seen: Seen) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The coefficients (flight, 3, axis) of the longest span that fits, and of the shortest; the covariance of an
-        axis's (flight, 3, 3); and which span it is (flight, span), one-hot. Computed on the processor."""
-        device, (flights, frames) = seen.times.device, seen.times.shape
-        spans = np.array([max(3, round(share * frames)) for share in SPANS])
-        long, short, spread = (torch.empty(flights, 3, 3, dtype=torch.float64) for _ in range(3))
-        span = torch.empty(flights, dtype=torch.int64)
-        given = (part.contiguous().cpu().numpy() for part in (seen.times, _fallen(seen), seen.there))
-        parabolas(*given, spans, self.noise, *(part.numpy() for part in (long, short, spread, span)))
-        one_hot = torch.nn.functional.one_hot(span, len(SPANS))
-        return long.to(device), short.to(device), spread.to(device), one_hot.to(device)
+        seen = Seen(*(part.cpu() for part in seen))
+        moments = self.step * np.arange(1, self.future + 1)
+        spans = np.array([max(3, round(share * seen.times.shape[1])) for share in SPANS])
+        features = torch.empty(len(inputs), *self.output_shape, dtype=torch.float64)
+        described(
+            *(part.contiguous().numpy() for part in (seen.times, seen.places, seen.there)),
+            GRAVITY,
+            spans,
+            self.noise,
+            np.array(GROWTH),
+            moments,
+            features.numpy(),
+        )
+        return features.to(inputs.device, dtype)
 
 
 def frames_of(input_shape: tuple[int, ...], by: str) -> int:
@@ -112,13 +97,3 @@ def frames_of(input_shape: tuple[int, ...], by: str) -> int:
             "data=table_tennis."
         )
     return length // len(PARTS)
-
-
-def _powers(times: Float[Tensor, "*batch time"]) -> Float[Tensor, "*batch time 3"]:
-    return torch.stack([torch.ones_like(times), times, times.square() / 2], -1)
-
-
-def _fallen(seen: Seen) -> Float[Tensor, "flight frame 3"]:
-    """Places as they would be without gravity."""
-    fall = torch.tensor([0.0, 0.0, GRAVITY / 2], dtype=torch.float64, device=seen.places.device)
-    return seen.places + fall * seen.times.square().unsqueeze(-1)

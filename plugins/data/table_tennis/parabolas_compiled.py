@@ -1,4 +1,4 @@
-"""Robust parabolas through the last frames of many flights, on one CPU core; a compiled function on NumPy arrays."""
+"""Robust parabolas through the last frames of flights and what they say, on one CPU core; functions on NumPy arrays."""
 
 from pathlib import Path
 from typing import no_type_check
@@ -109,3 +109,69 @@ def parabolas(times, places, there, spans, noise, long, short, spread, span):
                 for row in range(3):
                     spread[flight, row, row] = 1.0
                 solved(precision, spread[flight])
+
+
+@compiled
+@no_type_check
+def described(times, places, there, gravity, spans, noise, growth, moments, features):
+    """Fill `features` (flight, number) with what `extrapolation.ExtrapolationEncoder` says of flights.
+
+    Args:
+        times, places, there, noise, spans: see `parabolas`.
+        gravity: m/s².
+        growth: of the unit with the square of time, (3,), m/s².
+        moments: at which the ball is wanted, (future,), s.
+    """
+    flights, count = times.shape
+    fallen = places.copy()  # as they would be without gravity
+    for flight in range(flights):
+        for frame in range(count):
+            fallen[flight, frame, 2] += gravity / 2 * times[flight, frame] ** 2
+    long, short = np.empty((flights, 3, 3)), np.empty((flights, 3, 3))
+    spread, span = np.empty((flights, 3, 3)), np.empty(flights, np.int64)
+    parabolas(times, fallen, there, spans, noise, long, short, spread, span)
+    power = np.empty(3)
+    power[0] = 1.0
+    for flight in range(flights):
+        found = features[flight]
+        place = 0
+        for moment in moments:
+            power[1], power[2] = moment, moment**2 / 2
+            for axis in range(3):
+                total = -gravity * power[2] if axis == 2 else 0.0
+                for row in range(3):
+                    total += power[row] * long[flight, row, axis]
+                found[place] = min(max(total, -100.0), 100.0)
+                found[place + 3 * len(moments)] = np.log(noise + growth[axis] * moment**2)
+                place += 1
+        place *= 2
+        for parabola in (long, short):
+            for row in range(3):
+                for axis in range(3):
+                    found[place] = parabola[flight, row, axis] / 5
+                    place += 1
+        found[place : place + len(spans)] = 0.0
+        found[place + span[flight]] = 1.0
+        place += len(spans)
+        for moment in (moments[0], moments[-1]):
+            power[1], power[2] = moment, moment**2 / 2
+            total = 0.0
+            for row in range(3):
+                for column in range(3):
+                    total += power[row] * spread[flight, row, column] * power[column]
+            found[place] = np.log(total) / 6
+            place += 1
+        # both finely and coarsely: a bounce's path is metres from the parabola, a frame's noise millimetres
+        for frame in range(count):
+            power[1], power[2] = times[flight, frame], times[flight, frame] ** 2 / 2
+            for axis in range(3):
+                off = 0.0
+                if there[flight, frame]:
+                    off = fallen[flight, frame, axis]
+                    for row in range(3):
+                        off -= power[row] * long[flight, row, axis]
+                found[place + 3 * frame + axis] = np.tanh(off / (2 * noise))
+                found[place + 3 * count + 3 * frame + axis] = np.tanh(off / 0.1)
+            found[place + 6 * count + frame] = 1.0 if there[flight, frame] else 0.0
+        for place in range(len(found)):
+            found[place] = min(max(found[place], -1e4), 1e4)

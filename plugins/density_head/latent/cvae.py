@@ -65,6 +65,7 @@ class Networks(Latent):
         component: raw numbers → p(φ|x,z).
         rows: indices (rows,) into the flattened batch → the networks of these inputs.
         width: activations one decoded z holds in memory.
+        size: how many numbers the component reads.
     """
 
     prior: Gaussian
@@ -73,13 +74,11 @@ class Networks(Latent):
     component: Callable[[Tensor], Distribution]
     rows: Callable[[Tensor], "Networks"]
     width: int
+    size: int
 
     @property
     def center(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.prior.mean
-
-    def central(self) -> Distribution:
-        return self.component(self.decode(self.center))
 
     def numbers(self, noise: Tensor) -> Tensor:
         z = self.prior.at(noise.reshape(len(noise), *self.center.shape))
@@ -217,6 +216,7 @@ class CVAEHead(DensityHead):
             component=self.component,
             rows=lambda index: self._networks(flat[index]),
             width=self.hidden,
+            size=self.component.size,
         )
 
     def encode(self, value: Tensor) -> Tensor:

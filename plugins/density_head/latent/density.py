@@ -34,15 +34,17 @@ class Latent(ABC):
         component: raw numbers (*batch, number) → p(φ|x,z).
         center: z of the prior at noise 0, (*batch, latent).
         width: activations one decoded z holds in memory.
+        size: how many numbers the component reads.
     """
 
     component: Callable[[Tensor], Distribution]
     center: Tensor
     width: int
+    size: int
 
-    @abstractmethod
-    def central(self) -> Distribution:
-        """The component at noise 0, batch_shape (*batch)."""
+    def example(self) -> Distribution:
+        """The component of raw numbers 0, batch_shape (*batch): what it is a density of, at no decoder's cost."""
+        return self.component(self.center.new_zeros(*self.center.shape[:-1], self.size))
 
     @abstractmethod
     def numbers(self, noise: Float[Tensor, "sample item latent"]) -> Float[Tensor, "*batch sample number"]:
@@ -106,7 +108,7 @@ class LatentDensity(Distribution):
         self.points = latent.points(effort, kept=effort.first)
         self._fixed = Effort(effort.samples)
         self._mixture_points = latent.points(self._fixed)
-        self._example = latent.central()
+        self._example = latent.example()
         self.has_enumerate_support = self._example.has_enumerate_support
         super().__init__(self._example.batch_shape, self._example.event_shape, validate_args=False)
 

@@ -30,6 +30,7 @@ class Networks(Latent):
         component: raw numbers → p(φ|x,z).
         center: zeros, (*batch, latent), of the number type of z.
         width: activations one decoded z holds in memory.
+        size: how many numbers the component reads.
     """
 
     raw: Tensor
@@ -37,9 +38,7 @@ class Networks(Latent):
     component: Callable[[Tensor], Distribution]
     center: Tensor
     width: int
-
-    def central(self) -> Distribution:
-        return self.component(self.decode(self.raw, self.center))
+    size: int
 
     def numbers(self, noise: Tensor) -> Tensor:
         return self._decoded(noise.movedim(0, 1).reshape(*self.raw.shape[:-1], len(noise), noise.shape[-1]))
@@ -118,7 +117,7 @@ class SCVAEHead(DensityHead):
             weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
             return Mixture(weights, self.component(number))
         center = torch.zeros(*raw.shape[:-1], self.latent, dtype=kind, device=raw.device)
-        networks = Networks(raw, self.decoder, self.component, center, self.hidden)
+        networks = Networks(raw, self.decoder, self.component, center, self.hidden, self.component.size)
         effort = Effort(self.samples, self.tolerance)
         if self.tolerance is None:
             return sampled_mixture(networks, networks.points(effort), effort)
