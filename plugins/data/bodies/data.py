@@ -20,6 +20,7 @@ from framework.storage.generated import read_mark
 from plugins.data.bodies.bodies import Bodies, normalised, target_of
 from plugins.data.bodies.body import BodyModel
 from plugins.data.bodies.faust import SUBJECTS, Scan, registered, scans
+from plugins.data.bodies.faust_generator import people_root
 from plugins.data.bodies.people import People, chosen_body
 from plugins.data.bodies.scanner import KINDS, Kinds, Scanner
 from plugins.data.bodies.scans import Scans
@@ -132,17 +133,19 @@ class Faust(Bodies):
     """FAUST's training scans and their registrations, split by person (Bogo et al. 2014).
 
     Inputs are points drawn from a scan's vertices, targets the registration's vertices; "subject" (batch,) is the
-    person, 0 to 9. The scans of the test set have no registrations and are for `mode=predict`.
+    person, 0 to 9. The scans of the test set have no registrations and are for `mode=predict` and for
+    plugins.data.bodies.correspond.
 
     Args:
-        root: the folder that holds `training` (and `test`).
+        root: the folder that holds `training` (and `test`); None: people are generated in its layout.
+        body: of generated people, see `Registration`.
         points: of a cloud; scans have some 170,000.
         validation, test: people of these splits; all others are for training.
         data_seed: of the points, whatever the seed of the run.
 
     Raises:
-        DataError: no root, a scan without its registration or the other way round, a file that cannot be read,
-            registrations of different meshes, a split without scans.
+        DataError: a scan without its registration or the other way round, a file that cannot be read, registrations of
+            different meshes, a split without scans.
     """
 
     bibtex = """@inproceedings{bogo2014faust,
@@ -156,18 +159,20 @@ class Faust(Bodies):
         self,
         *,
         root: str | None = None,
+        body: str | None = None,
         points: Points = 10_000,
         validation: Subjects = [7],  # noqa: B006 - never written
         test: Subjects = [8, 9],  # noqa: B006 - never written
         data_seed: Seed = 0,
     ) -> None:
-        self.root = root
+        self.root, self.body = root, body
         self.points = points
         self.people = (set(validation), set(test))
         self.data_seed = data_seed
 
     def prepare(self) -> None:
-        folder, found = scans(self.root)
+        folder = people_root(self.body) if self.root is None else Path(self.root).expanduser()
+        found = scans(folder)
         first, self.faces = registered(found[0])
         self.target = target_of(len(first))
         self.input_shape = (self.points, 3)
@@ -215,7 +220,7 @@ class Faust(Bodies):
 
     def fingerprint(self) -> Mapping[str, str]:
         return {
-            "root": str(self.root),
+            "root": self.root or "generated",
             "version": "FAUST training",
             "points": str(self.points),
             "data_seed": str(self.data_seed),

@@ -1,7 +1,9 @@
-"""Finds FAUST's training scans and reads their registrations."""
+"""Finds FAUST's scans and the pairs of its challenges, and reads registrations."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -9,6 +11,10 @@ from framework.errors import DataError
 from framework.geometry.meshes import read
 
 SUBJECTS, POSES = 10, 10
+TEST = 200
+"""Test scans that there may be."""
+Challenge = Literal["intra", "inter"]
+CHALLENGES: tuple[Challenge, ...] = ("intra", "inter")
 WANTED = (
     "Wanted: the folder that holds training/scans/tr_scan_000.ply and training/registrations/tr_reg_000.ply to "
     "tr_scan_099.ply and tr_reg_099.ply."
@@ -28,25 +34,72 @@ class Scan:
         return self.number // POSES
 
 
-def scans(root: str | None) -> tuple[Path, list[Scan]]:
-    """The folder and every training scan in it that is there, with its registration.
+class Pair(NamedTuple):
+    """Numbers of two test scans."""
+
+    first: int
+    second: int
+
+    def __str__(self) -> str:
+        return f"{self.first:03}_{self.second:03}"
+
+
+def training_scan(folder: Path, number: int) -> Path:
+    return folder / "training" / "scans" / f"tr_scan_{number:03}.ply"
+
+
+def training_registration(folder: Path, number: int) -> Path:
+    return folder / "training" / "registrations" / f"tr_reg_{number:03}.ply"
+
+
+def test_scan(folder: Path, number: int) -> Path:
+    return folder / "test" / "scans" / f"test_scan_{number:03}.ply"
+
+
+def test_registration(folder: Path, number: int) -> Path:
+    """FAUST keeps these to itself; generated people have them."""
+    return folder / "test" / "registrations" / f"test_reg_{number:03}.ply"
+
+
+def pairs_file(folder: Path, challenge: Challenge) -> Path:
+    return folder / "test" / "challenge_pairs" / f"{challenge}_challenge.txt"
+
+
+def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
+    """Of which correspondences are asked for: of one person, or of two.
 
     Raises:
-        DataError: no root, no such layout in it, or one of a pair missing.
+        DataError: no such list, a line that is no pair, or a pair of a scan that is not there.
     """
-    if root is None:
-        raise DataError(
-            "data.root is not set: FAUST is licensed by the Max Planck Society and neither shipped nor generated. "
-            + WANTED
-        )
-    folder = Path(root).expanduser()
+    file = pairs_file(folder, challenge)
+    try:
+        lines = file.read_text(encoding="ascii").split()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{file}: the pairs of the challenge cannot be read ({error}).") from error
+    found = []
+    for number, line in enumerate(lines, 1):
+        match = re.fullmatch(r"(\d{3})_(\d{3})", line)
+        if match is None:
+            raise DataError(f"{file}, pair {number}: {line[:40]!r}; wanted two test scans, such as 000_001.")
+        pair = Pair(*map(int, match.groups()))
+        for one in pair:
+            if not test_scan(folder, one).is_file():
+                raise DataError(f"{file}, pair {number}: {test_scan(folder, one)} is not there.")
+        found.append(pair)
+    if not found:
+        raise DataError(f"{file} holds no pair.")
+    return found
+
+
+def scans(folder: Path) -> list[Scan]:
+    """Every training scan that is there, with its registration.
+
+    Raises:
+        DataError: no such layout, or one of a pair missing.
+    """
     found = []
     for number in range(SUBJECTS * POSES):
-        pair = Scan(
-            number,
-            folder / "training" / "scans" / f"tr_scan_{number:03}.ply",
-            folder / "training" / "registrations" / f"tr_reg_{number:03}.ply",
-        )
+        pair = Scan(number, training_scan(folder, number), training_registration(folder, number))
         there = pair.scan.is_file(), pair.registration.is_file()
         if any(there) and not all(there):
             missing = pair.registration if there[0] else pair.scan
@@ -55,7 +108,7 @@ def scans(root: str | None) -> tuple[Path, list[Scan]]:
             found.append(pair)
     if not found:
         raise DataError(f"data.root = {folder}: FAUST is not available there. {WANTED}")
-    return folder, found
+    return found
 
 
 def registered(scan: Scan, vertices: int | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -309,22 +309,35 @@ def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
 
 def write_registration(file: Path, registration: Registration) -> None:
     """As binary PLY."""
-    vertices = np.empty(len(registration.vertices), [("place", "<f4", 3), ("colour", "u1", 3)])
-    vertices["place"], vertices["colour"] = registration.vertices.numpy(), registration.colors.numpy()
-    faces = np.empty(len(registration.faces), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, registration.faces.numpy()
+    write_mesh(file, registration.vertices.numpy(), registration.faces.numpy(), registration.colors.numpy())
+
+
+def write_mesh(
+    file: Path,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    colors: UInt8[np.ndarray, "vertices 3"] | None = None,
+) -> None:
+    """As binary PLY; a cloud where there are no faces."""
+    columns = [("place", "<f4", 3), *([] if colors is None else [("colour", "u1", 3)])]
+    table = np.empty(len(vertices), columns)
+    table["place"] = vertices
+    if colors is not None:
+        table["colour"] = colors
+    rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"], rows["corners"] = 3, faces
     head = [
         "ply",
         "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
+        f"element vertex {len(table)}",
         *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {name}" for name in COLOURS),
-        f"element face {len(faces)}",
+        *(f"property uchar {name}" for name in COLOURS if colors is not None),
+        f"element face {len(rows)}",
         "property list uchar int vertex_indices",
         "end_header\n",
     ]
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes("\n".join(head).encode("ascii") + vertices.tobytes() + faces.tobytes())
+    file.write_bytes("\n".join(head).encode("ascii") + table.tobytes() + rows.tobytes())
 
 
 def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:

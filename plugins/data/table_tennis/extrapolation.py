@@ -17,8 +17,9 @@ from plugins.data.table_tennis.windows import GRAVITY, PARTS
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
 """Shares of the frames that a parabola is laid through: the longest that it fits counts, a bounce is left behind."""
-GROWTH = (0.5, 0.5, 6.0)
-"""By which the features' unit grows with the square of time, m/s²: z is reversed by a bounce."""
+SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
+"""By which the unit of features grows with time, m/s, and its square, m/s²: z is reversed by a bounce, which may have
+been in the last frames."""
 FURTHER = 24
 """Features beside the two of each number that is predicted and the four of each frame."""
 
@@ -77,6 +78,7 @@ class ExtrapolationEncoder(Encoder):
             GRAVITY,
             spans,
             self.noise,
+            np.array(SPEED),
             np.array(GROWTH),
             moments,
             features.numpy(),

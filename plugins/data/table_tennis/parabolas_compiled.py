@@ -113,13 +113,13 @@ def parabolas(times, places, there, spans, noise, long, short, spread, span):
 
 @compiled
 @no_type_check
-def described(times, places, there, gravity, spans, noise, growth, moments, features):
+def described(times, places, there, gravity, spans, noise, speed, growth, moments, features):
     """Fill `features` (flight, number) with what `extrapolation.ExtrapolationEncoder` says of flights.
 
     Args:
         times, places, there, noise, spans: see `parabolas`.
         gravity: m/s².
-        growth: of the unit with the square of time, (3,), m/s².
+        speed, growth: of the unit with time, (3,), m/s, and with its square, m/s².
         moments: at which the ball is wanted, (future,), s.
     """
     flights, count = times.shape
@@ -142,7 +142,9 @@ def described(times, places, there, gravity, spans, noise, growth, moments, feat
                 for row in range(3):
                     total += power[row] * long[flight, row, axis]
                 found[place] = min(max(total, -100.0), 100.0)
-                found[place + 3 * len(moments)] = np.log(noise + growth[axis] * moment**2)
+                found[place + 3 * len(moments)] = np.log(
+                    noise + speed[axis] * moment + growth[axis] * moment**2
+                )
                 place += 1
         place *= 2
         for parabola in (long, short):

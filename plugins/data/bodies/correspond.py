@@ -1,0 +1,125 @@
+"""`python -m plugins.data.bodies.correspond <run> [<FAUST>]` answers FAUST's challenges, in the form that they ask for.
+
+Without a folder people are generated in FAUST's layout (synthetic), whose true correspondences are known.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import ZIP_DEFLATED, ZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from framework.configuration.loading import load_with_description
+from framework.configuration.schema import build, resolve
+from framework.data import Data
+from framework.distributions.protocol import median
+from framework.errors import ConfigError, UserError
+from framework.geometry.clouds import denormalised
+from framework.geometry.meshes import read
+from framework.geometry.nearest import nearest
+from framework.storage.generated import read_mark
+from plugins.data.bodies.faust import CHALLENGES, Challenge, pairs, test_registration, test_scan
+from plugins.data.bodies.faust_generator import people_root
+
+
+class Answered(NamedTuple):
+    """Of one challenge.
+
+    Attributes:
+        file: a text file of each pair, zipped: x, y, z, metres, on the second scan for each vertex of the first.
+        pairs: how many.
+        error_cm: of each pair whose true registrations are there, the mean over their vertices.
+    """
+
+    file: Path
+    pairs: int
+    error_cm: list[float]
+
+
+def main(arguments: list[str]) -> None:
+    """Write `<out>/intra.zip` and `inter.zip`; print errors where the truth is known.
+
+    Raises:
+        UserError: a checkpoint of another data set, or a file that cannot be read.
+    """
+    parser = argparse.ArgumentParser(prog="python -m plugins.data.bodies.correspond", description=__doc__)
+    parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
+    parser.add_argument("root", nargs="?", help="the folder that holds FAUST's `test`; none: generated")
+    parser.add_argument("--out", type=Path, default=Path("outputs/faust"), help="default: outputs/faust")
+    given = parser.parse_args(arguments)
+    predictor, description = load_with_description(given.checkpoint)
+    part = description.config["data"]
+    if part["name"] not in ("registration", "faust"):
+        raise ConfigError(
+            f"{given.checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration` or "
+            "`faust`, whose target is a mesh."
+        )
+    data: Data = build("data", resolve("data", part))
+    folder = people_root(part.get("body")) if given.root is None else Path(given.root).expanduser()
+    marked = "" if read_mark(folder) is None else " (synthetic)"
+
+    @torch.no_grad()
+    def registered(scan: Path) -> np.ndarray:
+        batch = data.asked(scan)
+        local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
+        return denormalised(local, batch["centre"], batch["scale"])[0].float().numpy()
+
+    for challenge in CHALLENGES:
+        found = answered(registered, folder, challenge, given.out)
+        error = "not available, FAUST keeps its registrations to itself"
+        if found.error_cm:
+            error = (
+                f"{np.mean(found.error_cm):.2f} cm, of the worst pair {max(found.error_cm):.2f} cm{marked}"
+            )
+        sys.stdout.write(f"{challenge}: {found.pairs} pairs in {found.file}; error {error}\n")
+
+
+def answered(
+    registered: Callable[[Path], Float[np.ndarray, "vertex 3"]], root: Path, challenge: Challenge, out: Path
+) -> Answered:
+    """Correspondences of every pair through registered meshes.
+
+    A vertex of the first scan goes to the nearest vertex of the mesh registered to it, and from there to the same
+    vertex of the mesh registered to the second scan (thesis §6.5.2).
+
+    Args:
+        registered: a scan's file to the vertices registered to it, metres; asked once for each.
+
+    Raises:
+        DataError: no pairs, or a scan that cannot be read.
+    """
+    mesh_of = cache(registered)
+    given = pairs(root, challenge)
+    out.mkdir(parents=True, exist_ok=True)
+    file, errors = out / f"{challenge}.zip", []
+    with ZipFile(file, "w", ZIP_DEFLATED) as archive:
+        for pair in given:
+            first, second = (mesh_of(test_scan(root, one)) for one in pair)
+            thought = second[_nearest(first, read(test_scan(root, pair.first)).vertices)]
+            lines = [f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in thought.tolist()]
+            archive.writestr(f"{pair}.txt", "".join(lines))
+            truths = [test_registration(root, one) for one in pair]
+            if all(truth.is_file() for truth in truths):
+                here, there = (read(truth).vertices for truth in truths)
+                gap = np.linalg.norm(second[_nearest(first, here)] - there, axis=1)
+                errors.append(100 * float(gap.mean()))
+    return Answered(file, len(given), errors)
+
+
+def _nearest(vertices: np.ndarray, points: np.ndarray) -> Int[np.ndarray, "points"]:
+    """Of each point the vertex that is nearest."""
+    reference, asked = (torch.from_numpy(part).float()[None] for part in (vertices, points))
+    return nearest(reference, asked).index[0].numpy()
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except UserError as error:
+        sys.exit(f"error: {error}")
