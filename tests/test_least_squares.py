@@ -104,6 +104,32 @@ def test_neither_company_nor_order_changes_an_answer():
     torch.testing.assert_close(back.parameters.flip(0), whole.parameters, rtol=1e-9, atol=1e-9)
 
 
+def test_a_model_that_sums_up_by_itself_is_fitted_alike_and_keeps_its_numbers():
+    measured, _ = decays(12, 0.05)
+    measured[3] = math.nan
+    measured[4] = 0.0  # no decay: its rate is not determined
+    measured[5, ::3] = math.nan
+    model, kept = Decays(measured), []
+
+    def normal(parameters, rows):
+        residuals, jacobian = model(parameters, rows)
+        there = ~residuals.isnan()
+        residuals, jacobian = residuals.where(there, 0.0), jacobian.where(there.unsqueeze(-1), 0.0)
+        gradient = torch.einsum("nrp,nr->np", jacobian, residuals)
+        found = residuals.square().sum(-1) / 2, gradient, jacobian.mT @ jacobian, there.sum(-1)
+        kept.append((found, [part.clone() for part in found]))
+        return found
+
+    box = (torch.full((12, 3), 0.5), torch.zeros(3), torch.full((3,), 5.0))
+    plain = least_squares(model, *box, curvature=model.curvature)
+    summed = least_squares(model, *box, normal=normal, curvature=model.curvature)
+    assert torch.equal(plain.status, summed.status) and torch.equal(plain.rank, summed.rank)
+    assert plain.status[3:5].tolist() == [Status.NOT_FINITE, Status.ILL_POSED]
+    for name in ("parameters", "cost", "covariance"):
+        torch.testing.assert_close(getattr(plain, name), getattr(summed, name), rtol=1e-8, atol=1e-10)
+    assert kept and all(torch.equal(*pair) for both in kept for pair in zip(*both, strict=True))
+
+
 def test_units_do_not_matter():
     """Of parameters in micrometres and megametres, too."""
     measured, _ = decays(20, 0.05)
