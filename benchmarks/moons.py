@@ -179,7 +179,7 @@ def main() -> None:
     torch.set_num_threads(2)
     rows = results([Path(folder) for folder in sys.argv[1:]])
     pictures(rows)
-    took = sum(row["seconds"] for row in rows) / 2
+    took = sum(row["seconds"] for row in rows) / 60
     kept = [
         {key: value for key, value in row.items() if key in COLUMNS or key in ("seed", "synthetic")}
         for row in rows
@@ -188,8 +188,9 @@ def main() -> None:
     seeds = sorted({row["seed"] for row in rows})
     text = (
         "# Table 2.1: uncertainty on the two moons (synthetic data)\n\n"
-        f"{len(rows)} runs in {took:.0f} s, two at a time on two cores: `python benchmarks/thesis_tables.py 2.1`. A "
-        "seed draws data and weights; all methods of a seed have the same data, 5000 test points. ± is the standard "
+        f"{len(rows)} runs, {took:.0f} minutes of their clocks on a core each: "
+        "`python benchmarks/thesis_tables.py 2.1`. "
+        "A seed draws data and weights; all methods of a seed have the same data, 5000 test points. ± is the standard "
         "deviation over seeds. Epochs, batches and learning rate were chosen such that the two vanilla rows over-fit "
         "as the thesis's do, the last row's settings on other draws of the generator, after a first "
         "combination (5 networks, no dropout, λ = 1) had been short of the table's best rows on the test split by "
