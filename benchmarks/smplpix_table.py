@@ -166,8 +166,8 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "one's pictures and seeds). A dash: nothing is trained, all seeds give the same numbers. Inside: over "
             "the subject's pixels; the others over the frame, most of which is white. Milliseconds of "
             "processor time, one picture alone on one thread: drawing the mesh, 4 × 4 samples a pixel unless said, or "
-            "projecting its vertices; then the network. What longer training brings: "
-            "[smplpix_training.md](smplpix_training.md).",
+            "projecting its vertices; then the network. Networks are trained for a quarter of the experiments' epochs; "
+            "what longer training brings: [smplpix_training.md](smplpix_training.md)." + unfinished(runs),
             "",
             f"| | vertices | seeds | {' | '.join(heading for heading, _ in COLUMNS.values())} | drawing, ms | "
             "network, ms |",
@@ -196,6 +196,12 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "",
         ]
     )
+
+
+def unfinished(runs: Mapping[Row, list[dict[str, Any]]]) -> str:
+    """A sentence where trained rows have different numbers of seeds."""
+    counts = {len(results) for results in runs.values() if results[0]["parameters"]}
+    return " **Sweeps were stopped before all seeds had run.**" if len(counts) > 1 else ""
 
 
 def completed(folder: Path) -> list[dict[str, Any]]:
