@@ -234,7 +234,11 @@ def grouped(results: Sequence[dict[str, Any]]) -> dict[Row, list[dict[str, Any]]
         if len({result["seed"] for result in some}) < len(some):
             sys.exit(f"Two results of {row} have one seed; wanted sweeps over methods, topologies and seeds.")
     order = {method: place for place, method in enumerate(NAMES)}
-    return {row: found[row] for row in sorted(found, key=lambda row: order.get(row.method, len(order)))}
+
+    def place(row: Row) -> tuple[int, str, int]:
+        return order.get(row.method, len(order)), row.change, int(row.topology.removesuffix("k"))
+
+    return {row: found[row] for row in sorted(found, key=place)}
 
 
 def same(results: Sequence[dict[str, Any]]) -> bool:
