@@ -23,7 +23,7 @@ ROOT = HERE.parents[1]
 FOLDER = ROOT / "outputs/thesis_tables"
 SAID = ("pictures=false", "logger=none", "threads=1")
 BFLOAT16 = "trainer.precision=bf16-mixed"
-"""For convolutions, where asked for: two thirds of the time on a processor that has avx512_bf16, longer on another."""
+"""For convolutions, where asked for: it pays on a processor that has avx512_bf16."""
 CLASSES = (
     "aeroplane,bicycle,boat,bottle,bus,car,chair,diningtable,motorbike,sofa,train,tvmonitor"  # Table 3.3's
 )

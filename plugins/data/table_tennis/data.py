@@ -21,7 +21,7 @@ from plugins.data.table_tennis.physics import Constants
 from plugins.data.table_tennis.picture import side_view
 from plugins.data.table_tennis.recordings import SUFFIXES, Flight, distinct, flights_of, irregular, listed
 from plugins.data.table_tennis.simulator import Simulation, simulated
-from plugins.data.table_tennis.windows import PARTS, Grid, Window, prefix, windows
+from plugins.data.table_tennis.windows import CITED, PARTS, Grid, Window, prefix, windows
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
@@ -47,15 +47,7 @@ class TableTennis(Data):
         constants: of the ball and the table that are simulated.
     """
 
-    bibtex = """@article{gomez2020real,
-  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
-  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
-  journal = {IEEE Robotics and Automation Letters},
-  volume  = {5},
-  number  = {2},
-  pages   = {970--976},
-  year    = {2020}
-}"""
+    bibtex = CITED
     groups = ("table_tennis",)
     suffixes = SUFFIXES
 

@@ -11,7 +11,7 @@ from framework.metric import Metric, Pictured
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.data.table_tennis.ballistic import future_of
-from plugins.data.table_tennis.windows import PARTS
+from plugins.data.table_tennis.windows import CITED, PARTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,15 +45,7 @@ class FlightError(Metric, Pictured):
         height: of that plane, m: somewhat above the table, so that no bounce is between two frames.
     """
 
-    bibtex = """@article{gomez2020real,
-  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
-  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
-  journal = {IEEE Robotics and Automation Letters},
-  volume  = {5},
-  number  = {2},
-  pages   = {970--976},
-  year    = {2020}
-}"""
+    bibtex = CITED
     columns: ClassVar[dict[str, str]] = {
         "error_cm": "error cm",
         "error_far_cm": "error at the end cm",

@@ -9,6 +9,15 @@ from pydantic import Field
 
 from plugins.data.table_tennis.recordings import Flight
 
+CITED = """@article{gomez2020real,
+  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
+  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
+  journal = {IEEE Robotics and Automation Letters},
+  volume  = {5},
+  number  = {2},
+  pages   = {970--976},
+  year    = {2020}
+}"""
 PARTS = ("time", "x", "y", "z", "seen")
 """What is read of each frame: seconds from now (not above 0), metres, and 1 where there is a frame, 0 where it misses;
 the other numbers of a missing one are 0."""
