@@ -267,35 +267,24 @@ def _step(problems: _Problems, active: _Active) -> _Step:
     given = ("at", "lower", "upper", "cost", "gradient", "gram", "curve", "scale", "damping")
     compiled.stepped(*active.arrays(*given), *(part.numpy() for part in (*step, careful)))
     if len(where := careful.nonzero().squeeze(1)):
-        for part, mended in zip(step, _careful_step(problems, active.only(where)), strict=True):
+        some = _Step(*(part[where] for part in step))
+        for part, mended in zip(step, _careful_step(problems, active.only(where), some), strict=True):
             part[where] = mended
     return step
 
 
-def _careful_step(problems: _Problems, active: _Active) -> _Step:
-    """The same with the Jacobian itself, where its square has lost what it knows."""
+def _careful_step(problems: _Problems, active: _Active, step: _Step) -> _Step:
+    """The same from the singular values of the Jacobian, where its square has lost what it knows."""
     held = (active.at <= active.lower) & (active.gradient >= 0)
     held |= (active.at >= active.upper) & (active.gradient <= 0)
-    length = active.gram.diagonal(dim1=-2, dim2=-1).sqrt()
-    held |= length <= EPSILON * active.scale  # nothing is known of it here
-    cosine = active.gradient / (length * (2 * active.cost).sqrt().unsqueeze(-1))
-    slope = cosine.where(~held, 0.0).abs().nan_to_num(0.0).amax(-1)
-
+    held |= active.gram.diagonal(dim1=-2, dim2=-1).sqrt() <= EPSILON * active.scale
     scale = active.scale.where(active.scale > 0, 1.0)
-    area = scale.unsqueeze(-1) * scale.unsqueeze(-2)
-    pull = active.gradient / scale
     below, above = (active.lower - active.at) * scale, (active.upper - active.at) * scale
-    normal = (active.gram + active.curve) / area
-    factor, weak = _factor(normal, held, active.damping)
-    if len(weak):  # the Hessian is not positive there
-        normal[weak] = active.gram[weak] / area[weak]
-        factor[weak], still = _factor(normal[weak], held[weak], active.damping[weak])
-        weak = weak[still]
-    least = factor.diagonal(dim1=-2, dim2=-1).where(~held, torch.inf).amin(-1).square()
-    least[weak] = 0.0
-    known, feeble = torch.zeros_like(pull), weak
-    cut = torch.zeros(len(pull), dtype=torch.bool, device=pull.device)
-    move = _solved(problems, active, _System(scale, normal, pull, held, known), factor, weak)
+    residuals, jacobian = problems.written(active.at, active.rows)
+    jacobian = jacobian / scale.unsqueeze(-2)
+
+    known, cut = torch.zeros_like(active.at), torch.zeros_like(step.cut)
+    move = _solved(jacobian, residuals, held, known, active.damping)
     for _ in range(CLIPS):
         out = ((move < below) | (move > above)) & ~held
         some = out.any(-1).nonzero().squeeze(1)
@@ -303,65 +292,22 @@ def _careful_step(problems: _Problems, active: _Active) -> _Step:
             break
         known = torch.where(out, torch.minimum(torch.maximum(move, below), above), known)
         held, cut[some] = held | out, True
-        fewer = _System(*(part[some] for part in (scale, normal, pull, held, known)))
-        factor, weak = _factor(fewer.normal, fewer.held, active.damping[some])
-        move[some] = _solved(problems, active.only(some), fewer, factor, weak)
+        system = (part[some] for part in (jacobian, residuals, held, known, active.damping))
+        move[some] = _solved(*system)
     move = torch.minimum(torch.maximum(move, below), above)
-    gain = -(move * (pull + torch.bmm(normal, move.unsqueeze(-1)).squeeze(-1) / 2)).sum(-1)
-    told = (move * (active.damping.unsqueeze(-1) * move - pull)).sum(-1) / 2  # the same, were the step exact
-    wrong = ((gain - told).abs() > told / 10) & ~cut
-    wrong[feeble] = False
-    again = wrong.nonzero().squeeze(1)
-    if len(again):
-        fewer = _System(*(part[again] for part in (scale, normal, pull, held, known)))
-        each = torch.arange(len(again), device=again.device)
-        longer = _solved(problems, active.only(again), fewer, torch.empty_like(fewer.normal), each)
-        move[again] = torch.minimum(torch.maximum(longer, below[again]), above[again])
-        feeble = torch.cat((feeble, again))
-    if len(feeble):  # where the matrix has lost what the Jacobian knows
-        residuals, jacobian = problems.written(active.at[feeble], active.rows[feeble])
-        residuals += torch.bmm(jacobian, (move / scale)[feeble].unsqueeze(-1)).squeeze(-1)
-        gain[feeble] = active.cost[feeble] - residuals.square().sum(-1) / 2
-    return _Step(move / scale, gain, slope, least, cut)
+    after = residuals + torch.bmm(jacobian, move.unsqueeze(-1)).squeeze(-1)
+    least = step.least.where(step.least >= SINGULAR**2, 0.0)
+    return _Step(move / scale, active.cost - after.square().sum(-1) / 2, step.slope, least, cut)
 
 
-class _System(NamedTuple):
-    """Of scaled steps: Hessian, gradient, what is held, and how far it moves nevertheless."""
-
-    scale: Tensor
-    normal: Tensor
-    pull: Tensor
-    held: Tensor
-    known: Tensor
-
-
-def _factor(normal: Tensor, held: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """The Cholesky factor of the damped matrix of what is not held, and the problems where it is worth nothing."""
-    free = ~held
-    matrix = normal * (free.unsqueeze(-1) & free.unsqueeze(-2))
-    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(free, damping.unsqueeze(-1), 1.0))
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    weak = (failed > 0) | ~(factor.diagonal(dim1=-2, dim2=-1).amin(-1) >= SINGULAR)
-    return factor, weak.nonzero().squeeze(1)
-
-
-def _solved(problems: _Problems, active: _Active, system: _System, factor: Tensor, weak: Tensor) -> Tensor:
-    """The scaled step of least |J m + r|² + damping |m|², with the singular values of J where the factor is `weak`."""
-    scale, normal, pull, held, known = system
-    push = pull + torch.bmm(normal, known.unsqueeze(-1)).squeeze(-1)
-    factor[weak] = torch.eye(pull.shape[-1], dtype=factor.dtype, device=factor.device)
-    move = torch.cholesky_solve(-push.where(~held, 0.0).unsqueeze(-1), factor).squeeze(-1)
-    if len(weak):
-        residuals, jacobian = problems.written(active.at[weak], active.rows[weak])
-        jacobian = jacobian / scale[weak].unsqueeze(-2)
-        residuals = residuals + torch.bmm(jacobian, known[weak].unsqueeze(-1)).squeeze(-1)
-        jacobian = jacobian * ~held[weak].unsqueeze(-2)
-        left, values, right = torch.linalg.svd(jacobian, full_matrices=False)
-        values = values.where(values > EPSILON * values.amax(-1, keepdim=True), 0.0)
-        shares = values / (values.square() + active.damping[weak].unsqueeze(-1))
-        shares = shares * torch.bmm(left.mT, residuals.unsqueeze(-1)).squeeze(-1)
-        move[weak] = -torch.bmm(right.mT, shares.unsqueeze(-1)).squeeze(-1)
-    return torch.where(held, known, move)
+def _solved(jacobian: Tensor, residuals: Tensor, held: Tensor, known: Tensor, damping: Tensor) -> Tensor:
+    """The scaled step m of least |J m + r|² + damping |m|², which moves what is held as far as is known."""
+    residuals = residuals + torch.bmm(jacobian, known.unsqueeze(-1)).squeeze(-1)
+    left, values, right = torch.linalg.svd(jacobian * ~held.unsqueeze(-2), full_matrices=False)
+    values = values.where(values > EPSILON * values.amax(-1, keepdim=True), 0.0)
+    shares = values / (values.square() + damping.unsqueeze(-1))
+    shares = shares * torch.bmm(left.mT, residuals.unsqueeze(-1)).squeeze(-1)
+    return torch.where(held, known, -torch.bmm(right.mT, shares.unsqueeze(-1)).squeeze(-1))
 
 
 def _finish(problems: _Problems, active: _Active, status: Tensor, found: Solution) -> None:
