@@ -229,7 +229,7 @@ def drawn(rows: Sequence[Row]) -> None:
                 spread = errors.std(0, ddof=1)
                 axes.fill_between(times, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
         several = f"mean of {len(seeds)} seeds, band: standard deviation" if len(seeds) > 1 else "one seed"
-        axes.set_title(f"{kind}: {several}", fontsize=10)
+        axes.set_title(f"{kind}\n{several}", fontsize=10)
         axes.set(xlabel="time into the future (ms)", ylim=(0, None))
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
