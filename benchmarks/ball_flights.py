@@ -1,10 +1,11 @@
 """Where a ball will be: physics, TVAE, LSTM and hybrid on simulated and on recorded flights (thesis Figure 4.3).
 
     python benchmarks/ball_flights.py <folder of the laboratory's *.mat>
+    python benchmarks/ball_flights.py --draw
 
-Trains what is not yet in outputs/ball_flights, some ten minutes a method on one core, and writes ball_flights.md, .png
-and ball_flights_bundle.png beside this file. On recorded flights networks start from the weights of the simulated ones;
-flights, not windows, are split, by the seed.
+Trains what is not yet in outputs/ball_flights, some ten minutes a method on one core, and writes ball_flights.md, .csv,
+.png and ball_flights_bundle.png beside this file; `--draw` draws ball_flights.png anew from the table. On recorded
+flights networks start from the weights of the simulated ones; flights, not windows, are split, by the seed.
 """
 
 import os
@@ -15,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,17 +25,19 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
+from benchmarks import committed
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
-from framework.figures.style import COLOURS, titled_figure
+from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
 from framework.prediction import Prediction
+from framework.reports.table import Row, csv
 from plugins.data.table_tennis.flight_error import DRAWS, FlightError, Shown
 from plugins.data.table_tennis.flight_picture import bundle, landing_places
 from plugins.data.table_tennis.windows import PARTS
 
-HERE = Path(__file__)
+HERE = Path(__file__).resolve()
 RUNS = HERE.parent.parent / "outputs" / "ball_flights"
 METHODS = {"ballistic": "physics", "tvae": "TVAE", "lstm": "LSTM", "hybrid": "hybrid"}
 SEEDS = (0, 1, 2, 3, 4)
@@ -189,21 +193,55 @@ def table(found: dict[str, list[Measured]]) -> list[str]:
     return lines
 
 
-def drawn(everything: dict[str, dict[str, list[Measured]]]) -> None:
-    figure = titled_figure((10, 4.2), "Error of predicted flights against time into the future", False)
-    for place, (title, found) in enumerate(everything.items(), 1):
-        axes = figure.add_subplot(1, 2, place)
-        for (method, several), color in zip(found.items(), COLOURS, strict=False):
-            growth = np.stack([one.growth for one in several])
-            times = 16 * np.arange(1, growth.shape[1] + 1)
-            axes.plot(times, growth.mean(0), color=color, label=METHODS[method])
-            if len(growth) > 1:
-                axes.fill_between(times, growth.min(0), growth.max(0), color=color, alpha=0.15, linewidth=0)
-        axes.set(xlabel="time into the future (ms)", ylabel="mean error (cm)", ylim=(0, None))
-        axes.set_title(title, fontsize=10)
+def curves(flights: str, found: dict[str, list[Measured]]) -> Iterator[dict[str, object]]:
+    """Rows of the table: each method's and seed's mean error at each time."""
+    for method, several in found.items():
+        for seed, one in zip(SEEDS, several, strict=False):
+            for frame, error in enumerate(one.growth.tolist(), 1):
+                yield {
+                    "flights": flights,
+                    "method": METHODS[method],
+                    "seed": seed,
+                    "milliseconds_ahead": 16 * frame,
+                    "error_cm": error,
+                }
+
+
+def drawn(rows: Sequence[Row]) -> None:
+    figure = titled_figure((10, 4.6), "Error of predicted flights against time into the future", False)
+    flights = list(dict.fromkeys(str(row["flights"]) for row in rows))
+    panels = figure.subplots(1, len(flights), squeeze=False)[0]
+    for axes, kind in zip(panels, flights, strict=True):
+        seeds = {row["seed"] for row in rows if row["flights"] == kind}
+        for method, colour, marker in zip(METHODS.values(), COLOURS, MARKERS, strict=False):
+            own = [row for row in rows if (row["flights"], row["method"]) == (kind, method)]
+            times = sorted({int(str(row["milliseconds_ahead"])) for row in own})
+            errors = np.array(
+                [
+                    [float(str(row["error_cm"])) for row in own if row["seed"] == seed]
+                    for seed in SEEDS
+                    if seed in seeds
+                ]
+            )
+            mean = errors.mean(0)
+            axes.plot(times, mean, color=colour, marker=marker, markevery=4, markersize=4, label=method)
+            if len(seeds) > 1:
+                spread = errors.std(0, ddof=1)
+                axes.fill_between(times, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
+        several = f"mean of {len(seeds)} seeds, band: standard deviation" if len(seeds) > 1 else "one seed"
+        axes.set_title(f"{kind}\n{several}", fontsize=10)
+        axes.set(xlabel="time into the future (ms)", ylim=(0, None))
         axes.grid(alpha=0.3)
-        axes.legend()
-    figure.savefig(HERE.with_suffix(".png"), dpi=130)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("mean distance from the ball (cm)")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=len(METHODS),
+        fontsize=9,
+        frameon=False,
+    )
+    saved(figure, HERE.with_suffix(""), True)
 
 
 def bundles(found: dict[str, Measured]) -> None:
@@ -292,8 +330,16 @@ def write(
         f"{machine('torch', 'numpy')} One thread. Command: `python benchmarks/ball_flights.py <folder>`.",
     ]  # fmt: skip
     HERE.with_suffix(".md").write_text("\n".join(text) + "\n", encoding="utf-8")
-    both = {"simulated flights (synthetic)": simulated, "recorded flights (WAM laboratory)": recorded}
-    drawn({title: found for title, found in both.items() if found})
+    rows = [
+        row
+        for kind, found in (
+            ("simulated flights (synthetic)", simulated),
+            ("recorded flights (WAM laboratory)", recorded),
+        )
+        for row in curves(kind, found)
+    ]
+    csv(rows, None, HERE.with_suffix(".csv"))
+    drawn(rows)
     bundles({method: several[0] for method, several in simulated.items()})
 
 
@@ -306,4 +352,7 @@ def ratios(found: dict[str, list[Measured]], method: str) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else None)
+    if sys.argv[1:] == ["--draw"]:
+        drawn(committed.rows(HERE.with_suffix(".csv")))
+    else:
+        main(sys.argv[1] if len(sys.argv) > 1 else None)

@@ -3,9 +3,10 @@
     python -m framework -m 'data.angles=[pan]' seed=0,1,2 threads=1 hydra.sweep.dir=outputs/sweeps/blur \\
         experiment=idiap/fixed_kappa,idiap/von_mises,idiap/mixture,idiap/cvae,idiap/scvae
     python benchmarks/blur.py outputs/sweeps/blur [data.root of the real set]
+    python benchmarks/blur.py --draw
 
 Every trained model of the sweep sees its own test split under Gaussian blurs. Writes blur.md, blur.csv, blur.png (the
-curves) and blur_strip.png (one head's densities) beside this file.
+curves) and blur_strip.png (one head's densities) beside this file; `--draw` draws blur.png anew from blur.csv.
 """
 
 import json
@@ -15,19 +16,32 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import committed
 from benchmarks.machine import machine
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build
 from framework.datasets.images import blurred, picture
 from framework.distributions.density import circular_grid
 from framework.distributions.protocol import marginal
+from framework.figures.style import COLOURS, GREY, MARKERS, saved, titled_figure
 from framework.model import Predictor
 from framework.reports.table import aggregate, csv, markdown
 
-METHODS = ("fixed_kappa", "von_mises", "mixture", "cvae", "scvae")
+HERE = Path(__file__).resolve()
+METHODS = {
+    "fixed_kappa": "von Mises, fixed concentration",
+    "von_mises": "von Mises",
+    "mixture": "mixture of von Mises",
+    "cvae": "CVAE",
+    "scvae": "sCVAE",
+}
+"""The experiments, and what the pictures call them."""
+UNIFORM = -math.log(2 * math.pi)
+CUT = -3.0
+"""Nats: below, the axis of the curves is compressed."""
 DEVIATIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
 """Of the Gaussian, pixels of the 75-pixel crop."""
 IMAGES = 1000
@@ -48,52 +62,107 @@ def log_likelihoods(model: Predictor, images: torch.Tensor, pan: torch.Tensor) -
     return found
 
 
-def curves(rows: list[dict[str, object]], path: Path, label: str) -> None:
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    for row in rows:
-        mean = [row[f"blur_{d:g}"] for d in DEVIATIONS]
-        axes.plot(DEVIATIONS, mean, marker="o", markersize=3, label=str(row["method"]).rpartition("/")[2])
-        spread = np.array([row.get(f"blur_{d:g}_std", math.nan) for d in DEVIATIONS], dtype=float)
-        axes.fill_between(DEVIATIONS, np.array(mean) - spread, np.array(mean) + spread, alpha=0.15)
-    axes.axhline(-math.log(2 * math.pi), color="grey", linestyle=":", label="uniform density")
-    axes.set_xlabel("σ of the blur (pixels of 75)")
-    axes.set_ylabel("log-likelihood of the pan (nats)")
-    axes.set_ylim(max(axes.get_ylim()[0], -8), None)
-    axes.set_title(f"Log-likelihood under blur: {label}")
-    axes.legend(fontsize="small")
-    figure.savefig(path, dpi=150)
+def method(row: dict[str, object]) -> str:
+    """The name of the row's experiment in its folder."""
+    return str(row["method"]).rpartition("/")[2]
+
+
+def compared(rows: list[dict[str, object]]) -> list[dict[str, object]]:
+    """Means and standard deviations over seeds, in the order of METHODS."""
+    return sorted(aggregate(rows, by=["method"]), key=lambda row: list(METHODS).index(method(row)))
+
+
+def curves(rows: list[dict[str, object]], path: Path) -> None:
+    """The upper panel shows what separates the methods, the lower how far those fall that are sure of themselves."""
+    figure = titled_figure(
+        (7.5, 6), "Log-likelihood of the pan angle under blur, IDIAP", bool(rows[0]["synthetic"])
+    )
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.2))
+    lowest = CUT
+    for row in compared(rows):
+        place = list(METHODS).index(method(row))
+        mean, spread = (
+            np.array([row.get(f"blur_{d:g}{suffix}", math.nan) for d in DEVIATIONS], dtype=float)
+            for suffix in ("", "_std")
+        )
+        lowest = min(lowest, np.nanmin([mean, mean - spread]))
+        for axes in (upper, lower):
+            axes.plot(
+                DEVIATIONS,
+                mean,
+                color=COLOURS[place],
+                marker=MARKERS[place],
+                markersize=4,
+                label=METHODS[method(row)],
+            )
+            axes.fill_between(
+                DEVIATIONS, mean - spread, mean + spread, color=COLOURS[place], alpha=0.18, linewidth=0
+            )
+    upper.axhline(UNIFORM, color=GREY, linestyle=":", label="uniform density")
+    upper.set_ylim(CUT, None)
+    lower.set_ylim(lowest - 1.5, CUT)
+    broken(upper, lower)
+    seeds = sorted({int(str(row["seed"])) for row in rows})
+    several = (
+        f"mean of {len(seeds)} seeds, band: standard deviation" if len(seeds) > 1 else "one seed, so no band"
+    )
+    upper.set_title(f"{several}; the axis is compressed below {CUT:g}".replace("-", "−"), fontsize=9)
+    lower.set_xlabel("standard deviation of the Gaussian blur (pixels of 75)")
+    figure.supylabel("mean log-likelihood of the pan angle (nats)", fontsize=10)
+    upper.legend(fontsize=9, frameon=False)
+    saved(figure, path.with_suffix(""), True)
+
+
+def broken(upper: Axes, lower: Axes) -> None:
+    """Marks where the scale of the vertical axis changes between two panels."""
+    for axes, edge, height in ((upper, "bottom", 0), (lower, "top", 1)):
+        axes.spines[edge].set_visible(False)
+        mark = {
+            "marker": [(-1, -0.6), (1, 0.6)],
+            "markersize": 10,
+            "color": "black",
+            "linestyle": "",
+            "clip_on": False,
+        }
+        axes.plot([0, 1], [height, height], transform=axes.transAxes, **mark)
+        axes.grid(alpha=0.3)
+    upper.tick_params(bottom=False)
 
 
 @torch.no_grad()
-def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: Path, label: str) -> None:
+def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: Path, synthetic: bool) -> None:
     shown = DEVIATIONS[::2]
-    figure = Figure(figsize=(2.1 * len(shown), 4.4), layout="constrained")
+    figure = titled_figure(
+        (2.1 * len(shown), 4.8), "Densities of the pan angle of one head under blur, IDIAP", synthetic
+    )
     grid = figure.subplots(2, len(shown), height_ratios=(1, 1.2))
     for column, deviation in enumerate(shown):
         seen = blurred(image, deviation)
         grid[0, column].imshow(picture(seen))
         grid[0, column].set_axis_off()
-        grid[0, column].set_title(f"σ = {deviation:g} px")
+        grid[0, column].set_title(f"blur of {deviation:g} px")
         axes = grid[1, column]
         for name, model in models.items():
             torch.manual_seed(0)
             angles, log_density = circular_grid(marginal(model(seen[None]), 0))
-            axes.plot(angles.rad2deg(), log_density[:, 0].exp(), label=name, linewidth=1.2)
-        axes.axvline(math.degrees(pan), color="black", linestyle=":", linewidth=1, label="true pan")
+            colour = COLOURS[list(METHODS).index(name)]
+            axes.plot(
+                angles.rad2deg(), log_density[:, 0].exp(), color=colour, label=METHODS[name], linewidth=1.2
+            )
+        axes.axvline(math.degrees(pan), color="black", linestyle=":", linewidth=1, label="true pan angle")
         axes.set_xticks((-180, -90, 0, 90, 180))
-        axes.set_xlabel("pan °")
-    for axes in grid[1, 1:]:
-        axes.sharey(grid[1, 0])
+        axes.set_xlabel("pan angle (°)")
+    # without blur densities are several times as high
+    for axes in grid[1, 2:]:
+        axes.sharey(grid[1, 1])
         axes.tick_params(labelleft=False)
-    grid[1, 0].set_ylabel("density")
-    grid[1, 0].legend(fontsize="x-small")
-    figure.suptitle(f"One head, ever more blurred: {label}")
-    figure.savefig(path, dpi=150)
+    grid[1, 0].set_ylabel("density (1 / rad)")
+    handles, labels = grid[1, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    saved(figure, path.with_suffix(""), True)
 
 
 def main() -> None:
-    here = Path(__file__).resolve()
     rows, first = [], {}
     fields: dict[str, torch.Tensor] = {}
     for result in sorted(Path(sys.argv[1]).glob("*/results.json")):
@@ -107,14 +176,11 @@ def main() -> None:
             fields = {"input": batch["input"], "target": batch["target"]}
         found = log_likelihoods(model, fields["input"], fields["target"][:, :1])
         rows.append({"method": row["method"], "seed": row["seed"], "synthetic": row["synthetic"], **found})
-        name = row["method"].rpartition("/")[2]
         if row["seed"] == 0:
-            first[name] = model
-    compared = aggregate(rows, by=["method"])
-    compared.sort(key=lambda row: METHODS.index(str(row["method"]).rpartition("/")[2]))
+            first[method(row)] = model
     label = "synthetic IDIAP" if rows[0]["synthetic"] else "IDIAP"
-    csv(rows, {"method": "method", "seed": "seed", **COLUMNS}, here.with_suffix(".csv"))
-    curves(compared, here.with_suffix(".png"), label)
+    csv(rows, {"method": "method", "seed": "seed", **COLUMNS}, HERE.with_suffix(".csv"))
+    curves(rows, HERE.with_suffix(".png"))
     # a head in half profile, which blur makes doubtful step by step
     index = int((fields["target"][:, 0].abs() - math.radians(50)).abs().argmin())
     chosen = {name: first[name] for name in METHODS if name in first}
@@ -122,19 +188,23 @@ def main() -> None:
         chosen,
         fields["input"][index],
         fields["target"][index, 0].item(),
-        here.with_name("blur_strip.png"),
-        label,
+        HERE.with_name("blur_strip.png"),
+        bool(rows[0]["synthetic"]),
     )
+    named = [{**row, "method": METHODS[method(row)]} for row in compared(rows)]
     text = (
         f"# Log-likelihood of the pan under Gaussian blur: {label}\n\n"
         f"Nats, {len(fields['target'])} test images at 75 pixels, models trained without blur; ± is the standard "
-        f"deviation over seeds. The uniform density has {-math.log(2 * math.pi):.2f}. Commands in `blur.py`, pictures "
-        f"`blur.png` (Figure 3.7) and `blur_strip.png` (Figure 3.8).\n\n{markdown(compared, COLUMNS)}\n\n"
+        f"deviation over seeds. The uniform density has {UNIFORM:.2f}. Commands in `blur.py`, pictures "
+        f"`blur.png` (Figure 3.7) and `blur_strip.png` (Figure 3.8).\n\n{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    here.with_suffix(".md").write_text(text, encoding="utf-8")
+    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] == ["--draw"]:
+        curves(committed.rows(HERE.with_suffix(".csv")), HERE.with_suffix(".png"))
+    else:
+        main()

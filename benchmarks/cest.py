@@ -4,11 +4,12 @@
         pictures=false logger=none hydra.run.dir=outputs/cest/$seed; done
     python benchmarks/cest.py outputs/cest/0 outputs/cest/1 outputs/cest/2
 
-Writes cest.md, cest.png and cest_maps.png beside this file. One thread, processor time, all in one run.
+Writes cest.md, cest.csv, cest.png and cest_maps.png beside this file. One thread, processor time, all in one run.
+`python benchmarks/cest.py --draw` draws cest.png anew from cest.csv.
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import committed
 from benchmarks.cest_scipy import AGREEMENT, TIGHT, agreement, scipys, timed
 from benchmarks.machine import machine
 from framework.configuration.loading import load_with_description
@@ -25,7 +27,7 @@ from framework.data import Batch
 from framework.distributions.protocol import marginal
 from framework.figures.style import BLUE, GREEN, GREY, RED, saved, titled_figure
 from framework.model import Predictor
-from framework.reports.table import markdown
+from framework.reports.table import Row, csv, markdown
 from framework.target import Target
 from plugins.data.cest.data import CEST
 from plugins.data.cest.fit import fit
@@ -55,6 +57,16 @@ DOUBTS = {
     "error": "error, times that as measured",
     "cover": "90 % intervals cover",
 }
+
+
+LEGEND = {
+    "SciPy": "SciPy, at most so many evaluations",
+    "least squares": "batched least squares, at most so many steps",
+    "network": "network",
+    "network, then least squares": "network, then so many steps of least squares",
+}
+LEAST = 1e-8
+"""The smallest error that is drawn as it is."""
 
 
 @torch.no_grad()
@@ -149,16 +161,19 @@ def curves(
     return found
 
 
-def drawn(found: dict[str, list[tuple[float, float, float]]]) -> None:
-    figure = titled_figure((7, 4.5), "Ten lines' parameters of a real slice: error against run time", False)
+def drawn(rows: Sequence[Row]) -> None:
+    figure = titled_figure((7, 5), "Ten lines' parameters of a real slice: error against run time", False)
     axis = figure.subplots()
-    for (name, points), colour, marker in zip(found.items(), (GREY, BLUE, RED, GREEN), "osD^", strict=True):
-        spent, error, _ = np.array(points).T
-        axis.plot(spent, np.maximum(error, 1e-8), marker=marker, color=colour, label=name)
-    axis.axhline(1, color="0.8", zorder=0)
-    axis.set(xscale="log", yscale="log", xlabel="milliseconds a voxel, one core")
-    axis.set_ylabel("median |error|, standard errors of least squares")
-    axis.legend()
+    for (name, label), colour, marker in zip(LEGEND.items(), (GREY, BLUE, RED, GREEN), "osD^", strict=True):
+        own = [row for row in rows if row["method"] == name]
+        spent, error = (np.array([row[key] for row in own], dtype=float) for key in ("ms", "median"))
+        axis.plot(spent, np.maximum(error, LEAST), marker=marker, color=colour, label=label)
+    axis.axhline(1, color=GREY, linestyle=":", zorder=0, label="one standard error of least squares")
+    axis.set(xscale="log", yscale="log", xlabel="processor time (ms a voxel, one core)")
+    axis.set_ylabel(f"median |error| (standard errors of least squares;\nless than {LEAST:g} is drawn there)")
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     saved(figure, HERE, True)
 
 
@@ -220,7 +235,13 @@ def main() -> None:
     voxels, network = voxels_of(data, test), networks[0]
     rows = list(agreement(file))
     found = curves(network, data, inputs, test, voxels)
-    drawn(found)
+    points = [
+        {"method": name, "ms": ms, "median": off, "within": share}
+        for name, several in found.items()
+        for ms, off, share in several
+    ]
+    csv(points, None, HERE.with_suffix(".csv"))
+    drawn(points)
     mapped(network, data, file)
     scipy = found["SciPy"][-1][0]
     named = [(name, points[-1]) for name, points in found.items()]
@@ -314,4 +335,7 @@ the test split, the other half of which is judged.
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] == ["--draw"]:
+        drawn(committed.rows(HERE.with_suffix(".csv")))
+    else:
+        main()

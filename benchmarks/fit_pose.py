@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.lines import Line2D
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -166,7 +167,11 @@ def picture(results: dict[str, list[dict[str, np.ndarray]]], number: int) -> Non
             axis.set_yscale("log")
             axis.axhline((2.0, 1.0)[which], color=GREY, linestyle=":")
             axis.grid(color=GREY, alpha=0.2)
-    axes[0].legend(fontsize=8)
+    handles, labels = axes[0].get_legend_handles_labels()
+    said = "gradient of the rasteriser; lines: medians of the starts, bands: between quartiles"
+    handles.append(Line2D([], [], color=GREY, linestyle=":"))
+    labels.append("wanted: 2° and 1 cm")
+    below.legend(handles, labels, loc="outside lower center", ncols=len(labels), title=said, frameon=False)
     figure.savefig(HERE.with_suffix(".png"), dpi=110)
 
 

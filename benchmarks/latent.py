@@ -1,36 +1,39 @@
 """Work-precision curves of log-likelihoods that are integrals over a latent variable, on a toy known by quadrature.
 
     python benchmarks/latent.py
+    python benchmarks/latent.py --draw
 
-Writes latent.md, latent.csv and latent.png beside this file; about three minutes on one core.
+Writes latent.md, latent.csv and latent.png beside this file, about three minutes on one core; `--draw` draws latent.png
+anew from latent.csv.
 """
 
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
-import matplotlib as mpl
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import committed
+from benchmarks.latent_points import sequences
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
-from framework.distributions.closed_forms import normal_quantile
 from framework.distributions.protocol import estimate
 from framework.evaluation.pareto import front
 from framework.evaluation.tradeoff import run_times
+from framework.figures.style import BLUE, GREEN, RED, saved, titled_figure
 from framework.reports import table
 from framework.target import Target
-from plugins.density_head.latent.monte_carlo import NormalPoints, lattice
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
+from plugins.density_head.latent.monte_carlo import NormalPoints
 
 HERE = Path(__file__)
 CPU = torch.device("cpu")
@@ -46,6 +49,12 @@ HEADS = {
     "cvae, 1 latent": {"name": "cvae", "latent": 1, "hidden": 32},
     "cvae, 2 latent": {"name": "cvae", "latent": 2, "hidden": 32},
 }
+KINDS = {
+    ("lattice", "samples"): ("lattice points", BLUE, "o"),
+    ("independent", "samples"): ("independent points", RED, "s"),
+    ("lattice", "tolerance"): ("lattice points until a tolerance is met", GREEN, "^"),
+}
+"""How each kind of points looks in the picture."""
 COLUMNS = {
     "method": "method",
     "knob": "knob",
@@ -206,21 +215,24 @@ def curve(method: str, encoder: nn.Module, head: DensityHead) -> list[dict[str, 
                     log_prob = torch.stack([one.log_mean for one in found]).double()
                     debiased = torch.stack([one.debiased for one in found]).double()
                     told = torch.stack([one.standard_error for one in found]).double()
+                    error = log_prob - truth
                     rows.append(
                         {
                             "method": f"{method}, {kind}" if kind != "exact" else method,
                             "knob": knob,
                             "value": setting,
-                            "error_nats": float((log_prob - truth).square().mean().sqrt()),
-                            "error_of_mean_nats": float((log_prob - truth).mean(1).square().mean().sqrt()),
-                            "bias_nats": float((log_prob - truth).mean()),
+                            "error_nats": float(error.square().mean().sqrt()),
+                            "error_nats_std": float(error.square().mean(1).sqrt().std()),
+                            "error_of_mean_nats": float(error.mean(1).square().mean().sqrt()),
+                            "bias_nats": float(error.mean()),
                             "debiased_bias_nats": float((debiased - truth).mean()),
                             "told_error_nats": float(told.square().mean().sqrt()),
                             "samples_mean": float(
                                 torch.stack([one.samples for one in found]).double().mean()
                             ),
                             "family_excess_nats": family,
-                            "excess_nats": family - float((log_prob - truth).mean()),
+                            "excess_nats": family - float(error.mean()),
+                            "excess_nats_std": float(error.mean(1).std()),
                             "milliseconds_per_sample": 1e3 * seconds / ITEMS,
                             "synthetic": True,
                         }
@@ -238,86 +250,82 @@ def mark(rows: list[dict[str, object]]) -> None:
 
 
 def picture(rows: list[dict[str, object]]) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(13, 5.5), layout="constrained")
-    colors = {name: f"C{index}" for index, name in enumerate(HEADS)}
-    for method, knob in dict.fromkeys((row["method"], row["knob"]) for row in rows):
-        own = [row for row in rows if (row["method"], row["knob"]) == (method, knob)]
-        color = next(color for name, color in colors.items() if str(method).startswith(name))
-        style = {"samples": ":" if "independent" in str(method) else "-", "tolerance": "--"}.get(
-            str(knob), ""
-        )
-        label = f"{method}" + (" to a tolerance" if knob == "tolerance" else "")
-        time = [row["milliseconds_per_sample"] for row in own]
-        for axis, key in zip(axes, ("error_nats", "excess_nats"), strict=True):
-            if knob == "none" and key == "error_nats":
-                continue  # exact: no place on a logarithmic axis
-            marker = "s" if knob == "none" else "."
-            axis.plot(
-                time, [row[key] for row in own], linestyle=style, marker=marker, color=color, label=label
-            )
-        if knob != "none":
-            best = [row for row in own if row["pareto"]]
-            where = [[row[key] for row in best] for key in ("milliseconds_per_sample", "error_nats")]
-            axes[0].plot(*where, "o", markerfacecolor="none", color=color, markersize=8)
-    for axis in axes:
-        axis.set(xscale="log", yscale="log", xlabel="milliseconds per sample (batch of 64, one core)")
-        axis.grid(alpha=0.3, which="both", linewidth=0.4)
+    """A column a model, a row a quantity; colours and markers are kinds of points, line styles sizes of the latent."""
+    figure = titled_figure((11, 8.5), "Log-likelihoods of latent-variable models on a toy of two modes", True)
+    axes = figure.subplots(2, 2, sharex=True, sharey="row")
+    for column, (key, name) in enumerate((("scvae", "sCVAE"), ("cvae", "CVAE"))):
+        for line in curves(rows, key):
+            for axis, quantity in zip(axes[:, column], ("error_nats", "excess_nats"), strict=True):
+                banded(axis, line, quantity)
+        axes[0, column].set_title(f"{name}: error of the estimate", fontsize=11)
+        axes[1, column].set_title(f"{name}: error of the model", fontsize=11)
+        axes[1, column].set_xlabel("run time (ms per sample, batches of 64, one core)")
+    exact = next(row for row in rows if row["knob"] == "none")
+    for axis in axes[1]:
+        axis.axhline(exact["excess_nats"], color="black", linewidth=1, linestyle=":")
+    for axis in axes.flat:
+        axis.set(xscale="log", yscale="log")
+        axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0].set(ylabel="error of one log-likelihood against the head's own integral, nats (RMS)")
-    axes[0].set_title("error of the estimate (circled: Pareto)")
-    axes[1].set(ylabel="negative log-likelihood above the entropy of the truth, nats")
-    axes[1].set_title("error of the model")
-    axes[1].legend(fontsize=7, frameon=False)
-    figure.suptitle("Latent-variable heads on a synthetic toy: two von Mises whose modes move with x")
-    figure.savefig(HERE.with_suffix(".png"), dpi=110)
-    plt.close(figure)
+    axes[0, 0].set_ylabel("RMS error of one log-likelihood\nagainst the model's own integral (nats)")
+    axes[1, 0].set_ylabel("negative log-likelihood\nabove the entropy of the truth (nats)")
+    handles = [
+        Line2D([], [], color=colour, marker=marker, label=label) for label, colour, marker in KINDS.values()
+    ]
+    handles += [
+        Line2D([], [], color="black", label="one latent number, filled"),
+        Line2D(
+            [],
+            [],
+            color="black",
+            linestyle="--",
+            marker="o",
+            markerfacecolor="white",
+            label="two latent numbers, hollow",
+        ),
+        Line2D(
+            [],
+            [],
+            color="black",
+            linestyle=":",
+            linewidth=1,
+            label=f"mixture of two von Mises: exact, in {exact['milliseconds_per_sample']:.3f} ms",
+        ),
+    ]
+    said = f"Bands: standard deviation over {SEEDS} seeds. " if "error_nats_std" in exact else ""
+    said += f"Dots: {SAMPLES[0]} to {SAMPLES[-1]} points, or tolerances of {TOLERANCES[0]} to {TOLERANCES[-1]} nats."
+    legend = figure.legend(
+        handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False, title=said
+    )
+    legend.get_title().set(fontsize=9)
+    saved(figure, HERE.with_suffix(""), True)
 
 
-def kronecker(count: int, dimensions: int) -> Tensor:
-    """i (g⁻¹, g⁻², …) mod 1 with g^(d+1) = g + 1 (Roberts 2018)."""
-    root = 1.5
-    for _ in range(100):
-        root = (1 + root) ** (1 / (dimensions + 1))
-    powers = torch.tensor([root**-power for power in range(1, dimensions + 1)], dtype=torch.float64)
-    return torch.remainder(torch.outer(torch.arange(count, dtype=torch.float64), powers), 1.0)
+def curves(
+    rows: list[dict[str, object]], key: str
+) -> Iterator[tuple[list[dict[str, object]], dict[str, Any]]]:
+    """The rows of each curve of a model, and how it looks."""
+    for latent in (1, 2):
+        for (kind, knob), (_, colour, marker) in KINDS.items():
+            method = f"{key}, {latent} latent, {kind}"
+            own = [row for row in rows if (row["method"], row["knob"]) == (method, knob)]
+            style: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 4.5}
+            if latent == 2:
+                style |= {"linestyle": "--", "markerfacecolor": "white"}
+            yield own, style
 
 
-def sobol(count: int, dimensions: int) -> Tensor:
-    return torch.quasirandom.SobolEngine(dimensions).draw(count, dtype=torch.float64)
-
-
-SEQUENCES = {
-    "Kronecker": kronecker,
-    "Sobol": sobol,
-    "lattice": lambda count, dimensions: lattice(0, count, dimensions),
-}
-INTEGRANDS: tuple[Callable[[Tensor], Tensor], ...] = (
-    lambda z: torch.exp(2 * torch.cos(z.sum(-1) / z.shape[-1] ** 0.5 - 0.5)),
-    lambda z: torch.exp(50 * (torch.cos(z.sum(-1) / z.shape[-1] ** 0.5 - 0.5) - 1)),
-    lambda z: torch.exp(-2 * (z - 0.4).square().sum(-1)),
-    lambda z: torch.exp(z.sum(-1) / z.shape[-1] ** 0.5 / 2),
-    lambda z: torch.exp(10 * torch.cos(2 * z[..., 0] - 0.3 * z.sum(-1))),
-)
-
-
-def sequences(repeats: int = 400) -> list[dict[str, object]]:
-    """Variance of independent points over that of each sequence, randomly shifted: mean of five, and worst."""
-    rows: list[dict[str, object]] = []
-    torch.manual_seed(0)
-    for dimensions in (1, 2, 4, 8):
-        for count in (62, 64, 125, 512):
-            shift = torch.rand(repeats, 1, dimensions, dtype=torch.float64)
-            row: dict[str, object] = {"dimensions": dimensions, "points": count}
-            z = torch.randn(4 * repeats, count, dimensions, dtype=torch.float64)
-            plain = torch.stack([integrand(z).mean(1).var() for integrand in INTEGRANDS])
-            for name, sequence in SEQUENCES.items():
-                z = normal_quantile(torch.remainder(sequence(count, dimensions) + shift, 1.0))
-                ratios = plain / torch.stack([integrand(z).mean(1).var() for integrand in INTEGRANDS])
-                # a gain of a million is exact for any purpose
-                row[name] = float(ratios.clamp(max=1e6).log().mean().exp())
-                row[f"{name}, worst"] = float(ratios.min())
-            rows.append(row)
-    return rows
+def banded(axis: Axes, line: tuple[list[dict[str, object]], dict[str, Any]], key: str) -> None:
+    """One curve against run time, with its standard deviation over seeds where that was measured."""
+    own, style = line
+    time, mean, spread = (
+        np.array([row.get(name, math.nan) for row in own], dtype=float)
+        for name in ("milliseconds_per_sample", key, f"{key}_std")
+    )
+    axis.plot(time, mean, linewidth=1.2, **style)
+    # on a logarithmic axis a band that reaches zero ends at a third of its middle
+    low = np.maximum(mean - spread, mean / 3)
+    axis.fill_between(time, low, mean + spread, color=style["color"], alpha=0.12, linewidth=0)
 
 
 def main() -> None:
@@ -355,4 +363,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] == ["--draw"]:
+        picture(committed.rows(HERE.with_suffix(".csv")))
+    else:
+        main()

@@ -3,7 +3,7 @@
     python benchmarks/thesis_tables.py 2.1
 
 Or of sweeps that have run: `python benchmarks/moons.py <their folders>`. Writes moons.md, moons_landscapes.png and
-moons_reliability.png beside this file.
+moons_reliability.png beside this file; with `--draw` before the folders only the pictures.
 """
 
 import json
@@ -204,4 +204,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--draw"]:
+        torch.set_num_threads(1)
+        pictures(results([Path(folder) for folder in sys.argv[2:]]))
+    else:
+        main()

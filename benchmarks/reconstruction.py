@@ -1,9 +1,11 @@
 """What an encoding keeps of a cloud, against its length (thesis Figure 6.4), and what encoding costs (Figure 6.7).
 
     python benchmarks/reconstruction.py
+    python benchmarks/reconstruction.py --draw
 
 Writes reconstruction.csv, reconstruction_time.csv, reconstruction.png and reconstruction.md beside this file; half a
-minute on one core. Shapes are the generated CAD models of data=modelnet40.
+minute on one core. `--draw` draws the picture anew from both tables. Shapes are the generated CAD models of
+data=modelnet40.
 """
 
 import os
@@ -23,9 +25,10 @@ from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import committed
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
-from framework.figures.style import COLOURS, MARKERS, titled_figure
+from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
 from framework.geometry.clouds import Normalised, normalised, sizes
 from framework.geometry.nearest import chamfer
 from framework.reports.table import csv, markdown
@@ -43,10 +46,20 @@ EDGES = (2, 3, 4, 5, 6, 8, 10, 12, 15, 18, 21)
 SIDES = (3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 25, 28, 31)
 """Cells along an occupancy grid of N = side³ flags."""
 STRATEGIES: tuple[Strategy, ...] = ("ball_uniform", "hexagonal", "ball_grid", "grid")
-METHODS = ("raw points", "occupancy", *(f"bps {name}" for name in STRATEGIES))
+METHODS = {
+    "raw points": "raw points",
+    "occupancy": "occupancy grid",
+    "bps ball_uniform": "basis points, random in the ball",
+    "bps hexagonal": "basis points, hexagonal packing",
+    "bps ball_grid": "basis points, grid in the ball",
+    "bps grid": "basis points, grid in the cube",
+}
+"""The encodings, and what the picture calls them."""
+ENCODER, BALL_TREE = "bps", "scikit-learn ball tree"
 CLOUD_SIZES = (10, 100, 1000, 2048, 10_000, 100_000)
 BASIS_SIZES = (100, 512, 4096, 32_768)
-TIMED = (("bps", 512), ("scikit-learn ball tree", 512), ("bps", 4096), ("scikit-learn ball tree", 4096))
+TIMED_TREES = (512, 4096)
+"""Sizes of the basis at which the ball tree is timed too."""
 
 
 def shapes(points: int, models: int, classes: list[str] | None = None) -> tuple[Tensor, bool]:
@@ -105,7 +118,7 @@ def errors(clouds: Tensor) -> list[dict[str, object]]:
             measure(f"bps {strategy}", 3 * edge**3, nearest_points(clouds, strategy, edge**3))
     for side in SIDES:
         measure("occupancy", side**3, cells(clouds, side))
-    return sorted(rows, key=lambda row: METHODS.index(str(row["method"])))
+    return sorted(rows, key=lambda row: list(METHODS).index(str(row["method"])))
 
 
 def curve(rows: list[dict[str, object]], method: str) -> np.ndarray:
@@ -146,44 +159,58 @@ def times(cloud: Tensor) -> list[dict[str, object]]:
                 part = cloud[:, :size].contiguous()
                 table, points = part[0].numpy(), made.points.numpy()
                 for method, call in {
-                    "bps": lambda part=part, made=made: encode(part, made),
-                    "scikit-learn ball tree": lambda table=table, points=points: by_ball_tree(table, points),
+                    ENCODER: lambda part=part, made=made: encode(part, made),
+                    BALL_TREE: lambda table=table, points=points: by_ball_tree(table, points),
                 }.items():
-                    if method == "bps" or (method, count) in TIMED:
+                    if method == ENCODER or count in TIMED_TREES:
                         spent = quickest(call)
                         rows.append({"method": method, "basis": count, "points": size, "milliseconds": spent})
     return rows
 
 
-def pictured(rows: list[dict[str, object]], spent: list[dict[str, object]], synthetic: bool) -> None:
-    figure = titled_figure((12, 5), "What an encoding keeps of a cloud, and what it costs", synthetic)
+def pictured(rows: list[dict[str, object]], spent: list[dict[str, object]]) -> None:
+    """Colours are methods in both panels; the markers of the right one are sizes of the basis."""
+    title = "What an encoding keeps of a cloud, and what it costs"
+    figure = titled_figure((12, 5.6), title, bool(rows[0]["synthetic"]))
     left, right = figure.subplots(1, 2)
-    for method, colour, marker in zip(METHODS, COLOURS, MARKERS, strict=False):
-        left.plot(*curve(rows, method), color=colour, marker=marker, markersize=4, label=method)
+    for (method, name), colour in zip(METHODS.items(), COLOURS, strict=False):
+        length, error = curve(rows, method)
+        noise = np.array([row["chamfer_sem"] for row in rows if row["method"] == method], dtype=float)
+        left.plot(length, error, color=colour, marker=".", label=name)
+        left.fill_between(length, error - noise, error + noise, color=colour, alpha=0.2, linewidth=0)
     left.set(
-        xlabel="length of the encoding N (numbers)", ylabel="Chamfer distance (eq. 6.6), unit ball squared"
+        xlabel="length of the encoding N (numbers)", ylabel="Chamfer distance (squared radii of the ball)"
     )
-    left.set_title(f"{rows[0]['shapes']} shapes of {POINTS} points (as Figure 6.4)", fontsize=10)
-    styles = [("bps", count) for count in BASIS_SIZES] + [pair for pair in TIMED if pair[0] != "bps"]
-    for (method, count), marker in zip(styles, MARKERS, strict=False):
-        points = [row for row in spent if (row["method"], row["basis"]) == (method, count)]
-        right.plot(
-            [row["points"] for row in points],
-            [row["milliseconds"] for row in points],
-            color=COLOURS[BASIS_SIZES.index(count)],
-            linestyle="-" if method == "bps" else ":",
-            marker=marker,
-            markersize=4,
-            label=f"{method}, k = {count}",
-        )
-    right.set(xlabel="points of the cloud n", ylabel="ms per cloud, one core")
-    right.set_title("encoding time (as Figure 6.7)", fontsize=10)
+    left.set_title(
+        f"error after decoding (as Figure 6.4); narrow bands: standard error over {rows[0]['shapes']} shapes",
+        fontsize=10,
+    )
+    # timed is the encoder whose basis is random in the ball
+    own = COLOURS[list(METHODS).index("bps ball_uniform")]
+    for method, counts, colour, style, name in (
+        (ENCODER, BASIS_SIZES, own, "-", "this encoder, basis random in the ball"),
+        (BALL_TREE, TIMED_TREES, "black", ":", "scikit-learn's ball tree, search alone"),
+    ):
+        for count in counts:
+            points = [row for row in spent if (row["method"], row["basis"]) == (method, count)]
+            right.plot(
+                [row["points"] for row in points],
+                [row["milliseconds"] for row in points],
+                color=colour,
+                linestyle=style,
+                marker=MARKERS[BASIS_SIZES.index(count)],
+                markersize=5,
+                label=f"{name}, k = {count}",
+            )
+    right.set(xlabel="points of the cloud n", ylabel="least processor time (ms per cloud, one core)")
+    right.set_title("encoding time for k basis points (as Figure 6.7)", fontsize=10)
     for axes in (left, right):
         axes.set(xscale="log", yscale="log")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    figure.savefig(HERE.with_suffix(".png"))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(fontsize=8, frameon=False)
+    saved(figure, HERE.with_suffix(""), True)
 
 
 def claims(rows: list[dict[str, object]]) -> str:
@@ -226,7 +253,7 @@ def main() -> None:
     csv(rows, columns, HERE.with_suffix(".csv"))
     timed = {"method": "method", "basis": "k", "points": "n", "milliseconds": "ms"}
     csv(spent, timed, HERE.with_name("reconstruction_time.csv"))
-    pictured(rows, spent, synthetic)
+    pictured(rows, spent)
     wide = [
         {"method": f"{method}, k = {count}", "synthetic": synthetic}
         | {
@@ -234,8 +261,8 @@ def main() -> None:
             for row in spent
             if (row["method"], row["basis"]) == (method, count)
         }
-        for method, count in [("bps", count) for count in BASIS_SIZES]
-        + [pair for pair in TIMED if pair[0] != "bps"]
+        for method, counts in ((ENCODER, BASIS_SIZES), (BALL_TREE, TIMED_TREES))
+        for count in counts
     ]
     text = (
         "# What an encoding keeps of a cloud, and what it costs\n\n"
@@ -258,4 +285,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:] == ["--draw"]:
+        pictured(*(committed.rows(HERE.with_name(f"reconstruction{part}.csv")) for part in ("", "_time")))
+    else:
+        main()

@@ -11,6 +11,8 @@ from time import perf_counter
 
 import numpy as np
 import torch
+from matplotlib import colormaps
+from matplotlib.patches import Patch
 from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -132,11 +134,11 @@ def judged(network: nn.Module, clouds: Tensor, labels: Tensor, made: Basis, whol
     }
 
 
-def pictured(clouds: Tensor, labels: Tensor, said: dict[str, list[Tensor]]) -> None:
+def pictured(clouds: Tensor, labels: Tensor, said: dict[str, list[Tensor]], names: list[str]) -> None:
     """Scans from the front: true parts, and what each network says."""
     rows = {"truth": list(labels), **said}
     figure = titled_figure(
-        (2.0 * len(clouds) + 0.5, 2.4 * len(rows) + 0.7), "Parts of bodies, point by point", True
+        (2.0 * len(clouds) + 0.5, 2.4 * len(rows) + 1.3), "Parts of bodies, point by point", True
     )
     panels = figure.subplots(len(rows), len(clouds), squeeze=False)
     for line, (heading, found) in zip(panels, rows.items(), strict=True):
@@ -145,6 +147,9 @@ def pictured(clouds: Tensor, labels: Tensor, said: dict[str, list[Tensor]]) -> N
             shown = true >= 0
             axes.scatter(*cloud[shown][:, :2].T, s=0.4, c=label[shown], cmap="tab20", vmin=-0.5, vmax=19.5)
             axes.set(xticks=[], yticks=[], frame_on=False, aspect="equal")
+    colours = colormaps["tab20"](range(len(names)))
+    handles = [Patch(color=colour, label=name) for colour, name in zip(colours, names, strict=True)]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False)
     figure.savefig(HERE.with_suffix(".png"), dpi=80)
 
 
@@ -167,7 +172,7 @@ def main() -> None:
         with torch.inference_mode():
             some = held[0][:5]
             said[heading] = list(network(inputs(some, made, some.nan_to_num(0), whole)).argmax(-1))
-    pictured(held[0][:5], held[1][:5], said)
+    pictured(held[0][:5], held[1][:5], said, names)
     columns = {
         "reads": "the network reads",
         "accuracy": "accuracy",

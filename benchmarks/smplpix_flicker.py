@@ -105,17 +105,17 @@ def judged(per_subject: list[dict[str, list[Tensor]]]) -> dict[str, dict[str, fl
 
 
 def drawing(pictures: Pictures, found: dict[str, list[Tensor]]) -> Figure:
-    figure = titled_figure(
-        (9, 6.5), "A walk, and what flickers: differences after the flow, bright is much", True
-    )
+    figure = titled_figure((9.5, 6.5), "A walk, and how much of each picture flickers", True)
     axes = figure.subplots(2, len(pictures))
     for column, name in enumerate(pictures):
         axes[0, column].imshow(pictures[name][SHOWN].byte().numpy())
         axes[0, column].set_title(name, fontsize=9)
         off = found[name][SHOWN - 1].nan_to_num(0.0)
-        axes[1, column].imshow((off / BRIGHT).clamp(0, 1).numpy(), cmap="magma", vmin=0, vmax=1)
+        shown = axes[1, column].imshow(off.numpy(), cmap="magma", vmin=0, vmax=BRIGHT)
         for axis in axes[:, column]:
             axis.set_axis_off()
+    bar = figure.colorbar(shown, ax=axes[1], extend="max")
+    bar.set_label("|difference| to the next picture\nafter the flow (of 255)")
     return figure
 
 

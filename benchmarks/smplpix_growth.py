@@ -1,9 +1,14 @@
-"""How a picture's time grows with its mesh: rasterised, and painted by networks over projected vertices; written beside
-this file: `python benchmarks/smplpix_growth.py`."""
+"""How a picture's time grows with its mesh: rasterised, and painted by networks over projected vertices.
+
+    python benchmarks/smplpix_growth.py
+    python benchmarks/smplpix_growth.py --draw
+
+Writes smplpix_growth.md, .csv and .png beside this file; `--draw` draws the picture anew from the table.
+"""
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,10 +17,13 @@ import torch
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import committed
 from benchmarks.machine import machine
 from benchmarks.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
+from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
+from framework.reports.table import Row, csv
 from plugins.data.bodies.human_scans import in_front
 from plugins.data.bodies.people import chosen_body
 from plugins.data.bodies.topologies import sheet, topology
@@ -70,8 +78,6 @@ def ways(shape: tuple[int, ...], name: str) -> dict[str, Callable[[Tensor], Tens
 
 @torch.inference_mode()
 def report(picture: Path) -> str:
-    from matplotlib.figure import Figure
-
     torch.set_num_threads(1)
     people = {name: person(name) for name in TOPOLOGIES}
     calls = {name: ways(tuple(points.shape[1:]), name) for name, points in people.items()}
@@ -83,20 +89,13 @@ def report(picture: Path) -> str:
                 took = milliseconds(partial(calls[name][way], people[name]))
                 times[place] = min(times[place], took)
     counts = [points.shape[1] for points in people.values()]
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    axes = figure.subplots()
-    for way, times in found.items():
-        axes.loglog(counts, times, "o--" if way == "projection alone" else "o-", label=way, markersize=4)
-    axes.set_xticks(counts, [f"{count:,}" for count in counts])
-    axes.minorticks_off()
-    axes.set_xlabel("vertices")
-    axes.set_ylabel("milliseconds a picture, one core")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
-    figure.suptitle(
-        f"A body of more and more vertices, {SIZE[0]} × {SIZE[1]} pixels (synthetic)", fontsize="medium"
-    )
-    figure.savefig(picture, dpi=150)
+    measured = [
+        {"way": way, "vertices": count, "milliseconds": each, "synthetic": True}
+        for way, times in found.items()
+        for count, each in zip(counts, times, strict=True)
+    ]
+    csv(measured, None, picture.with_suffix(".csv"))
+    drawn(measured, picture)
     rows = [
         f"| {way} | {' | '.join(f'{each:.2f}' for each in times)} | {times[-1] / times[0]:.1f} | "
         f"{slope([float(count) for count in counts], times):.2f} |"
@@ -122,8 +121,34 @@ def report(picture: Path) -> str:
     )
 
 
+def drawn(rows: Sequence[Row], picture: Path) -> None:
+    figure = titled_figure(
+        (8, 4.4), f"Time of a picture of {SIZE[0]} × {SIZE[1]} pixels against vertices", True
+    )
+    axes = figure.subplots()
+    for way, colour, marker in zip(
+        dict.fromkeys(str(row["way"]) for row in rows), COLOURS, MARKERS, strict=False
+    ):
+        own = [row for row in rows if row["way"] == way]
+        counts, times = ([row[key] for row in own] for key in ("vertices", "milliseconds"))
+        style = "--" if way == "projection alone" else "-"
+        axes.loglog(counts, times, style, color=colour, marker=marker, markersize=5, label=way)
+    ticks = [int(str(count)) for count in dict.fromkeys(row["vertices"] for row in rows)]
+    axes.set_xticks(ticks, [f"{count:,}" for count in ticks])
+    axes.minorticks_off()
+    axes.set_xlabel("vertices")
+    axes.set_ylabel("processor time (ms, one core)")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside right center", frameon=False, fontsize=9)
+    saved(figure, picture.with_suffix(""), True)
+
+
 if __name__ == "__main__":
-    place = Path(__file__).with_suffix(".md")
-    text = report(place.with_suffix(".png"))
-    place.write_text(text + "\n", encoding="utf-8")
-    sys.stdout.write(text + "\n")
+    place = Path(__file__).resolve().with_suffix(".md")
+    if sys.argv[1:] == ["--draw"]:
+        drawn(committed.rows(place.with_suffix(".csv")), place.with_suffix(".png"))
+    else:
+        text = report(place.with_suffix(".png"))
+        place.write_text(text + "\n", encoding="utf-8")
+        sys.stdout.write(text + "\n")

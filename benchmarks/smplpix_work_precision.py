@@ -1,12 +1,12 @@
 """Quality of a person's picture against its milliseconds: meshes with more and fewer samples, and trained networks.
 
 `python benchmarks/smplpix_work_precision.py <run> …` with runs of smplpix/quick, hybrid or their like, all on the same
-data; writes smplpix_work_precision.md and .png beside this file.
+data; writes smplpix_work_precision.md, .csv and .png beside this file. `--draw` draws the picture anew from the table.
 """
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks import committed
 from benchmarks.machine import machine
 from benchmarks.smplpix_table import Judged, by_subject, described, examined
 from framework.configuration.assembly import build_predictor
@@ -21,7 +22,9 @@ from framework.configuration.description import Description
 from framework.configuration.loading import rebuilt, stored
 from framework.configuration.schema import build, resolve
 from framework.data import Data
+from framework.figures.style import saved
 from framework.model import Predictor
+from framework.reports.table import Row, csv
 from framework.reports.tradeoff_picture import error_against_run_time
 from framework.training.batches import Batches
 
@@ -131,16 +134,8 @@ def main(runs: list[str]) -> None:
                 {"method": method, **row(examined(predictor, data, None), feature_distance(predictor, data))}
             )
             sys.stdout.write(line(method, rows[-1]) + "\n")
-    figure = error_against_run_time(
-        rows,
-        SHOWN,
-        BETTER,
-        title="Pictures of unseen people against the time of one picture",
-        synthetic=True,
-        machine="one core, processor time",
-        note="Bars: standard error over subjects. Numbers beside points: samples of a pixel along each axis.",
-    )
-    figure.savefig(HERE.with_suffix(".png"), dpi=110)
+    csv([{**one, "synthetic": True} for one in rows], None, HERE.with_suffix(".csv"))
+    drawn(rows)
     text = [
         "# Quality of a picture against its time (synthetic people)",
         "",
@@ -162,6 +157,19 @@ def main(runs: list[str]) -> None:
     HERE.with_suffix(".md").write_text("\n".join(text), encoding="utf-8")
 
 
+def drawn(rows: Sequence[Row]) -> None:
+    figure = error_against_run_time(
+        rows,
+        SHOWN,
+        BETTER,
+        title="Pictures of unseen people against the time of one picture",
+        synthetic=True,
+        machine="one core, processor time",
+        note="Bars: standard error over subjects. Numbers beside points: samples of a pixel along each axis.",
+    )
+    saved(figure, HERE.with_suffix(""), True)
+
+
 def trained(run: str) -> str:
     """What a run was, in a few words."""
     description, _ = stored(run)
@@ -170,4 +178,7 @@ def trained(run: str) -> str:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    if sys.argv[1:] == ["--draw"]:
+        drawn(committed.rows(HERE.with_suffix(".csv")))
+    else:
+        main(sys.argv[1:])

@@ -81,6 +81,24 @@ def test_the_readme_leads_to_every_plugin_and_every_benchmark() -> None:
     assert not [path for path in linked if not (ROOT / path).exists()]
 
 
+def test_a_number_of_the_readmes_table_stands_on_the_page_it_links_to() -> None:
+    number = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
+    rows = [
+        line.split("|")[1:-1]
+        for line in READMES[0].read_text(encoding="utf-8").splitlines()
+        if "](benchmarks/" in line and line.startswith("|")
+    ]
+    assert len(rows) >= 4
+    for first, *told in rows:
+        page = re.search(r"\((benchmarks/\w+\.md)\)", first)
+        assert page
+        there = [float(found) for found in number.findall((ROOT / page[1]).read_text(encoding="utf-8"))]
+        for said in number.findall(" ".join(told)):
+            # as it stands there, or rounded
+            half = 0.5 * 10.0 ** -len(said.partition(".")[2])
+            assert any(abs(float(said) - value) <= half + 1e-12 for value in there), f"{page[1]}: {said}"
+
+
 def test_every_claim_has_evidence_a_verdict_and_a_command() -> None:
     text = CLAIMS.read_text(encoding="utf-8")
     rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in text.splitlines() if re.match(r"\| \d-\d", line)]

@@ -5,16 +5,16 @@ import sys
 from pathlib import Path
 
 import torch
-from PIL import Image
 
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.errors import ConfigError, UserError
+from framework.figures.style import saved
 from framework.geometry.clouds import denormalised, sizes
 from plugins.data.bodies.data import Registration
 from plugins.data.bodies.people import chosen_body
-from plugins.data.bodies.result import picture, write_ply
+from plugins.data.bodies.result import figure, write_ply
 
 
 def main(arguments: list[str]) -> None:
@@ -56,8 +56,8 @@ def register(checkpoint: str, scans: list[Path], folder: Path) -> list[Path]:
         cloud = denormalised(batch["input"], *place)[0, : int(sizes(batch["input"]))].numpy()
         stem = folder / f"{scan.stem}_registered"
         write_ply(stem.with_suffix(".ply"), vertices, faces, cloud)
-        Image.fromarray(picture(vertices, faces, cloud)).save(stem.with_suffix(".png"))
-        written += [stem.with_suffix(".ply"), stem.with_suffix(".png")]
+        drawn = figure(vertices, faces, cloud, f"Mesh registered to {scan.name}")
+        written += [stem.with_suffix(".ply"), saved(drawn, stem, True)]
     return written
 
 

@@ -1,15 +1,26 @@
-"""Shows a registered mesh with the scan it was registered to: as one PLY file, and as a picture."""
+"""Shows a registered mesh with the scan it was registered to: as one PLY file, and as a figure."""
 
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from scipy.spatial import KDTree
+
+from framework.figures.style import titled_figure
 
 SKIN, SCAN = (0.86, 0.68, 0.58), (0.16, 0.36, 0.75)
 """Colours of the mesh and of the scan's points (thesis Figure 6.6)."""
 AMBIENT = 0.3
 """Share of the light that comes from everywhere; the rest comes from the viewer."""
+DISTANCES = "viridis"
+"""Colour map of how far points lie from the mesh."""
+NEAR = 3
+"""Vertices around which the nearest point of the mesh is looked for."""
 
 
 def write_ply(
@@ -24,16 +35,65 @@ def write_ply(
     trimesh.Trimesh(points, faces, vertex_colors=colours, process=False).export(file, "ply")
 
 
-def picture(
+def distances(
     vertices: Float[np.ndarray, "vertex 3"],
     faces: Int[np.ndarray, "face 3"],
     cloud: Float[np.ndarray, "points 3"],
-    height: int = 480,
-) -> UInt8[np.ndarray, "height width 3"]:
-    """From the front and from the left, orthographic on white, y up: the cloud alone, the mesh, and both."""
-    everything = np.concatenate([vertices, cloud])
-    low, high = everything.min(0), everything.max(0)
-    middle, reach = (low + high) / 2, 1.06 * max((high - low).max(), 1e-9)
+) -> Float[np.ndarray, "points"]:
+    """From each point of the cloud to the mesh: to the nearest face of those around the nearest vertices."""
+    around = trimesh.Trimesh(vertices, faces, process=False).vertex_faces  # padded with -1
+    used = np.flatnonzero((around >= 0).any(1))
+    _, nearest = KDTree(vertices[used]).query(cloud, k=min(NEAR, len(used)))
+    candidates = around[used[nearest]].reshape(len(cloud), -1)
+    point, column = np.nonzero(candidates >= 0)
+    triangles = vertices[faces[candidates[point, column]]]
+    closest = trimesh.triangles.closest_point(triangles, cloud[point])
+    found = np.full(len(cloud), np.inf)
+    np.minimum.at(found, point, np.linalg.norm(closest - cloud[point], axis=1))
+    return found
+
+
+def figure(
+    vertices: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    cloud: Float[np.ndarray, "points 3"],
+    title: str,
+) -> Figure:
+    """The panels with axes in metres, and how far each point of the scan lies from the mesh, millimetres."""
+    millimetres = 1e3 * distances(vertices, faces, cloud)
+    far = np.quantile(millimetres, 0.95)
+    told = f"its points lie {millimetres.mean():.1f} mm off on average, 95 % within {far:.1f} mm"
+    scale = Normalize(0, max(far, 1e-3))
+    colours = colormaps[DISTANCES](scale(millimetres))[:, :3]
+    middle, reach = _frame(vertices, cloud)
+    drawn = titled_figure((11.5, 6.2), f"{title}; {told}", False)
+    grid = drawn.subplots(2, 4, sharey=True)
+    heads = ("scan", "registered mesh", "both", "distance from the mesh")
+    for axes, head in zip(grid[0], heads, strict=True):
+        axes.set_title(head, fontsize=10)
+    side, height, depth = (middle[axis] + reach * np.array([-0.5, 0.5]) for axis in range(3))
+    # seen from the left, the front is at the left
+    across = (("front: x (m)", side), ("left side: z (m)", depth[::-1]))
+    for row, (label, ends), images in zip(grid, across, panels(vertices, faces, cloud, colours), strict=True):
+        for axes, image in zip(row, images, strict=True):
+            axes.imshow(image, extent=(*ends, *height))
+            axes.set_xlabel(label)
+        row[0].set_ylabel("y (m)")
+    bar = drawn.colorbar(ScalarMappable(scale, DISTANCES), ax=grid[:, 3], extend="max", shrink=0.7)
+    bar.set_label("distance of a scan's point from the mesh (mm)")
+    return drawn
+
+
+def panels(
+    vertices: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    cloud: Float[np.ndarray, "points 3"],
+    colours: Float[np.ndarray, "points 3"],
+    height: int = 280,
+) -> UInt8[np.ndarray, "2 4 height width 3"]:
+    """From the front and from the left, orthographic on white, y up: the cloud alone, the mesh, both, and the cloud in
+    its own colours."""
+    middle, reach = _frame(vertices, cloud)
     views = []
     for right, towards in ((0, 2), (2, 0)):
         flip = 1 if right == 0 else -1  # from the left, the front is to the viewer's left
@@ -41,13 +101,21 @@ def picture(
         frame[0, right], frame[1, 1], frame[2, towards] = flip, 1, 1
         seen = (vertices - middle) @ frame.T / reach
         points = (cloud - middle) @ frame.T / reach
-        for parts in ((None, points), (seen, None), (seen, points)):
-            views.append(_drawn(*parts, faces, height))
-    return np.concatenate(views, 1)
+        blue = np.broadcast_to(SCAN, points.shape)
+        parts = ((None, points, blue), (seen, None, blue), (seen, points, blue), (None, points, colours))
+        views.append([_drawn(*part, faces, height) for part in parts])
+    return np.array(views)
+
+
+def _frame(vertices: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle and edge of the cube that is drawn."""
+    everything = np.concatenate([vertices, cloud])
+    low, high = everything.min(0), everything.max(0)
+    return (low + high) / 2, 1.06 * max(float((high - low).max()), 1e-9)
 
 
 def _drawn(
-    vertices: np.ndarray | None, points: np.ndarray | None, faces: np.ndarray, side: int
+    vertices: np.ndarray | None, points: np.ndarray | None, colours: np.ndarray, faces: np.ndarray, side: int
 ) -> UInt8[np.ndarray, "side side 3"]:
     """x right, y up, z to the viewer, all within ±0.5; nearer surfaces hide others, points sit on what they touch."""
     image = np.ones((side, side, 3))
@@ -59,7 +127,7 @@ def _drawn(
         order = np.argsort(points[:, 2], kind="stable")  # the nearest last
         row, column, near = *place[order].T, points[order, 2]
         seen = near >= depth[row, column] - 0.01  # noise of a scan may lie a little under the surface
-        image[row[seen], column[seen]] = SCAN
+        image[row[seen], column[seen]] = colours[order[seen]]
     return _bytes(image)
 
 

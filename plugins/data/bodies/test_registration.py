@@ -18,7 +18,7 @@ from framework.geometry.clouds import denormalised, sizes
 from framework.geometry.meshes import Mesh, read
 from plugins.data.bodies import body_files, poses
 from plugins.data.bodies.body import Body, BodyModel
-from plugins.data.bodies.result import SCAN, SKIN, picture, write_ply
+from plugins.data.bodies.result import SCAN, SKIN, distances, figure, panels, write_ply
 from plugins.data.bodies.rows import JOINTS, body_file, doll
 from plugins.data.bodies.scanner import KINDS, Scanner, scan, strangers
 
@@ -247,17 +247,17 @@ def test_a_result_is_one_coloured_ply(tmp_path):
     np.testing.assert_allclose(colours[-1], SCAN, atol=1 / 255)
 
 
-def test_a_picture_shows_the_front_and_the_left_side(tmp_path):
+def test_the_panels_show_the_front_and_the_left_side():
     # a square that looks to the front, to its left a bar that looks to the left; a point before and one behind the
     # square
     vertices = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (1, -1, -0.3), (1, 1, -0.3)], float)
     faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
     cloud = np.array([(0.5, 0.5, 1.0), (-0.5, -0.5, -1.0)])
-    image = picture(vertices, faces, cloud, height=100)
-    assert image.shape == (100, 600, 3)
-    Image.fromarray(image).save(tmp_path / "a.png")
+    red = np.array([(1.0, 0.0, 0.0)] * 2)
+    drawn = panels(vertices, faces, cloud, red, height=100)
+    assert drawn.shape == (2, 4, 100, 100, 3)
     skin, blue = ((255 * np.array(color)).round() for color in (SKIN, SCAN))
-    front, left = image[:, 200:300].astype(float), image[:, 500:600].astype(float)
+    front, left = drawn[:, 2].astype(float)
     assert (front == blue).all(-1).sum() == 1  # the point behind the square is hidden
     row, column = np.argwhere((front == blue).all(-1))[0]
     assert row < 50 < column  # up, and to the body's left, which is the viewer's right
@@ -266,7 +266,22 @@ def test_a_picture_shows_the_front_and_the_left_side(tmp_path):
     assert column < 50  # the front is to the left when a body is seen from its left
     share = (np.abs(left - skin).max(-1) <= 1).mean()
     assert 0.05 < share < 0.15  # the bar alone, 0.3 by 2 of 2.12 by 2.12
-    assert (image[:, :100] != 255).any(-1).sum() == 2  # the cloud alone
+    assert (drawn[0, 0] != 255).any(-1).sum() == 2  # the cloud alone
+    assert (drawn[0, 3] == (255, 0, 0)).all(-1).sum() == 2  # in its own colours
+    shown = figure(vertices, faces, cloud, "square")
+    shown.draw_without_rendering()
+    heads = ["scan", "registered mesh", "both", "distance from the mesh"]
+    assert [axes.get_title() for axes in shown.axes[:4]] == heads
+    assert shown.get_suptitle() == "square; its points lie 1000.0 mm off on average, 95 % within 1000.0 mm"
+    assert shown.axes[4].get_xlim()[0] > shown.axes[4].get_xlim()[1]  # the front is to the left
+
+
+def test_distances_are_to_the_surface():
+    # a square with a vertex that no face uses close to every point
+    vertices = np.array([(0, 0, 0), (2, 0, 0), (2, 2, 0), (0, 2, 0), (1, 0.9, 0.3)], float)
+    faces = np.array([(0, 1, 2), (0, 2, 3)])
+    cloud = np.array([(1, 0.9, 0.3), (0.4, 1.5, -0.02), (3, 3, 0), (1, -4, 3)])
+    np.testing.assert_allclose(distances(vertices, faces, cloud), [0.3, 0.02, 2**0.5, 5], atol=1e-12)
 
 
 def write(path, vertices, faces=None):

@@ -132,6 +132,8 @@ class CalibrationError(Metric, Pictured):
             accuracy_label=f"share of {self.names[1]}" if self.positive else "accuracy",
             title=title,
             synthetic=synthetic,
+            # the largest of so many probabilities is at least their mean
+            least=0.0 if self.positive or len(self.names) < 2 else 1 / len(self.names),
         )
 
     def _of_equal_width(self, confidence: Tensor, right: Tensor) -> "Bins":

@@ -21,16 +21,18 @@ def reliability(
     accuracy_label: str,
     title: str,
     synthetic: bool,
+    least: float = 0.0,
 ) -> Figure:
     """Above how many samples have which confidence, below how often they are right; empty bins stay blank.
 
     Args:
         count, confidence, right: of each bin of equal width the number of samples, and the sums of their confidences
             and of those right.
+        least: the lowest confidence that is possible, where the axis begins.
     """
     figure = titled_figure((5.8, 7.6), title, synthetic)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 5))
-    below.set(xlim=(0, 1), ylim=(0, 1))
+    below.set(xlim=(least, 1), ylim=(0, 1))
     below.set_xlabel(confidence_label, parse_math=False)
     below.set_ylabel(accuracy_label, parse_math=False)
     above.set_ylabel("share of samples")
@@ -39,7 +41,9 @@ def reliability(
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     if count.sum() == 0:
-        below.text(0.5, 0.5, "no sample seen", ha="center", va="center", color=GREY)
+        below.text(
+            0.5, 0.5, "no sample seen", transform=below.transAxes, ha="center", va="center", color=GREY
+        )
         return figure
     _histogram(above, count, confidence.sum(), right.sum(), accuracy_label)
     _curve(below, count, confidence, right)

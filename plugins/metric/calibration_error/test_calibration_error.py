@@ -256,6 +256,7 @@ def test_the_picture_shows_what_was_seen():
     assert [height for *_, height in found] == pytest.approx([0.4, 0.22, 0.98, 0.02])
     assert "ECE 0.170 in 10 bins\n40 samples" in [text.get_text() for text in below.texts]
     assert below.get_xlabel() == "confidence in the predicted class"
+    assert above.get_xlim() == below.get_xlim() == (0.5, 1.0)  # of two classes none is predicted with less
 
 
 def test_the_picture_of_the_positive_class_names_it():
@@ -264,6 +265,7 @@ def test_the_picture_of_the_positive_class_names_it():
     figure = metric.figure("real", synthetic=False)
     figure.draw_without_rendering()
     assert (figure.axes[1].get_xlabel(), figure.axes[1].get_ylabel()) == ("p(on_$)", "share of on_$")
+    assert figure.axes[1].get_xlim() == (0.0, 1.0)
     assert figure.get_suptitle() == "real"
 
 
