@@ -99,7 +99,7 @@ def largest(
     return torch.stack([part.amax(0) for part in values.split(counts.tolist())])
 
 
-def first(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
+def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
     """Rows of the first so many points of each cloud, of all points one after the other."""
     if len(counts) == 0:
         return counts

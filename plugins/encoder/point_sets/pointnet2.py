@@ -13,7 +13,7 @@ from framework.geometry.clouds import Normalisation, pad, require_normalised, si
 from framework.geometry.farthest import farthest
 from plugins.encoder.point_sets.balls import within
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import Reading, columns_read, first, largest, over_points
+from plugins.encoder.point_sets.point_sets import Reading, columns_read, first_rows, largest, over_points
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -33,7 +33,7 @@ class Scale(NamedTuple):
 
 
 PUBLISHED = {
-    # Qi et al. 2017, "PointNet++", supplementary B.1; 32 neighbours as in the authors' code
+    # Qi et al. 2017, "PointNet++", supplement on architectures; numbers of neighbours as in the authors' code
     "single_scale": (
         (Scale(1, 32, (64, 64, 128)),),
         (Scale(2, 64, (128, 128, 256)),),
@@ -103,12 +103,8 @@ class PointNet2(Encoder):
         self.levels = nn.ModuleList()
         length = columns - 3
         for count, published in zip(centroids, PUBLISHED[grouping], strict=True):
-            scales = [
-                Scale(radius * scale.radius, scale.neighbours, scaled(scale.widths, width))
-                for scale in published
-            ]
-            self.levels.append(Level(length, count, scales))
-            length = sum(scale.widths[-1] for scale in scales)
+            self.levels.append(Level(length, count, radius, published, width))
+            length = sum(scaled(scale.widths, width)[-1] for scale in published)
         *_, after = widths = scaled(WHOLE, width)
         self.whole = layers(3 + length, widths)
         found: list[nn.Module] = []
@@ -144,14 +140,18 @@ class Level(nn.Module):
     Args:
         length: how many numbers are known of a point.
         centroids: how many points of each cloud stay.
+        radius: of the scales' unit.
         scales: of the balls; what is known of each stands one after the other.
+        width: factor of the scales' widths.
     """
 
-    def __init__(self, length: int, centroids: int, scales: list[Scale]) -> None:
+    def __init__(
+        self, length: int, centroids: int, radius: float, scales: tuple[Scale, ...], width: float
+    ) -> None:
         super().__init__()
         self.centroids = centroids
-        self.scales = scales
-        self.networks = nn.ModuleList(layers(3 + length, scale.widths) for scale in scales)
+        self.balls = [(radius * scale.radius, scale.neighbours) for scale in scales]
+        self.networks = nn.ModuleList(layers(3 + length, scaled(scale.widths, width)) for scale in scales)
 
     def forward(
         self,
@@ -161,9 +161,9 @@ class Level(nn.Module):
     ) -> tuple[Float[Tensor, "centroid 3"], Float[Tensor, "centroid channels"], Int[Tensor, "batch"]]:
         """Places and values of points, those of a cloud as `spread` orders them, to those of the centroids."""
         # a beginning of such an order is the order of its points, so that it is found once for all levels
-        centres = places[first(counts, self.centroids)]
+        centres = places[first_rows(counts, self.centroids)]
         found = []
-        for (radius, most, _), network in zip(self.scales, self.networks, strict=True):
+        for (radius, most), network in zip(self.balls, self.networks, strict=True):
             index = within(places, counts, self.centroids, radius, most)
             found.append(described(network, places, values, centres, index))
         return centres, torch.cat(found, 1), counts.clamp(max=self.centroids)

@@ -5,12 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-import framework.deployment.frozen as deployed
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.clouds import pad
-from framework.model import Model
-from framework.target import Target
 from plugins.encoder.point_sets.pointnet2 import PointNet2
 
 SMALL = {"width": 0.125, "centroids": [20, 6], "radius": 0.4, "dropout": 0.0}
@@ -178,16 +175,6 @@ def test_few_clouds_at_a_time_give_what_all_at_once_give():
     with torch.no_grad():
         torch.testing.assert_close(made(clouds), whole, rtol=1e-5, atol=1e-6)
         assert made(clouds[:0]).shape == (0, 32)
-
-
-def test_the_frozen_form_gives_the_models_numbers():
-    target = Target("class", tuple("abcde"))
-    head = build("density_head", resolve("density_head", "categorical"), target=target)
-    model = Model([encoder()], head, (150, 3)).eval()
-    clouds = pad([torch.randn(number, 3) for number in (150, 30, 1)])
-    form = deployed.frozen(model, (150, 3))
-    with torch.no_grad():
-        np.testing.assert_allclose(form(clouds), model(clouds).probs.numpy(), rtol=0, atol=1e-6)
 
 
 def test_refuses_clouds_for_which_its_balls_mean_nothing():
