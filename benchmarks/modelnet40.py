@@ -5,9 +5,9 @@
         sed 's|^|modelnet40/|; s|.yaml$||' | paste -sd,)
     python benchmarks/modelnet40.py outputs/sweeps/modelnet40
 
-An hour on two cores; the multirun prints its own table at its end. Leave out `trainer.precision` on a processor
-without bfloat16 instructions. Further sweeps (more seeds) are named beside the first. Latencies are measured here, on
-one thread; encoding is in them. Writes modelnet40.md beside this file.
+An hour on two cores, and some two more with PointNet++; the multirun prints its own table at its end. Leave out
+`trainer.precision` on a processor without bfloat16 instructions. Further sweeps (more seeds) are named beside the
+first. Latencies are measured here, on one thread; encoding is in them. Writes modelnet40.md beside this file.
 """
 
 import json
