@@ -18,6 +18,7 @@ from framework.deployment.frozen import frozen
 from framework.deployment.frozen_network import affine_logits, connected, read, softmax
 from framework.encoder import Encoder
 from framework.errors import CheckpointError
+from framework.geometry.clouds import pad
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.target import Target
 from framework.training.checkpoint import WholeCheckpoints
@@ -165,6 +166,16 @@ def test_what_is_no_chain_of_layers_is_left_to_torch(kind):
     assert read(model, (4,)) is None
     same(form, model, torch.randn(5, 4))
     assert not form.density(torch.randn(5, 4)).logits.requires_grad
+
+
+@pytest.mark.parametrize("name", ["pointnet", "pointnet2", "deepsets"])
+def test_clouds_of_different_sizes_go_through_torch(name):
+    shape = (30, 3)
+    encoder = build("encoder", resolve("encoder", name), input_shape=shape)
+    model = trained([encoder], head("categorical", SEVEN), shape)
+    form = frozen(model, shape)
+    assert "in torch, without gradient" in form.form
+    same(form, model, pad([torch.randn(count, 3) for count in (30, 11, 1)]))
 
 
 @pytest.mark.parametrize("scale", ["predicted", "fixed"])

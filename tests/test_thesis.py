@@ -35,6 +35,7 @@ PARAMETERS = {
     "deepsets_micro": "2.1e5",
     "pointnet": "3.5e6",
     "pointnet_vanilla": "8e5",
+    "pointnet2": "1.7e6",
     "bps_mlp_400": "3.8e5",
     "bps_conv3d_unpadded": "4.4e6",
 }

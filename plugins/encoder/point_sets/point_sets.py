@@ -44,17 +44,19 @@ def over_points(
     dtype: torch.dtype,
     *,
     training: bool,
+    held: int = 1,
 ) -> Float[Tensor, "batch features"]:
     """What a network says of clouds, given their points (as `points_of`) and how many each has; in parts where it may.
 
     Args:
         training: whether the whole batch is wanted at once, as batch norm does.
+        held: as of `in_parts`.
     """
     columns, most, normalise = reading
     values, counts = points_of(clouds, normalise, columns=columns, most=most, dtype=dtype)
     if training or torch.is_grad_enabled():
         return network(values, counts)
-    return in_parts(network, values, counts)
+    return in_parts(network, values, counts, held)
 
 
 def points_of(
@@ -97,6 +99,15 @@ def largest(
     return torch.stack([part.amax(0) for part in values.split(counts.tolist())])
 
 
+def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
+    """Rows of the first so many points of each cloud, of all points one after the other."""
+    if len(counts) == 0:
+        return counts
+    start = counts.cumsum(0) - counts
+    number = torch.arange(min(most, int(counts.max())), device=counts.device)
+    return (start[:, None] + number)[number < counts[:, None]]
+
+
 def to_points(
     values: Float[Tensor, "batch channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
@@ -113,12 +124,16 @@ def in_parts(
     network: Callable[[Tensor, Tensor], Tensor],
     values: Float[Tensor, "point columns"],
     counts: Int[Tensor, "batch"],
+    held: int = 1,
 ) -> Float[Tensor, "batch features"]:
     """What a network says of points and counts, given few clouds at a time so that their numbers stay near.
 
     For evaluation without gradient: with it all are held anyway, and batch norm in training wants the whole batch.
+
+    Args:
+        held: rows of numbers that the network makes of a point, about.
     """
-    limit = AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE
+    limit = (AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE) // held
     total, groups = 0, [[]]
     for number in counts.tolist():
         if groups[-1] and total + number > limit:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation
+from plugins.encoder.point_sets.layers import layers
 from plugins.encoder.point_sets.point_sets import Reading, columns_read, largest, over_points
 
 Width = Annotated[int, Field(gt=0)]
@@ -123,12 +124,3 @@ def multiplied(
     """Every point times the matrix of its cloud."""
     parts = zip(values.split(counts.tolist()), matrices, strict=True)
     return torch.cat([values[:0], *(part @ matrix for part, matrix in parts)])
-
-
-def layers(length: int, widths: list[int]) -> nn.Sequential:
-    """Linear, batch norm, ReLU for each width; batch norm has the bias."""
-    found: list[nn.Module] = []
-    for width in widths:
-        found += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
-        length = width
-    return nn.Sequential(*found)

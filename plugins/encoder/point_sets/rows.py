@@ -1,4 +1,4 @@
-"""Rows of the contract: each variant and activation, with and without attributes."""
+"""Rows of the contract: each variant, activation and grouping, with and without attributes."""
 
 from framework.testing.rows import CloudRow
 
@@ -24,11 +24,27 @@ def rows(first: CloudRow, second: CloudRow) -> tuple[CloudRow, ...]:
 
 
 NET = {"point_widths": [8, 8, 8, 12], "widths": [12, 8]}
+BALLS = {"width": 0.125, "centroids": [20, 6], "radius": 0.4}
 SETS = {"channels": [12, 12], "widths": [8]}
 ROWS = {
     "pointnet": rows(
         CloudRow("vanilla", (40, 3), config={**NET, "variant": "vanilla"}),
         CloudRow("full", (40, 3), config=NET),
+    ),
+    "pointnet2": (
+        *rows(
+            CloudRow("balls of three sizes", (40, 3), config={**BALLS, "grouping": "multi_scale"}),
+            CloudRow("balls of one size", (40, 3), config=BALLS),
+        )[:3],
+        CloudRow(
+            "the first points, as they are",
+            (40, 3),
+            config={**BALLS, "points": 10, "normalise": "none", "radius": 4.0},
+            leave_out={
+                "points in any order": "the first points are read alone",
+                "finite on extreme inputs": "clouds that were not normalised are refused",
+            },
+        ),
     ),
     "deepsets": rows(
         CloudRow("elu", (40, 3), config={**SETS, "activation": "elu"}), CloudRow("tanh", (40, 3), config=SETS)

@@ -5,7 +5,15 @@ import torch
 
 from framework.errors import ConfigError
 from framework.geometry.clouds import pad
-from plugins.encoder.point_sets.point_sets import columns_read, even, in_parts, largest, points_of, to_points
+from plugins.encoder.point_sets.point_sets import (
+    columns_read,
+    even,
+    first_rows,
+    in_parts,
+    largest,
+    points_of,
+    to_points,
+)
 
 
 @pytest.mark.parametrize("numbers", [(5, 5, 5), (5, 2, 1), (1,)])
@@ -36,6 +44,14 @@ def test_the_largest_of_each_channel(numbers):
     assert values.grad.sum() == 3 * len(numbers)
 
 
+@pytest.mark.parametrize("numbers", [(4, 4, 4), (4, 2, 1), (1,), ()])
+@pytest.mark.parametrize("most", [1, 3, 9])
+def test_first_rows_are_those_of_each_cloud(numbers, most):
+    rows = torch.arange(sum(numbers)).split(list(numbers)) if numbers else []
+    found = first_rows(torch.tensor(numbers, dtype=torch.int64), most)
+    assert found.tolist() == [row for part in rows for row in part[:most].tolist()]
+
+
 def test_parts_hold_few_points_and_give_what_the_whole_gives():
     counts = torch.tensor([3000, 2000, 2100, 10, 5000, 1])
     values, seen = torch.randn(int(counts.sum()), 2), []
@@ -46,6 +62,9 @@ def test_parts_hold_few_points_and_give_what_the_whole_gives():
 
     assert torch.equal(in_parts(network, values, counts), largest(values, counts))
     assert seen == [[3000], [2000], [2100, 10], [5000], [1]]
+    seen.clear()
+    assert torch.equal(in_parts(network, values, counts, held=2), largest(values, counts))
+    assert seen == [[3000], [2000], [2100], [10], [5000], [1]]
     assert in_parts(network, values[:0], counts[:0]).shape == (0, 2)
 
 

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from framework.geometry.farthest import farthest
+
 Choice = Literal["random", "farthest"]
 
 
@@ -20,8 +22,8 @@ def chosen(
 ) -> Int[Tensor, "batch count"]:
     """Which points of each cloud, as indices; those of a cloud that has fewer in turn, over and over.
 
-    "random": drawn without replacement, by the seed and the cloud's size alone. "farthest": each as far as can be from
-    all before it, the first from the mean; of equally far ones the first.
+    "random": drawn without replacement, by the seed and the cloud's size alone. "farthest": as
+    `framework.geometry.farthest`.
 
     Args:
         counts: sizes of the clouds.
@@ -29,10 +31,7 @@ def chosen(
     if choice == "random":
         rows = [_random(size, count, seed) for size in counts.tolist()]
         return torch.stack(rows).to(clouds.device) if rows else counts.new_zeros(0, count)
-    from plugins.encoder.points.farthest import farthest
-
-    coordinates = np.ascontiguousarray(clouds[..., :3].detach().cpu().double().numpy())
-    return torch.from_numpy(farthest(coordinates, counts.cpu().numpy(), count)).to(clouds.device)
+    return farthest(clouds[..., :3], counts, count)
 
 
 @lru_cache(maxsize=4096)

@@ -1,15 +1,9 @@
-import itertools
-
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.geometry.clouds import normalised, pad
-from plugins.encoder.points.farthest import farthest
 
 DTYPES = [torch.float32, torch.float64]
 
@@ -22,42 +16,6 @@ def batch_of(lengths, columns=3, dtype=torch.float64):
     generator = torch.Generator().manual_seed(0)
     clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
     return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])
-
-
-def by_hand(cloud, count):
-    """Farthest-point sampling, all distances anew at each step, no point twice before all were chosen."""
-    start = np.linalg.norm(cloud - cloud.mean(0), axis=1)
-    chosen = [int(start.argmax())]
-    while len(chosen) < min(count, len(cloud)):
-        distance = np.linalg.norm(cloud[:, None] - cloud[chosen], axis=-1).min(1)
-        distance[chosen] = -1
-        chosen.append(int(distance.argmax()))
-    return [chosen[number % len(cloud)] for number in range(count)]
-
-
-@pytest.mark.parametrize("count", [1, 5, 30, 77])
-def test_farthest_points_agree_with_a_loop(count):
-    lengths = [30, 1, 12]
-    clouds = batch_of(lengths)
-    found = farthest(clouds.numpy(), np.array(lengths), count)
-    for number, length in enumerate(lengths):
-        assert found[number].tolist() == by_hand(clouds[number, :length].numpy(), count)
-
-
-@given(
-    st.lists(st.tuples(*[st.sampled_from([-1.0, 0.0, 1.0])] * 3), min_size=1, max_size=20), st.integers(1, 30)
-)
-@settings(max_examples=60, deadline=None)
-def test_of_duplicates_each_is_taken_once_before_any_is_twice(points, count):
-    cloud = np.array(points)
-    found = farthest(cloud[None], np.array([len(cloud)]), count)[0]
-    assert len(set(found[: len(cloud)])) == min(count, len(cloud))
-    # no later point is farther from those before it than an earlier one was, but for the first
-    gaps = [
-        np.linalg.norm(cloud[found[:step]] - cloud[found[step]], axis=1).min()
-        for step in range(1, len(found))
-    ]
-    assert all(after <= before + 1e-12 for before, after in itertools.pairwise(gaps))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

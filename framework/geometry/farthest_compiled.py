@@ -1,4 +1,4 @@
-"""Farthest-point sampling (Eldar et al. 1997), compiled at its first call; the compiled code is kept on disk."""
+"""Farthest-point sampling, compiled at its first call; the compiled code is kept on disk."""
 
 from typing import no_type_check
 
@@ -9,7 +9,7 @@ from numba import njit
 @njit(cache=True, nogil=True, error_model="numpy")
 @no_type_check
 def farthest(clouds, counts, count):
-    """Indices (cloud, count): each point as far as can be from all before it, the first from the mean.
+    """Indices (cloud, count); `framework.geometry.farthest.farthest` says which.
 
     Args:
         clouds: (cloud, point, 3) float64, C-contiguous.

@@ -1,0 +1,14 @@
+"""The layers that PointNet and PointNet++ are made of."""
+
+from collections.abc import Sequence
+
+from torch import nn
+
+
+def layers(length: int, widths: Sequence[int]) -> nn.Sequential:
+    """Linear, batch norm, ReLU for each width; batch norm has the bias."""
+    found: list[nn.Module] = []
+    for width in widths:
+        found += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
+        length = width
+    return nn.Sequential(*found)

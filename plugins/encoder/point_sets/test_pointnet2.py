@@ -1,0 +1,207 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, DataError
+from framework.geometry.clouds import pad
+from plugins.encoder.point_sets.pointnet2 import PointNet2
+
+SMALL = {"width": 0.125, "centroids": [20, 6], "radius": 0.4, "dropout": 0.0}
+BALLS = {  # radius, neighbours of each scale of each level, in SMALL's units; Qi et al. 2017 with 0.2 as 0.4
+    "single_scale": [[(0.4, 32)], [(0.8, 64)]],
+    "multi_scale": [[(0.2, 16), (0.4, 32), (0.8, 128)], [(0.4, 32), (0.8, 64), (1.6, 128)]],
+}
+
+
+def encoder(shape=(150, 3), **config):
+    torch.manual_seed(0)
+    made = build("encoder", resolve("encoder", {"name": "pointnet2", **SMALL, **config}), input_shape=shape)
+    made(torch.randn(6, *shape) / 3)  # gives the running moments something to hold
+    return made.eval()
+
+
+def passed(layers, numbers):
+    """Linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
+    for layer in layers:
+        state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
+        if isinstance(layer, torch.nn.Linear):
+            numbers = numbers @ state["weight"].T
+        elif isinstance(layer, torch.nn.BatchNorm1d):
+            numbers = (numbers - state["running_mean"]) / np.sqrt(state["running_var"] + 1e-5)
+            numbers = numbers * state["weight"] + state["bias"]
+        elif isinstance(layer, torch.nn.ReLU):
+            numbers = np.maximum(numbers, 0)
+    return numbers
+
+
+def spread(places, start):
+    """The order in which each is as far as can be from those before it, all distances anew at each step."""
+    order = [start]
+    while len(order) < len(places):
+        distance = np.linalg.norm(places[:, None] - places[order], axis=-1).min(1)
+        distance[order] = -1
+        order.append(int(distance.argmax()))
+    return order
+
+
+def by_hand(made, cloud, balls):
+    """One cloud (points, columns) ball by ball in NumPy, float64, normalised as eq. 6.2."""
+    points = cloud.double().numpy().copy()
+    points[:, :3] -= points[:, :3].mean(0)
+    points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
+    points = points[: made.reading.most, : made.reading.columns]
+    mean = points[:, :3].mean(0)
+    points = points[spread(points[:, :3], int(np.linalg.norm(points[:, :3] - mean, axis=1).argmax()))]
+    for level, scales in zip(made.levels, balls, strict=True):
+        points = points[spread(points[:, :3], 0)]
+        places, described = points[:, :3], []
+        for centre in places[: level.centroids]:
+            numbers = []
+            for network, (radius, most) in zip(level.networks, scales, strict=True):
+                near = points[np.linalg.norm(places - centre, axis=1) <= radius][:most]
+                numbers.append(passed(network, np.hstack([near[:, :3] - centre, near[:, 3:]])).max(0))
+            described.append(np.concatenate([centre, *numbers]))
+        points = np.stack(described)
+    return passed(made.last, passed(made.whole, points).max(0))
+
+
+@pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
+@pytest.mark.parametrize(
+    "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 40})], ids=str
+)
+def test_agrees_with_numpy_on_clouds_of_any_size(grouping, columns, config):
+    made = encoder((150, columns), grouping=grouping, **config)
+    clouds = [torch.randn(number, columns) * 4 + 7 for number in (150, 2, 13, 30)]
+    wanted = np.stack([by_hand(made, cloud, BALLS[grouping]) for cloud in clouds])
+    found = made.double()(pad(clouds).double()).detach().numpy()
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+    single = made.float()(pad(clouds)).detach().numpy()
+    np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "grouping, chains, total, megabytes",
+    [
+        (
+            "single_scale",
+            [(3, 64, 64, 128), (131, 128, 128, 256), (259, 256, 512, 1024), (1024, 512, 256)],
+            1_472_360,
+            5.9,
+        ),
+        (
+            "multi_scale",
+            [
+                *[(3, 32, 32, 64), (3, 64, 64, 128), (3, 64, 96, 128)],
+                *[(323, 64, 64, 128), (323, 128, 128, 256), (323, 128, 128, 256)],
+                *[(643, 256, 512, 1024), (1024, 512, 256)],
+            ],
+            1_742_856,  # 1.7e6, Table 6.2
+            7.0,
+        ),
+    ],
+)
+def test_parameters_of_the_published_networks(grouping, chains, total, megabytes):
+    """Of the two the multi-scale one has Table 6.2's parameters; Table 6.3's 5.8 MB are nearer to the other."""
+    made = PointNet2((1024, 3), grouping=grouping)
+    weights = sum(before * after for chain in chains for before, after in itertools.pairwise(chain))
+    moments = sum(sum(chain[1:]) for chain in chains)
+    assert weights + 2 * moments + 257 * 40 == total
+    assert sum(parameter.numel() for parameter in made.parameters()) + 257 * 40 == total
+    stored = sum(tensor.numel() * tensor.element_size() for tensor in made.state_dict().values())
+    assert (stored + 4 * 257 * 40) / 1e6 == pytest.approx(megabytes, abs=0.05)
+    assert made.output_shape == (256,)
+
+
+@pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
+def test_the_gradient_is_that_of_differences(grouping):
+    made = encoder((12, 4), grouping=grouping, attributes=True, width=0.03).double()
+    clouds = pad([torch.randn(12, 4), torch.randn(7, 4)]).double()
+    clouds[1, 7:] = math.nan
+    rows = [torch.cat([clouds[0], clouds[1, :7]]).requires_grad_()]
+
+    def features(values):
+        padding = values.new_full((5, 4), math.nan)
+        return made(torch.stack([values[:12], torch.cat([values[12:], padding])]))
+
+    assert torch.autograd.gradcheck(features, rows, eps=1e-6, atol=1e-6, fast_mode=True)
+
+
+@pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
+def test_order_place_size_and_company_of_a_cloud_change_nothing(grouping):
+    made = encoder(grouping=grouping).double()
+    clouds = [torch.randn(number, 3, dtype=torch.float64) for number in (150, 40, 3)]
+    wanted = made(pad(clouds))
+    for index, cloud in enumerate(clouds):
+        turned = cloud[torch.randperm(len(cloud))]
+        for changed in (turned, cloud + 100, cloud * 3, torch.cat([cloud, cloud.new_full((9, 3), math.nan)])):
+            torch.testing.assert_close(made(changed[None])[0], wanted[index], rtol=1e-9, atol=1e-9)
+        assert torch.equal(made(cloud[None]), made(cloud[None]))
+
+
+@pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
+@pytest.mark.parametrize("number", [5, 19, 150])
+def test_points_that_all_come_twice_change_nothing(grouping, number):
+    """They come last, and only fill what would be filled anyway."""
+    made = encoder((300, 3), grouping=grouping).double()
+    cloud = torch.randn(number, 3, dtype=torch.float64)
+    twice = torch.cat([cloud, cloud[torch.randperm(number)]])
+    torch.testing.assert_close(made(twice[None]), made(cloud[None]), rtol=1e-9, atol=1e-9)
+
+
+def test_points_in_one_place_and_one_point_alone_are_the_same_cloud():
+    made = encoder()
+    found = made(torch.full((1, 150, 3), 4.0))
+    assert torch.isfinite(found).all()
+    torch.testing.assert_close(found, made(torch.zeros(1, 1, 3)))
+
+
+def test_padding_does_not_enter_the_moments_of_batch_norm():
+    clouds = [torch.randn(number, 3) for number in (9, 9, 9)]
+    made, other = encoder(), encoder()
+    made.train()(torch.stack(clouds))
+    other.train()(torch.cat([torch.stack(clouds), torch.full((3, 5, 3), math.nan)], 1))
+    for name, value in made.state_dict().items():
+        torch.testing.assert_close(other.state_dict()[name], value, msg=name)
+
+
+def test_few_clouds_at_a_time_give_what_all_at_once_give():
+    made = encoder((300, 3), grouping="multi_scale")
+    clouds = pad([torch.randn(number, 3) for number in (300, 20, 21, 10, 299)])
+    whole = made(clouds)
+    with torch.no_grad():
+        torch.testing.assert_close(made(clouds), whole, rtol=1e-5, atol=1e-6)
+        assert made(clouds[:0]).shape == (0, 32)
+
+
+def test_refuses_clouds_for_which_its_balls_mean_nothing():
+    made = encoder(normalise="none", radius=0.2)
+    clouds = torch.randn(3, 150, 3) / 3
+    assert torch.isfinite(made(clouds)).all()
+    clouds[1] *= 100
+    with pytest.raises(DataError, match=r"Cloud 1 of the batch reaches .* encoder pointnet2"):
+        made(clouds)
+
+
+def test_refuses_attributes_that_are_not_there():
+    with pytest.raises(ConfigError, match="these have none"):
+        PointNet2((100, 3), attributes=True)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"grouping": "both"},
+        {"centroids": [8]},
+        {"radius": 0},
+        {"width": 0},
+        {"normalise": "ball"},
+        {"points": 0},
+    ],
+)
+def test_refuses_a_config_out_of_range(config):
+    with pytest.raises(ConfigError, match=r"encoder\."):
+        resolve("encoder", {"name": "pointnet2", **config})
