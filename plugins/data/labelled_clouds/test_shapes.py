@@ -14,21 +14,21 @@ from plugins.data.labelled_clouds.shapes.generator import CLASSES, Models, as_of
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A generated root of 4 + 2 models a class; its cache too is the module's own."""
+    """A generated root of 3 + 2 models a class; its cache too is the module's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FRAMEWORK_CACHE", str(tmp_path_factory.mktemp("cache")))
-        return generated(Models(train_models=4, test_models=2))
+        return generated(Models(train_models=3, test_models=2))
 
 
 def test_a_root_is_a_function_of_its_seed_to_the_byte(root):
-    again = generated(Models(train_models=4, test_models=2))
+    again = generated(Models(train_models=3, test_models=2))
     assert again != root
 
     def content(folder):
         return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*.off"))}
 
     assert content(again) == content(root)
-    more = content(generated(Models(train_models=5, test_models=2)))
+    more = content(generated(Models(train_models=4, test_models=2)))
     first = {name: text for name, text in content(root).items() if name.parts[1] == "train"}
     assert {name: more[name] for name in first} == first  # the first of more are those of fewer
     assert content(generated(Models(train_models=4, test_models=2, generator_seed=1))) != content(root)
@@ -62,14 +62,14 @@ def test_the_classes_are_those_of_modelnet40_and_equally_many(root):
     """Princeton's 40, in their order; nothing else is in the root, and every class has as many models."""
     assert list(CLASSES) == sorted(CLASSES) == list(EDGE_M)
     assert sorted(path.name for path in root.iterdir() if path.is_dir()) == list(CLASSES)
-    for split, count in (("train", 4), ("test", 2)):
+    for split, count in (("train", 3), ("test", 2)):
         assert {len(list((root / name / split).iterdir())) for name in CLASSES} == {count}
 
 
 @pytest.mark.parametrize("category", CLASSES)
 def test_every_model_is_a_closed_surface_of_sensible_size(root, category):
     files = sorted((root / category).rglob("*.off"))
-    assert [file.name for file in files] == [f"{category}_{number:04d}.off" for number in (5, 6, 1, 2, 3, 4)]
+    assert [file.name for file in files] == [f"{category}_{number:04d}.off" for number in (4, 5, 1, 2, 3)]
     for file in files:
         mesh = read(file)
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
@@ -89,7 +89,7 @@ def test_every_model_is_a_closed_surface_of_sensible_size(root, category):
 
 @pytest.mark.parametrize("category", CLASSES)
 def test_no_triangle_is_needless(category):
-    for number in range(5):
+    for number in range(3):
         solid = model(category, "test", number, 3)
         corners = np.round(solid.vertices, 5)[solid.faces]
         area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
@@ -106,8 +106,8 @@ def assert_edges_meet(vertices, faces):
 
 def test_the_models_of_a_class_differ(root):
     for category in CLASSES:
-        texts = {as_off(model(category, "train", number, 0)) for number in range(10)}
-        assert len(texts) == 10
+        texts = {as_off(model(category, "train", number, 0)) for number in range(4)}
+        assert len(texts) == 4
 
 
 # ---- solids against their own formulas -------------------------------------------------------------------
