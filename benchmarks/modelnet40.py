@@ -219,7 +219,7 @@ def on_test(model: Any, clouds: Tensor, labels: Tensor) -> tuple[np.ndarray, np.
 
 
 def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
-    """A row for each run that is done, with its scores on each test cloud.
+    """A row for each run that is done, with its scores on each test cloud; "key" tells variants of a row apart.
 
     Raises:
         DataError: a run was tested on other data than those made now.
@@ -232,9 +232,12 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
         key = numbers["experiment"].rpartition("/")[2]
         table, method, *thesis = ROWS[key]
         if "conv3d" in key:
-            method = f"{method} ({round(config['encoder']['bps']['points'] ** (1 / 3))}³ grid)"
+            side = round(config["encoder"]["bps"]["points"] ** (1 / 3))
+            method += f" ({side}³ grid)"
+            key += "" if side == 32 else f" {side}"
         cut = config["encoder"].get("tdf", {}).get("truncation", 1.0)
-        method += "" if cut == 1 else f", cut off at {cut:g} cells"
+        if cut != 1:
+            method, key = f"{method}, cut off at {cut:g} cells", f"{key} {cut:g}"
         model = framework.load(path.parent)
         right, nll = on_test(model, clouds, labels)
         if abs(right.mean() - numbers["accuracy"]) > 2 / len(right):
@@ -282,7 +285,7 @@ def main() -> None:
     batch = test.__getitems__(range(len(test)))
     order = list(ROWS)
     rows = [row for folder in sys.argv[1:] for row in found(Path(folder), batch["input"], batch["target"])]
-    rows.sort(key=lambda row: (order.index(row["key"]), row["seed"]))
+    rows.sort(key=lambda row: (order.index(row["key"].split()[0]), row["seed"]))
     methods = by_method(rows)
     table = aggregate(rows, by=["method", "key"])
     for row in table:  # its own errors instead of the deviation among runs
