@@ -133,7 +133,7 @@ SOLIDS = {
     "side view": (solids.carried([(0, 0), (4, 0), (4, 1), (0, 3)], 0.5), 4, 16 + 0.5 * (8 + math.sqrt(20))),
     "tray": (solids.tray(4.0, 3.0, 2.0, 0.5, 0.5), 15, 67),
     "sheet": (solids.ribbon(LINE, LINE, 0.5, 2.0), 3, 17),
-    "washer": (solids.extruded(CIRCLE, 0.5, CIRCLE / 2), 0.375 * math.pi, 3 * math.pi),
+    "disc": (solids.extruded(CIRCLE, 0.5), 0.5 * math.pi, 3 * math.pi),
 }  # fmt: skip
 
 

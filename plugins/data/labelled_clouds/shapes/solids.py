@@ -125,16 +125,10 @@ def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: in
     return Solid(*_rings(rings, sides, caps=not closed))
 
 
-def extruded(
-    outline: Float[np.ndarray, "corners 2"],
-    height: Number,
-    hole: Float[np.ndarray, "corners 2"] | None = None,
-) -> Solid:
-    """An outline that its centre sees whole, from z = 0 to `height`, with a hole of as many corners, if any."""
-    inner = np.zeros_like(outline) if hole is None else hole
-    levels = [(inner, 0), (outline, 0), (outline, height), (inner, height)]
-    if hole is not None:
-        levels.append((inner, 0))  # its wall
+def extruded(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
+    """An outline that the origin sees whole, counter-clockwise, from z = 0 to `height`."""
+    middle = np.zeros_like(outline)
+    levels = [(middle, 0), (outline, 0), (outline, height), (middle, height)]
     rings = [np.column_stack([flat, np.full(len(flat), float(z))]) for flat, z in levels]
     return Solid(*_rings(rings, len(outline), caps=False))
 
