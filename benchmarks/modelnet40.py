@@ -1,10 +1,10 @@
 """Tables 6.1, 6.2 and 6.3 on the synthetic CAD set: every row, error and run time, and the thesis's claims on them.
 
-    python benchmarks/thesis_tables.py 6.1-6.3 --bfloat16          # with --tell the two sweeps, to run one by one
+    python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its two sweeps, to run one by one
 
-That is three seeds of every row that takes less than five minutes on one core (`modelnet40_quick`), and one of the
-others (`modelnet40_slow`); some hours on two cores. Leave out `--bfloat16` on a processor without such instructions.
-Of sweeps that have run, these or others with fewer rows:
+That is three seeds of every row that takes about five minutes or less on one core (`modelnet40_quick`), and one of the
+others (`modelnet40_slow`); some hours on two cores. Add `--bfloat16` where /proc/cpuinfo lists avx512_bf16, and nowhere
+else: it is emulated there, and slower by far. Of sweeps that have run, these or others with fewer rows:
 
     python benchmarks/modelnet40.py outputs/thesis_tables/modelnet40_quick outputs/thesis_tables/modelnet40_slow
 
