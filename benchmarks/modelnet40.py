@@ -3,8 +3,8 @@
     python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its two sweeps, to run one by one
 
 That is three seeds of every row that takes about five minutes or less on one core (`modelnet40_quick`), and one of the
-others (`modelnet40_slow`); some hours on two cores. Add `--bfloat16` where /proc/cpuinfo lists avx512_bf16, and nowhere
-else: it is emulated there, and slower by far. Of sweeps that have run, these or others with fewer rows:
+others (`modelnet40_slow`); some hours on two cores. Add `--bfloat16` where /proc/cpuinfo lists avx512_bf16;
+elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others with fewer rows:
 
     python benchmarks/modelnet40.py outputs/thesis_tables/modelnet40_quick outputs/thesis_tables/modelnet40_slow
 
