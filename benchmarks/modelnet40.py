@@ -1,29 +1,38 @@
-"""Tables 6.1, 6.2 and 6.3 on the synthetic CAD set: every row, error and run time, from one multirun.
+"""Tables 6.1, 6.2 and 6.3 on the synthetic CAD set: every row, error and run time, and the thesis's claims on them.
 
-    python -m framework -m pictures=false logger=none threads=1 trainer.precision=bf16-mixed hydra.launcher.jobs=2 \\
-        hydra.sweep.dir=outputs/sweeps/modelnet40 experiment=$(ls conf/experiment/modelnet40 | grep -v base | \\
-        sed 's|^|modelnet40/|; s|.yaml$||' | paste -sd,)
-    python benchmarks/modelnet40.py outputs/sweeps/modelnet40
+    python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its two sweeps, to run one by one
 
-An hour on two cores, and some two more with PointNet++; the multirun prints its own table at its end. Leave out
-`trainer.precision` on a processor without bfloat16 instructions. Further sweeps (more seeds) are named beside the
-first. Latencies are measured here, on one thread; encoding is in them. Writes modelnet40.md beside this file.
+That is three seeds of every row that takes about five minutes or less on one core (`modelnet40_quick`), and one of the
+others (`modelnet40_slow`); some hours on two cores. Add `--bfloat16` where /proc/cpuinfo lists avx512_bf16;
+elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others with fewer rows:
+
+    python benchmarks/modelnet40.py outputs/thesis_tables/modelnet40_quick outputs/thesis_tables/modelnet40_slow
+
+Latencies are measured here, on one thread; encoding is in them. Every model predicts the test clouds again, so that
+methods are compared cloud by cloud: ten minutes more. Writes modelnet40.md beside this file.
 """
 
 import json
+import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import yaml
+from jaxtyping import Float
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
+from framework.distributions.class_probabilities import class_probabilities
+from framework.errors import DataError
 from framework.evaluation.cost import wall_time
-from framework.reports.table import aggregate, markdown
+from framework.reports.table import Better, aggregate, markdown
 
 ROWS = {  # table and row, what the thesis reports: accuracy, FLOPs, parameters
     "voxnet": ("6.1, 1", "VoxNet (32³ flags)", "83.0 %", "> 1e8", "9.0e5"),
@@ -68,10 +77,157 @@ COLUMNS = {
     "n": "seeds",
     "thesis": "thesis: accuracy (ModelNet40), FLOPs, parameters",
 }
-BETTER = {"accuracy": "higher", "nll": "lower", "ece": "lower", "one_ms": "lower", "many_ms": "lower"}
+BETTER: Better = {"accuracy": "higher", "nll": "lower", "ece": "lower", "one_ms": "lower", "many_ms": "lower"}
+SCORES = ("accuracy", "nll")
+"""Means over test clouds; their errors are computed here, from the clouds' own numbers."""
+BLOCK = 256
+"""Clouds that are predicted at once."""
 
 
-def found(sweep: Path, clouds: torch.Tensor) -> list[dict[str, Any]]:
+class Contrast(NamedTuple):
+    """A comparison of the thesis: `margin` + Σ weight · accuracy is above 0.
+
+    Attributes:
+        claim: in words.
+        thesis: what it reports, in points.
+        weights: of methods, by their experiments.
+        margin: a share of the clouds.
+    """
+
+    claim: str
+    thesis: str
+    weights: Mapping[str, float]
+    margin: float = 0.0
+
+
+def better(one: str, other: str) -> dict[str, float]:
+    return {one: 1.0, other: -1.0}
+
+
+def cheaper(grid: str, other: str) -> dict[str, float]:
+    """How much more `other` loses than `grid` does, from 32³ to 8³."""
+    return {f"{other}_32": 1.0, f"{other}_8": -1.0, f"{grid}_32": -1.0, f"{grid}_8": 1.0}
+
+
+CLAIMS: dict[str, tuple[Contrast, ...]] = {
+    "Basis point sets are better than occupancy and truncated distances (§6.5.1)": (
+        Contrast("than flags, 32³", "+8.4", better("bps_mlp_grid_32", "occ_mlp_32")),
+        Contrast("than flags, 8³", "+13.1", better("bps_mlp_grid_8", "occ_mlp_8")),
+        Contrast("than truncated distances, 32³", "+8.3", better("bps_mlp_grid_32", "tdf_mlp_32")),
+        Contrast("than truncated distances, 8³", "+11.7", better("bps_mlp_grid_8", "tdf_mlp_8")),
+    ),
+    "A plain network on them is better than VoxNet on flags (§6.5.1)": (
+        Contrast("32³", "+5.3", better("bps_mlp_grid_32", "voxnet")),
+    ),
+    "A small grid costs them little (§6.5.1)": (
+        Contrast(
+            "8³ instead of 32³: less than two points",
+            "0.7",
+            better("bps_mlp_grid_8", "bps_mlp_grid_32"),
+            0.02,
+        ),
+        Contrast("less than it costs flags", "0.7, 5.4", cheaper("bps_mlp_grid", "occ_mlp")),
+        Contrast("less than it costs truncated distances", "0.7, 4.1", cheaper("bps_mlp_grid", "tdf_mlp")),
+    ),
+    "3D convolutions are better than the plain network (§6.5.1)": (
+        Contrast("distances, 32³", "+1.5", better("bps_conv3d", "bps_mlp_grid_32")),
+    ),
+}
+
+
+class Method(NamedTuple):
+    """What the runs of one row say of each test cloud.
+
+    Attributes:
+        accuracy: 1 where the likeliest class is the true one, else 0.
+        nll: of the true class, nats.
+    """
+
+    accuracy: Float[np.ndarray, "seeds clouds"]
+    nll: Float[np.ndarray, "seeds clouds"]
+
+
+def seed_variance(values: Float[np.ndarray, "seeds clouds"]) -> float:
+    """Of a run's mean over all clouds there are, among seeds, without bias: it may come out below 0.
+
+    Two-way analysis of variance without replication: the means of seeds also differ because on each cloud they differ
+    by chance, by the residual variance over the number of clouds.
+    """
+    seeds, clouds = values.shape
+    residual = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
+    chance = (residual**2).sum() / ((seeds - 1) * (clouds - 1))
+    return float(values.mean(1).var(ddof=1) - chance / clouds)
+
+
+def pooled(methods: Mapping[str, Method], score: str) -> float:
+    """The mean of it over all rows of several seeds: three seeds of one row know little. NaN where there are none."""
+    found = [seed_variance(getattr(own, score)) for own in methods.values() if len(own.accuracy) > 1]
+    return max(0.0, float(np.mean(found))) if found else math.nan
+
+
+def compared(
+    methods: Mapping[str, Method], weights: Mapping[str, float], score: str = "accuracy"
+) -> tuple[float, float]:
+    """Σ weight · mean score, and its standard error over new test clouds and new seeds.
+
+    Clouds: the same for all methods, hence the variance of Σ weight · score over clouds, of means over seeds; what
+    differs by chance from seed to seed on each cloud is in it. Seeds: of every method its own, hence
+    Σ weight² · (pooled variance) / seeds. Without a row of several seeds only the clouds are in it.
+    """
+    among_seeds = np.nan_to_num(pooled(methods, score))
+    each = sum(weight * getattr(methods[key], score).mean(0) for key, weight in weights.items())
+    assert isinstance(each, np.ndarray)
+    variance = each.var(ddof=1) / len(each)
+    variance += sum(w**2 * among_seeds / len(methods[key].accuracy) for key, w in weights.items())
+    return float(each.mean()), math.sqrt(variance)
+
+
+def verdict(value: float, error: float) -> str:
+    """Of a claim that the value is above 0, at two standard errors."""
+    return "held" if value > 2 * error else "contradicted" if value < -2 * error else "open"
+
+
+def claims(methods: Mapping[str, Method]) -> str:
+    """A table: each comparison, and what the claim amounts to: held where all are, contradicted where any is."""
+    lines = [
+        "| claim | thesis, points | here, points | standard errors | verdict |",
+        "|---|---:|---:|---:|---|",
+    ]
+    for claim, contrasts in CLAIMS.items():
+        said, rows = [], []
+        for words, thesis, weights, margin in contrasts:
+            missing = [key for key in weights if key not in methods]
+            if missing:
+                said.append("open")
+                rows.append(f"| … {words} | {thesis} | not run: {', '.join(missing)} | | open |")
+                continue
+            value, error = compared(methods, weights)
+            shown = f"{100 * value:+.1f} ± {100 * error:.1f}"
+            size = (value + margin) / error if error else math.copysign(math.inf, value + margin)
+            said.append(verdict(value + margin, error))
+            rows.append(f"| … {words} | {thesis} | {shown} | {size:+.1f} | {said[-1]} |")
+        whole = "contradicted" if "contradicted" in said else "open" if "open" in said else "held"
+        lines += [f"| **{claim}** | | | | **{whole}** |", *rows]
+    return "\n".join(lines)
+
+
+def on_test(model: Any, clouds: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Of every test cloud whether its class is found, and the true class's negative log-likelihood."""
+    right, nll = [], []
+    with torch.inference_mode():
+        for some, label in zip(clouds.split(BLOCK), labels.split(BLOCK), strict=True):
+            probability = class_probabilities(model(some))
+            right.append(probability.argmax(-1) == label)
+            nll.append(-probability.gather(1, label[:, None])[:, 0].log())
+    return torch.cat(right).double().numpy(), torch.cat(nll).numpy()
+
+
+def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
+    """A row for each run that is done, with its scores on each test cloud; "key" tells variants of a row apart.
+
+    Raises:
+        DataError: a run was tested on other data than those made now.
+    """
     rows = []
     for path in sorted(sweep.glob("*/results.json")):
         numbers = json.loads(path.read_text(encoding="utf-8"))
@@ -80,56 +236,94 @@ def found(sweep: Path, clouds: torch.Tensor) -> list[dict[str, Any]]:
         key = numbers["experiment"].rpartition("/")[2]
         table, method, *thesis = ROWS[key]
         if "conv3d" in key:
-            method = f"{method} ({round(config['encoder']['bps']['points'] ** (1 / 3))}³ grid)"
+            side = round(config["encoder"]["bps"]["points"] ** (1 / 3))
+            method += f" ({side}³ grid)"
+            key += "" if side == 32 else f" {side}"
         cut = config["encoder"].get("tdf", {}).get("truncation", 1.0)
-        method += "" if cut == 1 else f", cut off at {cut:g} cells"
+        if cut != 1:
+            method, key = f"{method}, cut off at {cut:g} cells", f"{key} {cut:g}"
         model = framework.load(path.parent)
+        right, nll = on_test(model, clouds, labels)
+        if abs(right.mean() - numbers["accuracy"]) > 2 / len(right):
+            raise DataError(
+                f"{path.parent}: accuracy {right.mean():.4f} on the test clouds made now, {numbers['accuracy']:.4f} in "
+                "its results; wanted the same. It was run on other data: run it anew."
+            )
+        some = clouds[:BLOCK]
         with torch.inference_mode():
             one = wall_time(lambda model=model: model(clouds[:1]), torch.device("cpu"), budget_seconds=2)
-            many = wall_time(lambda model=model: model(clouds), torch.device("cpu"), repeats=5)
+            many = wall_time(lambda model=model, some=some: model(some), torch.device("cpu"), repeats=5)
         fitted = config["density_head"]["name"] in ("extra_trees", "xgboost")
         rows.append(
-            {name: value for name, value in numbers.items() if name.removesuffix("_sem") in COLUMNS}
+            {name: value for name, value in numbers.items() if name in COLUMNS}
             | {
                 "key": key,
                 "seed": numbers["seed"],
                 "method": method,
                 "table": table,
                 "thesis": ", ".join(thesis),
+                "right": right,
+                "nlls": nll,
             }
-            | {"one_ms": 1e3 * one, "many_ms": 1e3 * many / len(clouds)}
+            | {"one_ms": 1e3 * one, "many_ms": 1e3 * many / len(some)}
             | {"megabytes": (path.parent / "checkpoints" / "model.ckpt").stat().st_size / 1e6}
             | {"seconds": job["ended"] - job["started"], "synthetic": numbers["synthetic"]}
-            | {"from": job["started"], "to": job["ended"]}
             | {"epochs": "at once" if fitted else str(config["trainer"]["max_epochs"])}
         )
     return rows
+
+
+def by_method(rows: Sequence[dict[str, Any]]) -> dict[str, Method]:
+    """The clouds' scores of each row of the tables; takes them out of `rows`."""
+    kept: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for row in rows:
+        kept.setdefault(row["key"], []).append((row.pop("right"), row.pop("nlls")))
+    return {key: Method(*map(np.stack, zip(*pairs, strict=True))) for key, pairs in kept.items()}
 
 
 def main() -> None:
     torch.set_num_threads(1)
     data = build("data", resolve("data", "modelnet40"))
     data.prepare()
-    count = min(256, len(data.splits().test))
-    clouds = torch.stack([data.splits().test[index]["input"] for index in range(count)])
+    test = data.splits().test
+    batch = test.__getitems__(range(len(test)))
     order = list(ROWS)
-    rows = [row for folder in sys.argv[1:] for row in found(Path(folder), clouds)]
-    rows.sort(key=lambda row: order.index(row.pop("key")))
-    several = len({row["method"] for row in rows}) < len(rows)
-    compared = aggregate(rows, by=["method"]) if several else [{**row, "n": 1} for row in rows]
+    rows = [row for folder in sys.argv[1:] for row in found(Path(folder), batch["input"], batch["target"])]
+    rows.sort(key=lambda row: (order.index(row["key"].split()[0]), row["seed"]))
+    methods = by_method(rows)
+    table = aggregate(rows, by=["method", "key"])
+    for row in table:  # its own errors instead of the deviation among runs
+        for name in [name for name in row if name.endswith("_std")]:
+            del row[name]
+        for score in SCORES:
+            row[score], row[f"{score}_sem"] = compared(methods, {str(row["key"]): 1.0}, score)
     fingerprint = data.fingerprint()
-    minutes = (max(row["to"] for row in rows) - min(row["from"] for row in rows)) / 60
+    among_seeds = pooled(methods, "accuracy")
+    known = (
+        "No row has several: it is not in the errors."
+        if math.isnan(among_seeds)
+        else f"One run's accuracy has {100 * math.sqrt(among_seeds):.2f} points of it."
+    )
     text = (
         "# Tables 6.1 to 6.3: classes of CAD models (synthetic data)\n\n"
-        f"The generated set of `data=modelnet40`: {len(data.target.names)} classes, {fingerprint['train']} clouds for "
-        f"training, {fingerprint['test']} for the test, 2048 points each. The thesis's figures are of ModelNet40 "
-        "and a GPU's thousands of epochs: orderings compare, numbers do not. ± is the standard error over test clouds "
-        "of one run, over runs where there are several seeds. Latencies on one thread, encoding included. FLOPs are "
-        f"those of matrix products and convolutions. {len(rows)} runs took {minutes:.0f} minutes, two at a time on one "
-        "core each, matrix products and convolutions of training in bfloat16. Epochs are what that allows; rates were "
-        "chosen on the validation split. Commands in `modelnet40.py`.\n\n"
-        f"{markdown(compared, COLUMNS, better=BETTER)}\n\n"
-        f"{machine('torch', 'pytorch-lightning', 'scikit-learn', 'xgboost')}\n"
+        f"The generated set of `data=modelnet40` ({fingerprint['version']}): {len(data.target.names)} classes, "
+        f"{fingerprint['train']} clouds for training, {fingerprint['test']} for the test, 2048 points each. The "
+        "thesis's figures are of ModelNet40 and a GPU's thousands of epochs: orderings compare, numbers do not. "
+        "Latencies on one thread, encoding included. FLOPs are those of matrix products and convolutions. Epochs are "
+        "what two cores allow; rates were chosen on the validation split of an earlier, easier generated set. "
+        "Commands in `modelnet40.py`. Of several seeds numbers are means.\n\n"
+        f"{markdown(table, COLUMNS, better=BETTER)}\n\n"
+        "± of accuracy and NLL is the standard error over new test clouds and new seeds: the variance over clouds of "
+        "the mean over seeds, and the variance among seeds beyond what clouds explain over the number of seeds. The "
+        "latter is estimated once, over all rows of several seeds (two-way analysis of variance), and so it also "
+        f"stands for rows of one. {known}\n\n"
+        "## The thesis's claims\n\n"
+        "Differences of accuracy on the same test clouds (paired), ± as above; at two standard errors a comparison is "
+        "held or contradicted, else open. A claim is held where all its comparisons are, contradicted where one is. "
+        "The column before the verdict is the distance from the bound, 0 or two points lost.\n\n"
+        f"{claims(methods)}\n\n"
+        f"{len(rows)} runs took {sum(row['seconds'] for row in rows) / 3600:.1f} hours of one core. "
+        f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *(['xgboost'] if 'bps_xgboost' in methods else []))}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
     sys.stdout.write(text)

@@ -45,7 +45,7 @@ class ModelNet40(LabelledClouds):
     A mesh's points depend on `data_seed` and its file's name alone. They are drawn once and kept in the cache.
 
     Args:
-        root: the unpacked ModelNet40; None: a generated set in its layout, 23 classes.
+        root: the unpacked ModelNet40; None: a generated set in its layout, its 40 classes.
         surfaces: how meshes become points.
         classes: some of them; None: all.
         validation_share: of the official training split, of every class alike; with 0 all of it trains, as in the

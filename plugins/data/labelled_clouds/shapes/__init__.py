@@ -1,1 +1,1 @@
-"""Generated CAD models: random furniture, vessels and machine parts as closed solids."""
+"""Generated CAD models: random furniture, vessels, parts of buildings and other things as closed solids."""

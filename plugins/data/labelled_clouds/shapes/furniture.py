@@ -51,47 +51,63 @@ def top(random: Random, width: float, depth: float, height: float, thick: float,
 
 
 def table(random: Random) -> Solid:
-    height = random.uniform(0.4, 0.85)
-    width, depth = random.uniform(0.7, 2.1), random.uniform(0.6, 1.1)
-    thick, bar = random.uniform(0.02, 0.07), random.uniform(0.04, 0.1)
-    if random.random() < 0.3:  # round, on a pedestal
-        radius, foot = random.uniform(0.35, 0.75), random.uniform(0.2, 0.4)
-        return joined(
-            [
-                cylinder(radius, thick, (0, 0, height), sides=32),
-                cylinder(bar / 1.5, height),
-                cylinder(foot, 0.03, top=foot * random.uniform(0.6, 1), sides=24),
-            ]
-        )
-    return joined(top(random, width, depth, height, thick, bar))
+    height = random.uniform(0.35, 0.95)
+    width, depth = random.uniform(0.6, 2.2), random.uniform(0.5, 1.2)
+    thick, bar = random.uniform(0.015, 0.08), random.uniform(0.03, 0.12)
+    if random.random() < 0.3:  # round, on a pedestal or on legs
+        radius, foot = random.uniform(0.35, 0.8), random.uniform(0.2, 0.4)
+        parts = [cylinder(radius, thick, (0, 0, height), sides=32)]
+        if random.random() < 0.4:
+            parts.append(legs(random, 1.3 * radius, 1.3 * radius, height, bar))
+        else:
+            parts.append(cylinder(bar / 1.5, height))
+            parts.append(cylinder(foot, 0.03, top=foot * random.uniform(0.6, 1), sides=24))
+        return joined(parts)
+    parts = top(random, width, depth, height, thick, bar)
+    if random.random() < 0.15:  # a board below
+        parts.append(box(0.85 * width, 0.8 * depth, 0.03, (0, 0, random.uniform(0.15, 0.5) * height)))
+    if random.random() < 0.12:  # a drawer
+        parts.append(box(0.4 * width, 0.7 * depth, 0.12, (0, -0.16 * depth, height - 0.12)))
+    return joined(parts)
 
 
 def desk(random: Random) -> Solid:
-    height, width, depth = random.uniform(0.65, 0.8), random.uniform(1.0, 1.9), random.uniform(0.5, 0.85)
-    thick, bar = random.uniform(0.02, 0.05), random.uniform(0.03, 0.07)
-    chest = random.uniform(0.28, 0.5)
+    height, width, depth = random.uniform(0.65, 0.85), random.uniform(0.9, 2.0), random.uniform(0.45, 0.95)
+    thick, bar = random.uniform(0.015, 0.06), random.uniform(0.03, 0.08)
+    chest = random.uniform(0.28, 0.55)
     side = random.choice([-1, 1])
     x = side * (width - chest) / 2 * 0.96
-    low = random.choice([0.0, 0.0, 0.35]) * height
-    parts = [box(width, depth, thick, (0, 0, height)), box(chest, depth * 0.9, height - low, (x, 0, low))]
-    for number in range(int(random.integers(0, 4))):
-        z = low + (number + 0.5) / 4 * (height - low)
-        parts.append(box(chest * 0.85, 0.02, (height - low) * 0.18, (x, -depth * 0.46, z)))
+    low = random.choice([0.0, 0.0, 0.35, 0.7]) * height
+    parts = [box(width, depth, thick, (0, 0, height))]
+    if random.random() < 0.85:
+        parts.append(box(chest, depth * 0.9, height - low, (x, 0, low)))
+        rows = int(random.integers(0, 5))
+        for number in range(rows):
+            z = low + (number + 0.1) / rows * (height - low)
+            parts.append(box(chest * 0.85, 0.02, (height - low) * 0.8 / rows, (x, -depth * 0.46, z)))
+        if random.random() < 0.35:  # a second chest
+            parts.append(box(chest, depth * 0.9, height - low, (-x, 0, low)))
+    else:  # one flat drawer
+        parts.append(box(0.8 * width, 0.85 * depth, 0.12, (0, 0, height - 0.12)))
+        low = height
     if low or random.random() < 0.5:
         parts.append(legs(random, width, depth, height, bar))
     else:
         parts.append(box(bar, depth * 0.9, height, (-side * (width / 2 - bar), 0, 0)))
-    if random.random() < 0.35:  # a second chest
-        parts.append(box(chest, depth * 0.9, height - low, (-x, 0, low)))
-    if random.random() < 0.5:
+    if random.random() < 0.4:
         parts.append(
             box(width * 0.95, 0.02, height * random.uniform(0.3, 0.7), (0, depth * 0.4, height * 0.3))
         )
+    if random.random() < 0.25:  # shelves above
+        tall, deep = random.uniform(0.2, 0.7), random.uniform(0.2, 0.35)
+        y = (depth - deep) / 2
+        parts.append(mirrored(box(0.025, deep, tall, (0.48 * width, y, height)), 0))
+        parts += [box(0.98 * width, deep, 0.025, (0, y, height + share * tall)) for share in (0.5, 1)]
     return joined(parts)
 
 
 def bench(random: Random) -> Solid:
-    height, width, depth = random.uniform(0.38, 0.5), random.uniform(1.0, 2.0), random.uniform(0.3, 0.5)
+    height, width, depth = random.uniform(0.35, 0.55), random.uniform(0.8, 2.0), random.uniform(0.28, 0.55)
     thick, bar = random.uniform(0.03, 0.07), random.uniform(0.04, 0.09)
     if random.random() < 0.5:
         parts = [box(bar, depth * 0.9, height, (side * width * 0.4, 0, 0)) for side in (-1, 1)]
@@ -110,12 +126,18 @@ def bench(random: Random) -> Solid:
             z = height + tall * (number + 0.6) / count
             parts.append(box(width, 0.03, 0.6 * tall / count, (0, depth * 0.5, z)))
         parts += [box(bar, bar, tall, (side * width * 0.42, depth * 0.52, height)) for side in (-1, 1)]
+        if random.random() < 0.4:  # arms
+            z = height + 0.5 * tall
+            parts.append(mirrored(box(bar, depth, 0.7 * bar, (0.46 * width, 0, z)), 0))
+            parts.append(
+                mirrored(box(0.7 * bar, 0.7 * bar, 0.5 * tall, (0.46 * width, -0.4 * depth, height)), 0)
+            )
     return joined(parts)
 
 
 def stool(random: Random) -> Solid:
     height, size = random.uniform(0.4, 0.8), random.uniform(0.15, 0.24)
-    thick, bar = random.uniform(0.03, 0.08), random.uniform(0.025, 0.05)
+    thick, bar = random.uniform(0.02, 0.12), random.uniform(0.02, 0.06)
     if random.random() < 0.6:
         parts = [cylinder(size, thick, (0, 0, height), sides=24)]
         count = int(random.choice([1, 3, 4, 4]))
@@ -129,8 +151,10 @@ def stool(random: Random) -> Solid:
             parts.append(
                 ring(size * 0.75 * (1 + spread) / 2, bar * 0.35, (0, 0, height * random.uniform(0.2, 0.5)))
             )
+        if random.random() < 0.2:  # a low back
+            parts.append(box(1.2 * size, 0.03, random.uniform(0.1, 0.3), (0, 0.8 * size, height)))
         return joined(parts)
-    parts = [box(2 * size, 2 * size * random.uniform(0.75, 1), thick, (0, 0, height))]
+    parts = [box(2 * size, 2 * size * random.uniform(0.6, 1), thick, (0, 0, height))]
     parts += [
         legs(random, 2 * size, 1.7 * size, height, bar),
         *rails(random, 2 * size, 1.7 * size, height, bar),
@@ -158,8 +182,10 @@ def back(random: Random, width: float, height: float, tall: float, y: float, bar
 
 
 def chair(random: Random) -> Solid:
-    height, width, depth = random.uniform(0.38, 0.5), random.uniform(0.38, 0.52), random.uniform(0.36, 0.5)
-    thick, bar = random.uniform(0.03, 0.08), random.uniform(0.03, 0.055)
+    if random.random() < 0.2:
+        return couch(random, random.uniform(0.45, 0.75))
+    height, width, depth = random.uniform(0.35, 0.7), random.uniform(0.36, 0.6), random.uniform(0.36, 0.55)
+    thick, bar = random.uniform(0.02, 0.12), random.uniform(0.025, 0.06)
     parts = [box(width, depth, thick, (0, 0, height)), *rails(random, width, depth, height, bar)]
     if random.random() < 0.2:  # an office chair's foot
         parts.append(cylinder(bar / 1.5, height))
@@ -167,7 +193,7 @@ def chair(random: Random) -> Solid:
             parts.append(rod((0, 0, 0.06), (0.28 * np.cos(angle), 0.28 * np.sin(angle), 0.03), 0.02))
     else:
         parts.append(legs(random, width, depth, height, bar))
-    parts += back(random, width, height + thick, random.uniform(0.3, 0.6), depth / 2 - bar / 2, bar)
+    parts += back(random, width, height + thick, random.uniform(0.2, 0.7), depth / 2 - bar / 2, bar)
     if random.random() < 0.3:
         z = height + random.uniform(0.18, 0.26)
         for side in (-1, 1):
@@ -206,10 +232,6 @@ def couch(random: Random, width: float) -> Solid:
     return joined(parts)
 
 
-def armchair(random: Random) -> Solid:
-    return couch(random, random.uniform(0.45, 0.8))
-
-
 def sofa(random: Random) -> Solid:
     seat = couch(random, random.uniform(0.95, 2.2))
     if random.random() < 0.15:  # a corner sofa
@@ -220,7 +242,7 @@ def sofa(random: Random) -> Solid:
 
 def bed(random: Random) -> Solid:
     width, length = random.choice([0.9, 1.2, 1.6, 1.8]) * random.uniform(0.95, 1.05), random.uniform(1.9, 2.2)
-    height, thick = random.uniform(0.15, 0.4), random.uniform(0.12, 0.28)
+    height, thick = random.uniform(0.12, 0.45), random.uniform(0.1, 0.3)
     parts = [
         box(width, length, 0.1, (0, 0, height - 0.1)),
         box(width * 0.96, length * 0.97, thick, (0, 0, height)),
@@ -230,88 +252,16 @@ def bed(random: Random) -> Solid:
         parts.append(box(width, 0.05, height + random.uniform(0.3, 0.8), (0, length / 2, 0)))
     if random.random() < 0.35:
         parts.append(box(width, 0.05, height + random.uniform(0.1, 0.4), (0, -length / 2, 0)))
+    if random.random() < 0.12 and width < 1.3:  # a bunk
+        post = box(0.07, 0.07, 1.6, (0.48 * width, 0.49 * length, 0))
+        parts += [mirrored(mirrored(post, 0), 1), box(width, length, 0.25, (0, 0, 1.1))]
+    elif random.random() < 0.12:  # a canopy
+        post = box(0.06, 0.06, 2.0, (0.48 * width, 0.49 * length, 0))
+        parts.append(mirrored(mirrored(post, 0), 1))
+        parts.append(mirrored(box(width, 0.06, 0.06, (0, 0.49 * length, 1.95)), 1))
+        parts.append(mirrored(box(0.06, length, 0.06, (0.48 * width, 0, 1.95)), 0))
     pillows = 1 if width < 1.3 else 2
     for number in range(pillows if random.random() < 0.8 else 0):
         x = width * ((number + 0.5) / pillows - 0.5)
         parts.append(box(0.7 * width / pillows, 0.35, 0.1, (x, length * 0.36, height + thick)))
-    return joined(parts)
-
-
-def shelf(random: Random) -> Solid:
-    width, depth, height = random.uniform(0.5, 1.4), random.uniform(0.22, 0.4), random.uniform(0.9, 2.2)
-    board = random.uniform(0.02, 0.045)
-    count = int(random.integers(3, 7))
-    levels = np.linspace(random.choice([0.0, 0.08]), height - board, count)
-    parts = [box(width, depth, board, (0, 0, z)) for z in levels]
-    parts += [box(board, depth, height, (side * (width - board) / 2, 0, 0)) for side in (-1, 1)]
-    if random.random() < 0.5:
-        parts.append(box(width, board * 0.5, height, (0, depth / 2, 0)))
-    if random.random() < 0.4:
-        parts.append(box(board, depth, height))
-    for z in levels[:-1]:  # books
-        if random.random() < 0.3:
-            wide = random.uniform(0.1, 0.35) * width
-            tall = 0.7 * height / count
-            parts.append(box(wide, depth * 0.7, tall, (random.uniform(-0.25, 0.25) * width, 0, z + board)))
-    return joined(parts)
-
-
-def dresser(random: Random) -> Solid:
-    width, depth, height = random.uniform(0.5, 1.5), random.uniform(0.35, 0.6), random.uniform(0.6, 1.3)
-    foot = random.choice([0.0, 0.06, 0.12])
-    parts = [box(width, depth, height - foot, (0, 0, foot))]
-    parts.append(box(width * 1.05, depth * 1.06, 0.03, (0, 0, height)))
-    if foot:
-        parts.append(legs(random, width, depth, foot, 0.06))
-    rows, columns = int(random.integers(2, 6)), int(random.choice([1, 2, 2, 3]))
-    for row in range(rows):
-        for column in range(columns):
-            x = width * ((column + 0.5) / columns - 0.5)
-            z = foot + (height - foot) * (row + 0.08) / rows
-            parts.append(box(0.9 * width / columns, 0.025, 0.84 * (height - foot) / rows, (x, -depth / 2, z)))
-            knob = (x, -depth / 2 - 0.03, z + 0.42 * (height - foot) / rows)
-            parts.append(box(random.choice([0.03, 0.12]), 0.03, 0.025, knob))
-    return joined(parts)
-
-
-def night_stand(random: Random) -> Solid:
-    width, depth, height = random.uniform(0.35, 0.6), random.uniform(0.3, 0.5), random.uniform(0.4, 0.75)
-    foot = random.choice([0.0, 0.1, 0.25]) * random.uniform(0.8, 1.2)
-    board, low = 0.025, foot
-    parts = [box(width * 1.05, depth * 1.05, 0.03, (0, 0, height))]
-    if random.random() < 0.5:  # an open lower half
-        low = foot + (height - foot) * random.uniform(0.35, 0.6)
-        parts += [box(board, depth, low - foot, (side * (width - board) / 2, 0, foot)) for side in (-1, 1)]
-        parts.append(box(width, depth, board, (0, 0, foot)))
-    parts.append(box(width, depth, height - low, (0, 0, low)))
-    if foot:
-        parts.append(legs(random, width, depth, foot, 0.05))
-    rows = int(random.integers(1, 4))
-    for row in range(rows):
-        z = low + (height - low) * (row + 0.1) / rows
-        parts.append(box(0.88 * width, 0.025, 0.8 * (height - low) / rows, (0, -depth / 2, z)))
-        parts.append(box(0.06, 0.03, 0.025, (0, -depth / 2 - 0.03, z + 0.4 * (height - low) / rows)))
-    return joined(parts)
-
-
-def wardrobe(random: Random) -> Solid:
-    width, depth, height = random.uniform(0.7, 1.8), random.uniform(0.4, 0.65), random.uniform(1.3, 2.2)
-    foot = random.choice([0.0, 0.08, 0.12])
-    parts = [box(width, depth, height - foot, (0, 0, foot))]
-    if random.random() < 0.5:
-        parts.append(box(width * 1.07, depth * 1.07, 0.07, (0, 0, height)))
-    if foot:
-        parts.append(legs(random, width, depth, foot, 0.07))
-    low = foot
-    if random.random() < 0.4:  # drawers below the doors
-        low = foot + 0.2 * height
-        parts.append(box(0.94 * width, 0.03, 0.16 * height, (0, -depth / 2, foot + 0.02 * height)))
-    doors = int(random.integers(2, 4))
-    for number in range(doors):
-        x = width * ((number + 0.5) / doors - 0.5)
-        parts.append(
-            box(0.93 * width / doors, 0.03, (height - low) * 0.94, (x, -depth / 2, low + 0.02 * height))
-        )
-        handle = x + (0.38 if number % 2 == 0 else -0.38) * width / doors
-        parts.append(box(0.03, 0.04, 0.18, (handle, -depth / 2 - 0.03, low + (height - low) * 0.45)))
     return joined(parts)

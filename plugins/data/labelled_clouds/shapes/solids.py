@@ -125,18 +125,64 @@ def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: in
     return Solid(*_rings(rings, sides, caps=not closed))
 
 
-def extruded(
-    outline: Float[np.ndarray, "corners 2"],
-    height: Number,
-    hole: Float[np.ndarray, "corners 2"] | None = None,
-) -> Solid:
-    """An outline that its centre sees whole, from z = 0 to `height`, with a hole of as many corners, if any."""
-    inner = np.zeros_like(outline) if hole is None else hole
-    levels = [(inner, 0), (outline, 0), (outline, height), (inner, height)]
-    if hole is not None:
-        levels.append((inner, 0))  # its wall
+def extruded(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
+    """An outline that the origin sees whole, counter-clockwise, from z = 0 to `height`."""
+    middle = np.zeros_like(outline)
+    levels = [(middle, 0), (outline, 0), (outline, height), (middle, height)]
     rings = [np.column_stack([flat, np.full(len(flat), float(z))]) for flat, z in levels]
     return Solid(*_rings(rings, len(outline), caps=False))
+
+
+def carried(outline: Sequence[Point], width: Number) -> Solid:
+    """A side view (y, z), counter-clockwise, carried along x, in the middle; its corners' mean sees it whole."""
+    flat = np.asarray(outline, float)
+    middle = flat.mean(0)
+    solid = extruded(flat - middle, width)
+    return Solid(solid.vertices[:, [2, 0, 1]] + [-width / 2, *middle], solid.faces)
+
+
+def tray(
+    width: Number,
+    depth: Number,
+    height: Number,
+    wall: Number,
+    floor: Number,
+    at: Point = (0, 0, 0),
+    foot: Number = 1.0,
+) -> Solid:
+    """An open box with walls so thick, its floor too; `foot` is the bottom's size as a share of the rim's."""
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
+    outer = np.array([width, depth])
+    inner = outer - 2 * wall
+    levels = [(foot * outer, 0), (outer, height), (inner, height), (foot * inner, floor)]
+    rings = [np.column_stack([corners * size, np.full(4, float(z))]) for size, z in levels]
+    vertices, faces = _rings(rings, 4)
+    return Solid(vertices + np.asarray(at, float), faces)
+
+
+def ribbon(
+    low: Float[np.ndarray, "points 2"], high: Float[np.ndarray, "points 2"], thickness: Number, height: Number
+) -> Solid:
+    """A standing sheet between two lines (x, y) of as many points, at z = 0 and at `height`, x rising."""
+    rings = [
+        np.array(
+            [
+                (bottom[0], bottom[1] - thickness / 2, 0.0),
+                (bottom[0], bottom[1] + thickness / 2, 0.0),
+                (top[0], top[1] + thickness / 2, height),
+                (top[0], top[1] - thickness / 2, height),
+            ]
+        )
+        for bottom, top in zip(low, high, strict=True)
+    ]
+    return Solid(*_rings(rings, 4))
+
+
+def without_needless(solid: Solid) -> Solid:
+    """The solid without triangles of which two corners are in one place: what is left of a ring of radius 0."""
+    corners = solid.vertices[solid.faces]
+    apart = np.abs(corners - np.roll(corners, 1, axis=1)).max(-1)  # of each corner from the one before
+    return Solid(solid.vertices, solid.faces[(apart > 1e-9).all(1)])  # the cosine of a right angle is 6e-17
 
 
 def _rings(rings: Sequence[np.ndarray], sides: int, caps: bool = True) -> tuple[np.ndarray, np.ndarray]:
