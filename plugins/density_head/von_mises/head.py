@@ -17,15 +17,19 @@ from plugins.density_head.von_mises.density import VonMises
 
 LARGEST_CONCENTRATION = 1e12
 """A standard deviation of a microradian; float32 angles resolve no more."""
+LEAST_SCALE = 0.25
+"""Of the pair, so that κ falls to 0 with the pair alone: were the scale to fall too, so would the pair's gradient, and
+an angle given up early would not be found again."""
 
 
 class VonMisesHead(DensityHead):
     """One von Mises density per angle: biternion mean, predicted or one global concentration (thesis §3.4).
 
     With `concentration="predicted"` it reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with
-    κ = |(cos, sin)| g(r): up to the scale g(r) the pair is the density's natural parameter, so that the uniform
-    density is a point like any other. Were the pair normalised, as in eq. 3.1, and κ = g(r), the gradients in
-    both would vanish with κ, and a network that begins by finding an angle unpredictable stays there (README).
+    κ = |(cos, sin)| g(r): up to the scale g(r), which stays above a quarter, the pair is the density's natural
+    parameter, so that the uniform density is a point like any other. Were the pair normalised, as in eq. 3.1, and
+    κ = g(r), the gradients in both would vanish with κ, and a network that begins by finding an angle unpredictable
+    stays there (README).
 
     With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to
     constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on validation (eq. 3.5).
@@ -105,11 +109,13 @@ def polar(
 
 
 def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """g(r) = exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_CONCENTRATION.
+    """g(r) = c + (1 - c) exp(r / (1 - c)) for r ≤ 0 and (1 + r/4)⁴ above: from c to LARGEST_CONCENTRATION, 1 and
+    smooth at 0, c = LEAST_SCALE.
 
     The Fisher information of log κ is nearly constant (1/2 for large κ), so a logarithmic map trains best;
     the power keeps that shape over the κ that occur, but lets neither κ nor an outlier's gradient explode.
     """
     most = 4 * (LARGEST_CONCENTRATION**0.25 - 1)
     high = (1 + raw.clamp(0, most) / 4).square().square()
-    return torch.where(raw < 0, torch.exp(raw.clamp(max=0)), high)
+    room = 1 - LEAST_SCALE
+    return torch.where(raw < 0, LEAST_SCALE + room * torch.exp(raw.clamp(max=0) / room), high)

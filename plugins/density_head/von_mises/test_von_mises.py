@@ -21,6 +21,7 @@ from plugins.density_head.von_mises import blocks, fit_coefficients, functions, 
 from plugins.density_head.von_mises.bessel import polynomial
 from plugins.density_head.von_mises.coefficients import NODES, TABLES
 from plugins.density_head.von_mises.density import LARGEST, VonMises
+from plugins.density_head.von_mises.head import LEAST_SCALE, scale_of_raw
 
 mpmath.mp.dps = 90
 DTYPES = (torch.float32, torch.float64)
@@ -428,6 +429,28 @@ def test_fixed_loss_is_the_cosine_loss_up_to_a_constant():
     cosine_loss = 1 - (unit * torch.cat([target.cos(), target.sin()], -1)).sum(-1)  # eq. 3.2
     constant = made.loss(raw, target) - cosine_loss
     torch.testing.assert_close(constant, constant[0].expand(50))
+
+
+def test_the_scale_of_the_pair_has_a_floor_and_no_kink():
+    raw = torch.tensor([-1e4, -60.0, -1e-9, 0.0, 1e-9], dtype=torch.float64, requires_grad=True)
+    scale = scale_of_raw(raw)
+    (slope,) = torch.autograd.grad(scale.sum(), raw)
+    torch.testing.assert_close(scale, torch.tensor([LEAST_SCALE] * 2 + [1.0] * 3).double(), rtol=1e-8, atol=0)
+    torch.testing.assert_close(slope, torch.tensor([0.0] * 2 + [1.0] * 3).double(), rtol=1e-8, atol=1e-30)
+
+
+@pytest.mark.parametrize("shrunken", [-3.0, -20.0, -1e4])
+def test_an_angle_given_up_is_found_again(shrunken):
+    made, target = head(), 0.7 + 0.1 * torch.randn(64, 1)
+    raw = torch.tensor([1e-4, -1e-4, shrunken], requires_grad=True)
+    optimizer = torch.optim.Adam([raw], lr=0.05)
+    for _ in range(400):
+        optimizer.zero_grad()
+        made.loss(raw.expand(64, -1), target).mean().backward()
+        optimizer.step()
+    density = made(raw)
+    assert density.mean.item() == pytest.approx(0.7, abs=0.1)
+    assert density.concentration.item() > 1
 
 
 def test_calibrated_concentration_maximises_the_likelihood():
