@@ -11,6 +11,9 @@ from torch.distributions import Distribution, Independent, Normal
 
 from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
+from framework.distributions.highest import highest
+from framework.distributions.moved import Moved
+from framework.distributions.tempering import CircularPower
 from plugins.density_head.gaussian.density import Gaussian
 from plugins.density_head.von_mises.density import VonMises
 
@@ -97,6 +100,46 @@ def test_hardly_any_density_is_higher_elsewhere(kind: str, numbers: int) -> None
         before += int((highest - density.log_prob(modes).amax(0) > 1e-3).sum())
     assert missed <= (0 if numbers == 1 else 1)
     assert before >= len(seeds)
+
+
+def nested(structure: str, seed: int) -> Distribution:
+    """Densities with several humps inside another mixture, (ITEMS,)."""
+    generator = torch.Generator().manual_seed(seed)
+    center = math.pi * torch.randn(3, ITEMS, 5, 1, dtype=torch.float64, generator=generator)
+    width = (0.4 * torch.randn(3, ITEMS, 5, 1, dtype=torch.float64, generator=generator) - 0.5).exp()
+    real, equal = structure == "moved", torch.zeros(ITEMS, 5)
+    flat = [
+        Mixture(equal, Gaussian(one, each) if real else VonMises(one, each**-2))
+        for one, each in zip(center, width, strict=True)
+    ]
+    if structure == "three mixtures":
+        return Mixture(torch.zeros(ITEMS, 3), Stacked(flat))
+    if structure == "three tempered":
+        tempered = [CircularPower(one, torch.tensor(0.7, dtype=torch.float64)) for one in flat]
+        return Mixture(torch.zeros(ITEMS, 3), Stacked(tempered))
+    if structure == "moved":
+        place, scale = torch.randn(
+            2, ITEMS, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+        )
+        moved = [Moved(one, shift * place, scale.exp()) for shift, one in enumerate(flat)]
+        return Mixture(torch.zeros(ITEMS, 3), Stacked(moved))
+    inner = Mixture(torch.zeros(ITEMS, 2), Stacked(flat[:2]))
+    return Mixture(torch.zeros(ITEMS, 2), Stacked([inner, flat[2]]))
+
+
+@pytest.mark.parametrize("structure", ["three mixtures", "three tempered", "moved", "mixtures of mixtures"])
+def test_humps_of_nested_mixtures_are_highest_together(structure: str) -> None:
+    """The second hump of each may be the highest of all: each one's own mode alone does not lead there."""
+    missed = before = 0
+    for seed in range(5):
+        density = nested(structure, seed)
+        assert isinstance(density, Mixture)
+        top = everywhere(density, "reals" if structure == "moved" else "angles")
+        missed += int((top - density.log_prob(density.mode) > 1e-3).sum())
+        modes = density.components.mode.movedim(1, 0)
+        before += int((top - density.log_prob(highest(density, modes)) > 1e-3).sum())
+    assert missed <= 1  # of 200: three places are climbed from
+    assert before > 3 * missed
 
 
 def test_two_overlapping_components_have_their_mode_between_them() -> None:

@@ -131,10 +131,11 @@ class Mixture(Distribution):
         if self.has_enumerate_support:
             support = self.enumerate_support()
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
-        modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
-        if self.event_shape.numel() > 1 and len(modes) <= CROSSED:
-            return highest(self, torch.cat([modes, crossings(self.components, modes)]))
-        return highest(self, modes)
+        places = peaks(self)  # of every component, however nested: two humps of one may be highest with another's
+        if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
+            modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
+            places = torch.cat([places, crossings(self.components, modes)])
+        return highest(self, places)
 
     @property
     def mean(self) -> Tensor:
