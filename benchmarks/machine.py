@@ -3,6 +3,7 @@
 import datetime
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -18,8 +19,11 @@ def machine(*packages: str) -> str:
     processor = platform.processor() or "unknown processor"
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
-        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
-        processor = f"{names[0].partition(':')[2].strip()}, {len(names)} cores" if names else processor
+        text = cpuinfo.read_text()
+        names = re.findall(r"^model name\s*:\s*(.*)$", text, re.MULTILINE)
+        # the widest of them decides by how much float32 and bfloat16 differ
+        widest = [each for each in ("avx512_bf16", "avx512f", "avx2") if re.search(rf"\b{each}\b", text)][:1]
+        processor = ", ".join([names[0], f"{len(names)} cores", *widest]) if names else processor
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
     return (
         f"{processor}; {datetime.date.today().isoformat()}; Python {platform.python_version()}, {versions}."
