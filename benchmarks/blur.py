@@ -1,14 +1,14 @@
 """What blur does to each method's log-likelihood of the pan angle (thesis Figures 3.7 and 3.8), as committed pictures.
 
-    python -m framework -m 'data.angles=[pan]' seed=0,1,2 threads=1 hydra.sweep.dir=outputs/sweeps/blur \\
-        experiment=idiap/fixed_kappa,idiap/von_mises,idiap/mixture,idiap/cvae,idiap/scvae
-    python benchmarks/blur.py outputs/sweeps/blur [data.root of the real set]
+    python benchmarks/thesis_tables.py 3.7-3.8 [--seeds 3]
+    python benchmarks/blur.py <sweeps of idiap experiments> [--root <the real set>]
     python benchmarks/blur.py --draw
 
-Every trained model of the sweep sees its own test split under Gaussian blurs. Writes blur.md, blur.csv, blur.png (the
-curves) and blur_strip.png (one head's densities) beside this file; `--draw` draws blur.png anew from blur.csv.
+Every trained model of the pan alone sees its own test split under Gaussian blurs. Writes blur.md, blur.csv, blur.png
+(the curves) and blur_strip.png (one head's densities) beside this file; `--draw` draws blur.png anew from blur.csv.
 """
 
+import argparse
 import json
 import math
 import sys
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 from matplotlib.axes import Axes
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -162,15 +163,25 @@ def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: P
     saved(figure, path.with_suffix(""), True)
 
 
-def main() -> None:
+def pans(sweeps: list[Path]) -> list[Path]:
+    """Results of the runs that predict the pan alone."""
+    found = []
+    for path in (path for sweep in sweeps for path in sorted(sweep.glob("*/results.json"))):
+        angles = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))["data"]["angles"]
+        if list(angles) == ["pan"]:
+            found.append(path)
+    return found
+
+
+def main(sweeps: list[Path], root: str | None) -> None:
     rows, first = [], {}
     fields: dict[str, torch.Tensor] = {}
-    for result in sorted(Path(sys.argv[1]).glob("*/results.json")):
+    for result in pans(sweeps):
         row = json.loads(result.read_text(encoding="utf-8"))
         model, description = load_with_description(result.parent)
         if not fields:
-            root = {"root": sys.argv[2]} if len(sys.argv) > 2 else {}
-            data = build("data", description.config["data"] | root)
+            real = {} if root is None else {"root": root}
+            data = build("data", description.config["data"] | real)
             data.prepare()
             batch = data.splits().test.__getitems__(range(min(IMAGES, len(data.splits().test))))
             fields = {"input": batch["input"], "target": batch["target"]}
@@ -204,7 +215,14 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--draw"]:
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    arguments.add_argument("sweeps", nargs="*", type=Path)
+    arguments.add_argument("--root", help="the real data set, where runs were trained on a generated one")
+    arguments.add_argument("--draw", action="store_true", help="draw blur.png anew from blur.csv")
+    given = arguments.parse_args()
+    if given.draw:
         curves(committed.rows(HERE.with_suffix(".csv")), HERE.with_suffix(".png"))
     else:
-        main()
+        main(given.sweeps, given.root)
