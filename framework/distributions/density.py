@@ -131,7 +131,8 @@ class Mixture(Distribution):
         if self.has_enumerate_support:
             support = self.enumerate_support()
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
-        places = peaks(self)  # of every component, however nested: two humps of one may be highest with another's
+        # of every component, however nested: two humps of one may be highest with another's
+        places = peaks(self)
         if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
             modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
             places = torch.cat([places, crossings(self.components, modes)])
