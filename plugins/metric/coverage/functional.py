@@ -19,8 +19,8 @@ EQUAL = {torch.float32: 1e-6, torch.float64: 1e-12}
 plateau."""
 FINER = 8
 """Angles on which regions are cut out, for each one at which the density is evaluated."""
-BLOCK = 2**16
-"""Angles cut out at once: they stay in the cache."""
+BLOCK = 2**18
+"""Angles cut out at once: enough that calls cost little, and few enough for a cache."""
 HALVINGS = 40
 """Of a cell in which a border lies: to its 1e-12th part."""
 SECANTS = 2
