@@ -53,7 +53,7 @@ SAMPLES = (1, 10, 30, 100)
 
 
 def each(call: Callable[[], object]) -> float:
-    """Milliseconds a sample: the median of seven calls, of fewer where one takes half a second."""
+    """Milliseconds a sample: the median of seven calls, of one where it takes half a second."""
     once = milliseconds(call, repeats=1, warm_up=1)
     return (once if once > 500 else milliseconds(call, repeats=7, warm_up=0)) / BATCH
 

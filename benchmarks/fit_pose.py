@@ -133,7 +133,9 @@ def picture(results: dict[str, list[dict[str, np.ndarray]]], number: int) -> Non
         return eight_bit(fine(scene)["color"][..., :3]).numpy()
 
     figure = titled_figure((13, 8.5), "A body fitted to its picture from 30° and 20 cm off", True)
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 1.05))
+    halves = figure.subfigures(2, 1, height_ratios=(1, 1.05))
+    assert isinstance(halves, np.ndarray)
+    above, below = halves
     shown = {"start": next(iter(results.values()))[number]["numbers"] * 0}
     shown["target"] = next(iter(results.values()))[number]["target"]
     titles = {"start": "start", "target": "target"}

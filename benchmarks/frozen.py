@@ -46,7 +46,9 @@ def predictor(encoders: list[dict], shape: tuple[int, ...]) -> Model | FrozenFro
     made = build_predictor(config, CLASSES, shape, seed=0)
     with torch.no_grad():
         made.train()(torch.rand(64, *shape))
-    return made.eval()
+    made.eval()
+    assert isinstance(made, Model | FrozenFrontEnd)
+    return made
 
 
 def seconds(call: Callable[[], object], repeats: int) -> float:
@@ -79,6 +81,7 @@ def rows(title: str, calls: Calls, count: int) -> list[str]:
 def classifier(count: int) -> list[str]:
     made = predictor([MLP], (512,))
     form = frozen(made, (512,))
+    assert isinstance(made, Model)
     network = torch.nn.Sequential(made.encoders, made.projection, torch.nn.Softmax(-1)).eval()
     inputs = torch.rand(count, 512)
     array = inputs.numpy()

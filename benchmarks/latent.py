@@ -33,7 +33,9 @@ from framework.evaluation.tradeoff import run_times
 from framework.figures.style import BLUE, GREEN, RED, saved, titled_figure
 from framework.reports import table
 from framework.target import Target
+from plugins.density_head.latent.cvae import CVAEHead
 from plugins.density_head.latent.monte_carlo import NormalPoints
+from plugins.density_head.latent.scvae import SCVAEHead
 
 HERE = Path(__file__)
 CPU = torch.device("cpu")
@@ -145,7 +147,7 @@ def trained(config: dict[str, object]) -> tuple[nn.Module, DensityHead]:
 
 def integral(head: DensityHead, raw: Tensor, value: Tensor) -> Tensor:
     """log p(φ|x) of the head itself by the trapezium rule over ±8 standard deviations of z, float64, (items,)."""
-    if not hasattr(head, "decoder"):
+    if not isinstance(head, CVAEHead | SCVAEHead):
         return head(raw).log_prob(value)
     latent = head.decoder.spread.shape[-1]
     axis = torch.linspace(-8, 8, 8001 if latent == 1 else 301, dtype=torch.float64)
@@ -155,7 +157,7 @@ def integral(head: DensityHead, raw: Tensor, value: Tensor) -> Tensor:
     )
     found = []
     for row, target in zip(raw, value, strict=True):
-        if hasattr(head, "networks"):
+        if isinstance(head, CVAEHead):
             networks = head.networks(row)
             number = networks.decode(networks.prior.at(z))
         else:
@@ -177,6 +179,8 @@ def points(kind: str) -> Iterator[None]:
 
 
 def turned(head: DensityHead, knob: str, value: float) -> None:
+    if not isinstance(head, CVAEHead | SCVAEHead):
+        return
     if knob == "samples":
         head.samples, head.tolerance = int(value), None
     elif knob == "tolerance":
@@ -192,7 +196,7 @@ def curve(method: str, encoder: nn.Module, head: DensityHead) -> list[dict[str, 
         truth = integral(double, raw.double(), value.double())
         head.float()
         family = float((true_log_prob(x.double(), value.double()) - truth).mean())
-        kinds = [("exact", "none", (0.0,))]
+        kinds: list[tuple[str, str, tuple[float, ...]]] = [("exact", "none", (0.0,))]
         if hasattr(head, "samples"):
             kinds = [("lattice", "samples", SAMPLES), ("independent", "samples", SAMPLES)]
             kinds.append(("lattice", "tolerance", TOLERANCES))

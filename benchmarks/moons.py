@@ -25,7 +25,7 @@ from framework.configuration.schema import build, resolve
 from framework.evaluation.splits import evaluate
 from framework.metric import Pictured
 from framework.reports.landscape_picture import Plane, landscapes, probabilities
-from framework.reports.table import aggregate, markdown
+from framework.reports.table import Better, aggregate, markdown
 from framework.training.batches import Batches
 
 HERE = Path(__file__).parent
@@ -56,7 +56,7 @@ COLUMNS = {
     "seconds": "whole run, s",
     "n": "seeds",
 }
-BETTER = {
+BETTER: Better = {
     "accuracy": "higher",
     "nll": "lower",
     "brier": "lower",

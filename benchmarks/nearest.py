@@ -19,10 +19,10 @@ from statistics import median
 os.environ["OMP_NUM_THREADS"] = "1"  # before pykdtree is imported
 
 import numpy as np
-import pynanoflann
+import pynanoflann  # pyright: ignore[reportMissingImports]
 import torch
 from numpy.typing import NDArray
-from pykdtree.kdtree import KDTree
+from pykdtree.kdtree import KDTree  # pyright: ignore[reportMissingImports]
 from scipy.spatial import cKDTree  # type: ignore[reportAttributeAccessIssue]
 from sklearn.neighbors import NearestNeighbors
 

@@ -53,7 +53,8 @@ def main() -> None:
     for invariant in (False, True):
         for points in (2048, 5000):
             clouds = sampled(points, 0)
-            rotation = torch.from_numpy(Rotation.random(len(clouds), 0).as_matrix())
+            turns = Rotation.random(len(clouds), 0)  # pyright: ignore[reportArgumentType]  # SciPy takes a seed
+            rotation = torch.from_numpy(turns.as_matrix())
             turned = (clouds.double() @ rotation.mT).float()
             own = codes(clouds, invariant)
             again = apart(own, codes(sampled(points, 1), invariant))

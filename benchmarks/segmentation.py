@@ -88,7 +88,7 @@ def inputs(clouds: Tensor, made: Basis, points: Tensor, whole: bool) -> Tensor:
     return per_point(encode(clouds, made, ["distance"], "none"), points) if whole else points
 
 
-def trained(clouds: Tensor, labels: Tensor, classes: int, made: Basis, whole: bool) -> nn.Module:
+def trained(clouds: Tensor, labels: Tensor, classes: int, made: Basis, whole: bool) -> nn.Sequential:
     torch.manual_seed(0)
     generator = torch.Generator().manual_seed(0)
     layers = [nn.Linear(3 + (BASIS if whole else 0), 256), nn.ReLU(), nn.Linear(256, 128), nn.ReLU()]
@@ -110,9 +110,13 @@ def trained(clouds: Tensor, labels: Tensor, classes: int, made: Basis, whole: bo
 
 
 @torch.inference_mode()
-def judged(network: nn.Module, clouds: Tensor, labels: Tensor, made: Basis, whole: bool) -> dict[str, float]:
+def judged(
+    network: nn.Sequential, clouds: Tensor, labels: Tensor, made: Basis, whole: bool
+) -> dict[str, float]:
     """Share of right points and its standard error over scans, mean intersection over union, milliseconds a scan."""
-    classes = network[-1].out_features
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    classes = last.out_features
     right, spent = [], []
     table = torch.zeros(classes, classes)
     for cloud, label in zip(clouds, labels, strict=True):

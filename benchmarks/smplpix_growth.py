@@ -26,15 +26,15 @@ from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
 from framework.reports.table import Row, csv
 from plugins.data.bodies.human_scans import in_front
 from plugins.data.bodies.people import chosen_body
-from plugins.data.bodies.topologies import sheet, topology
+from plugins.data.bodies.topologies import Name, sheet, topology
 from plugins.renderer.smplpix.canvas import fast_bfloat16
 
 SIZE = (410, 308)
-TOPOLOGIES = ("7k", "27k", "110k")
+TOPOLOGIES: tuple[Name, ...] = ("7k", "27k", "110k")
 ROUNDS = 3
 
 
-def person(name: str) -> Tensor:
+def person(name: Name) -> Tensor:
     """(points, 6): the default body at rest in a topology, coloured by place, before the canonical camera."""
     body, _ = chosen_body(None)
     whole = sheet(body)

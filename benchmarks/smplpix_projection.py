@@ -17,9 +17,8 @@ from benchmarks.machine import machine
 from benchmarks.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure
 from benchmarks.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
-from framework.encoder import Encoder
 from framework.geometry.camera import look_from
-from plugins.renderer.smplpix.projection import gathered, project, seen_in_torch
+from plugins.renderer.smplpix.projection import Projection, gathered, project, seen_in_torch
 
 RINGS = ((82, 84), (165, 168), (328, 336), (1000, 1000))
 """Bodies of 6,890, 27,722, 110,210 and 1,000,002 points; the thesis has 6,890 and 27,578."""
@@ -39,16 +38,16 @@ def points(rings: int, segments: int) -> Tensor:
     return torch.cat([camera.canonical(vertices), (vertices - low) / (high - low)], 1).float()
 
 
-def made(levels: int = 1, splat: int = 0) -> Encoder:
+def made(levels: int = 1, splat: int = 0) -> Projection:
     config = {"name": "projection", "height": HEIGHT, "width": WIDTH, "levels": levels, "splat": splat}
     return build("encoder", resolve("encoder", config), input_shape=(1, 6), input_columns=())
 
 
-def in_torch(encoder: Encoder, clouds: Tensor) -> Tensor:
+def in_torch(encoder: Projection, clouds: Tensor) -> Tensor:
     return gathered(clouds, seen_in_torch(clouds, encoder.view), encoder.view)
 
 
-def both_ways(encoder: Encoder, clouds: Tensor) -> None:
+def both_ways(encoder: Projection, clouds: Tensor) -> None:
     project(clouds.clone().requires_grad_(), encoder.view).sum().backward()
 
 

@@ -90,6 +90,7 @@ TABLES = {
         "head poses of synthetic people in the layouts of IDIAP, CAVIAR and TownCentre",
         {
             "idiap": HEADS,
+            "idiap_backbones": (methods("idiap", "cvae"), "data.angles=[pan]", "density_head.backbones=each"),
             "caviar": (methods("caviar", "fixed_kappa", "von_mises", "mixture"),),
             "towncentre": (methods("towncentre", "fixed_kappa", "von_mises", "mixture"),),
         },
