@@ -370,3 +370,26 @@ SAFETENSORS = [
     struct.pack("<Q", 2**63) + b"{}", struct.pack("<Q", 10**6) + b"{", struct.pack("<Q", 10**5) + b"[" * 10**5,
     struct.pack("<Q", 64) + b'{"a":{"dtype":"F32","shape":[1000000000000],"data_offsets":[0,4]}}'[:64],
 ]  # fmt: skip
+
+
+def niftis(whole: bytes) -> Iterator[bytes]:
+    """Images of NIfTI-1 that are not of the size they say, lie elsewhere, or are scaled to nothing."""
+    most = 2**15 - 1
+    for place, packed in (
+        (40, struct.pack("<8h", 4, most, most, most, most, 1, 1, 1)),
+        (40, struct.pack("<8h", 7, *[most] * 7)),
+        (40, struct.pack("<8h", 4, -1, 2, 3, 4, 1, 1, 1)),
+        (40, struct.pack("<8h", 0, *[1] * 7)),
+        (70, struct.pack("<h", 1536)),
+        (70, struct.pack("<h", 128)),
+        (70, struct.pack("<h", 32)),
+        (108, struct.pack("<f", 1e30)),
+        (108, struct.pack("<f", -9.0)),
+        (108, struct.pack("<f", float("nan"))),
+        (112, struct.pack("<2f", float("nan"), float("inf"))),
+        (112, struct.pack("<2f", 1e38, 1e38)),
+        (348, b"\1\0\0\0" + struct.pack("<2i", 2**31 - 16, 4)),
+        (348, b"\1\0\0\0" + struct.pack("<2i", 0, 4)),
+    ):
+        yield whole[:place] + packed + whole[place + len(packed) :]
+    yield whole[:348]

@@ -74,6 +74,7 @@ class Reader:
         inner: damage that keeps what the format checks first (checksums, compression); used for half of the files.
         crafted: files that were made to do harm; read before the damaged ones.
         told: what a refusal must name; None: the file.
+        optional: whether a pipe, a device or a folder in its place is left out, with a note.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Reader:
     inner: Sequence[Damage] = ()
     crafted: Sequence[bytes] = ()
     told: str | None = None
+    optional: bool = False
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """Whole files of every format that is read, and damage inside what a format checks first."""
 
+import gzip
 import hashlib
 import io
 import pickle
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import scipy.io
 import torch
@@ -67,6 +69,11 @@ def in_png(content: bytes, random: np.random.Generator) -> bytes:
             )
         made += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
     return made
+
+
+def in_gzip(content: bytes, random: np.random.Generator) -> bytes:
+    """What is packed, its checksum made right."""
+    return gzip.compress(spoilt(gzip.decompress(content), random), 1)
 
 
 def in_mat(content: bytes, random: np.random.Generator) -> bytes:
@@ -285,6 +292,28 @@ def dales(packed: bool) -> bytes:
         packed=packed, points=points, offset=np.array([0, 10, 30]), label=np.array([0, 1]),
         object_id=np.array([5, 6]), classes=np.array(["tree", "car"]),
     )  # fmt: skip
+
+
+def z_spectra() -> dict[str, Any]:
+    """Of 3 × 4 voxels, 2 of them outside the mask, in two regions."""
+    offsets = np.linspace(-4.0, 4.0, 9)
+    lines = 1 - 0.8 / (1 + offsets**2)
+    mask, region = np.ones((3, 4)), np.zeros((3, 4))
+    mask[0, :2], region[1:, 2:] = 0, 1
+    height = RANDOM.uniform(0.5, 2, (3, 4))
+    return {
+        "spectra": height[..., None] * lines, "offsets": offsets, "M0": height, "mask": mask, "region": region,
+    }  # fmt: skip
+
+
+def nifti(array: np.ndarray) -> bytes:
+    return nibabel.Nifti1Image(array.reshape(3, 4, 1, *array.shape[2:]), np.eye(4)).to_bytes()
+
+
+def flight() -> np.ndarray:
+    """(9, 4): t, x, y, z."""
+    time = 0.016 * np.arange(9)
+    return np.stack([time, 3 * time, -2 * time, 0.3 + time - 4.9 * time**2], -1)
 
 
 def checkpoint() -> bytes:

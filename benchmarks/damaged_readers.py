@@ -1,8 +1,13 @@
 """Every reader of files that the project has, with whole files for it, damage inside checksums, and crafted ones."""
 
+import gzip
+import json
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import torch
@@ -16,6 +21,7 @@ from benchmarks.damaged_files import (
     FACES,
     VERTICES,
     image,
+    in_gzip,
     in_mat,
     in_png,
     in_values,
@@ -37,12 +43,15 @@ from framework.sweeps import jobs
 from framework.testing import sample_files
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import read_run_info
-from plugins.data.bodies import body_files, motion, scan_layout
+from plugins.data.bodies import body_files, faust, motion, scan_layout, skins
+from plugins.data.bodies.pose_images import PoseFromImage
+from plugins.data.cest.volumes import read_volume
 from plugins.data.coil20.views import read_views
 from plugins.data.head_pose import caviar_labels, idiap_labels, towncentre_labels
 from plugins.data.images_with_angles.table import read_table
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.pascal3d import layout
+from plugins.data.table_tennis import recordings
 from plugins.renderer.rasterizer import sample_scenes as scenes
 from plugins.renderer.rasterizer import scene_files, turntable
 
@@ -82,6 +91,10 @@ def records(file: Path) -> object:
     return jobs.records(file.parent)
 
 
+def value(file: Path) -> object:
+    return jobs.Job(0, [], [], file.parent, "", "").value()
+
+
 def readers() -> Iterator[Reader]:
     """In the order of the report."""
     yield from clouds()
@@ -89,6 +102,8 @@ def readers() -> Iterator[Reader]:
     yield from people()
     yield from tables_and_images()
     yield from labels()
+    yield from spectra()
+    yield from flights()
     yield from models()
     yield from runs()
 
@@ -135,8 +150,25 @@ def subjects() -> Iterator[Reader]:
         materials,
         [in_png],
         [*crafted.images()],
+        optional=True,
+    )
+    parts, binary = scenes.described(*square)
+    parts["buffers"][0]["uri"] = "scene.bin"
+    yield Reader(  # the scene is named where bytes say nothing by themselves
+        "BIN, buffers of scenes",
+        "scene.bin",
+        [binary],
+        partial(with_buffer, document=json.dumps(parts)),
+        told="scene.",
     )
     yield Reader("JSON, cameras", "camera.json", [camera], turntable.read_camera)
+
+
+def with_buffer(file: Path, document: str) -> object:
+    """A scene whose numbers lie beside it."""
+    scene = file.with_suffix(".gltf")
+    scene.write_text(document, encoding="utf-8")
+    return scene_files.read(scene)
 
 
 def people() -> Iterator[Reader]:
@@ -170,6 +202,23 @@ def people() -> Iterator[Reader]:
         "JSON, cameras of people", "cameras.json", [cameras], scan_layout.read_cameras, crafted=crafted.JSONS
     )
     yield Reader("text, lists of people", "train.txt", [b"test_0001\ntest_0002\n"], lists)
+    yield Reader(
+        "text, pairs of FAUST",
+        "test/challenge_pairs/intra_challenge.txt",
+        [b"000_001\n001_000\n002_001\n"],
+        pairs,
+        crafted=crafted.TEXTS,
+    )
+
+
+def pairs(file: Path) -> object:
+    """Of the scans that a challenge asks for."""
+    folder = file.parents[2]
+    for number in range(3):
+        scan = faust.test_scan(folder, number)
+        scan.parent.mkdir(exist_ok=True)
+        scan.touch()
+    return faust.pairs(folder, "intra")
 
 
 def lists(file: Path) -> object:
@@ -211,6 +260,17 @@ def tables_and_images() -> Iterator[Reader]:
     yield Reader("PNG", "one.png", pngs, crop, [in_png], [*crafted.images()])
     yield Reader("JPEG", "one.jpg", jpegs, crop)
     yield Reader("other images", "one.img", others, crop)
+    yield Reader("images of skin", "one.png", pngs, skin, crafted=[*crafted.images()])
+    bodies = [image("PNG", "RGBA"), image("TIFF", "RGBA")]
+    yield Reader("images of bodies", "one.png", bodies, body, crafted=[*crafted.images()])
+
+
+def skin(file: Path) -> object:
+    return skins.content(file), skins.read(file)
+
+
+def body(file: Path) -> object:
+    return PoseFromImage._picture_of(cast(PoseFromImage, SimpleNamespace(input_shape=(4, 20, 24))), file)
 
 
 def labels() -> Iterator[Reader]:
@@ -238,6 +298,74 @@ def labels() -> Iterator[Reader]:
     names = b"2008_000008 -1\n2008_000015  1\n2008_000019\n"
     yield Reader(
         "text, lists of PASCAL VOC", "car_train.txt", [names], layout.read_list, crafted=crafted.TEXTS
+    )
+
+
+def spectra() -> Iterator[Reader]:
+    """Z-spectra and what lies beside them."""
+    found = whole.z_spectra()
+    mats = [whole.mat(packed, **found) for packed in (False, True)]
+    packed = [npz(packed=packed, **found) for packed in (False, True)]
+    plain, offsets = whole.nifti(found["spectra"]), "\n".join(map(str, found["offsets"])).encode()
+    yield Reader("MATLAB 5, Z-spectra", "slice.mat", mats, read_volume, [in_mat], [*crafted.mat("spectra")])
+    yield Reader("NPZ, Z-spectra", "slice.npz", packed, read_volume, [in_zip], [*crafted.npz("spectra")])
+    yield Reader("NIfTI, Z-spectra", "slice.nii", [plain], nifti, crafted=[*crafted.niftis(plain)])
+    yield Reader(
+        "NIfTI, Z-spectra, packed",
+        "slice.nii.gz",
+        [gzip.compress(plain)],
+        nifti,
+        [in_gzip],
+        [gzip.compress(content) for content in crafted.niftis(plain)],
+    )
+    yield Reader(  # the volume is named where numbers say nothing by themselves
+        "text, offsets of Z-spectra",
+        "slice.offsets.txt",
+        [offsets],
+        nifti,
+        crafted=crafted.TEXTS,
+        told="slice.",
+    )
+    mask = gzip.compress(whole.nifti(found["mask"]))
+    yield Reader("NIfTI, masks of Z-spectra", "slice.mask.nii.gz", [mask], nifti, [in_gzip], told="slice.")
+
+
+def nifti(file: Path) -> object:
+    """A volume with its offsets and its mask, one of which is damaged."""
+    found = whole.z_spectra()
+    content = {
+        "slice.nii": whole.nifti(found["spectra"]),
+        "slice.offsets.txt": "\n".join(map(str, found["offsets"])).encode(),
+        "slice.mask.nii.gz": gzip.compress(whole.nifti(found["mask"])),
+    }
+    for name, sound in content.items():
+        if name != file.name and not file.with_name(name).exists():
+            file.with_name(name).write_bytes(sound)
+    return read_volume(file if file.name == "slice.nii.gz" else file.with_name("slice.nii"))
+
+
+def flights() -> Iterator[Reader]:
+    rows = whole.flight()
+    table = b"t,x,y,z\n" + b"".join(b"%f,%f,%f,%f\n" % tuple(row) for row in rows)
+    cells = np.empty((1, 2), object)
+    cells[0, :] = rows, rows[:5]
+    times, balls = np.empty((1, 2), object), np.empty((1, 2), object)
+    for number in range(2):
+        times[0, number], balls[0, number] = cells[0, number][:, :1], cells[0, number][:, 1:]
+    mats = [
+        whole.mat(packed, **content)
+        for packed in (False, True)
+        for content in ({"ballTrain": {"data": cells}}, {"time": times, "ball": balls})
+    ]
+    read = partial(recordings.flights_of, step=0.016)
+    yield Reader("CSV, flights", "one.csv", [table], read, crafted=crafted.CSV)
+    yield Reader(
+        "MATLAB 5, flights",
+        "one.mat",
+        mats,
+        read,
+        [in_mat],
+        [*crafted.mat("ballTrain"), *crafted.mat("ball")],
     )
 
 
@@ -287,6 +415,7 @@ def runs() -> Iterator[Reader]:
         "config.yaml of a run", "config.yaml", [config], stored, crafted=[*crafted.yamls(config)], told=""
     )
     yield Reader("records of jobs", jobs.RECORD, [job], records, crafted=crafted.JSONS)
+    yield Reader("values of jobs", jobs.VALUE, [b"0.5"], value, crafted=crafted.JSONS, optional=True)
     yield Reader(
         "marks of generated data",
         "synthetic.json",

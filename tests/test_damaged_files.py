@@ -1,5 +1,6 @@
 """Damaged and harmful files: every reader of the project reads them or says a sentence, and soon."""
 
+import ast
 import pickle
 import subprocess
 import sys
@@ -33,6 +34,76 @@ def test_no_reader_crashes_hangs_or_raises_anything_but_a_sentence(tmp_path: Pat
     lines = [line for line in done.stdout.splitlines() if " 100 files, " in line]
     assert len(lines) >= 30
     assert all("0 unclean, 0 crashes, 0 hangs" in line for line in lines), done.stdout
+
+
+def test_every_reader_of_the_project_is_among_them() -> None:
+    """Each module that guards a file reads a whole one where the damaged ones are read; no other module opens files."""
+    done = subprocess.run(
+        [sys.executable, "-c", WHO_READS], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    reached = set(done.stdout.split())
+    guarding, opening = set[str](), set[str]()
+    for file in (path for top in ("framework", "plugins") for path in (ROOT / top).rglob("*.py")):
+        name = file.relative_to(ROOT).as_posix()
+        if (
+            file.name.startswith("test_")
+            or file.name == "rows.py"
+            or name.startswith(("framework/testing/", "framework/storage/"))
+        ):
+            continue
+        called = {
+            ast.unparse(node.func)
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call)
+        }
+        if {"guarded", "reading.guarded"} & called:
+            guarding.add(name)
+        if any(one in ("open", "np.load", "torch.load") or one.endswith(READING) for one in called):
+            opening.add(name)
+    assert guarding - reached == OWN_CACHE
+    assert opening == OWN_FILES.keys()
+
+
+READING = (".read_text", ".read_bytes", "Image.open", ".loadmat")
+OWN_CACHE = {
+    "plugins/data/bodies/default_body.py",
+    "plugins/data/bodies/topologies.py",
+    "plugins/data/labelled_clouds/reading.py",
+}
+"""They guard what the project keeps in its own cache, where `archive` reads it, which is among the readers."""
+OWN_FILES = {
+    "framework/configuration/composition.py": "the package's config.yaml",
+    "framework/datasets/images.py": "within a guard",
+    "framework/evaluation/cost.py": "/proc",
+    "framework/modes/plugins.py": "the package's own modules",
+    "framework/sweeps/jobs.py": "the console of a job that it started",
+    "framework/tracking/journal.py": "the run's own journal, line by line",
+    "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
+    "plugins/renderer/rasterizer/parts.py": "bytes that a guard has read",
+}
+"""Who opens a file beside `framework.storage`, and which."""
+WHO_READS = """
+import sys
+from benchmarks.damage import scratch
+from benchmarks.damaged_readers import readers
+from benchmarks.fuzz import whole
+from framework.storage.reading import guarded
+
+code, found = guarded.__wrapped__.__code__, set()
+
+def called(frame, event, argument):
+    if event == "call" and frame.f_code is code:  # by contextlib, by whoever guards
+        found.add(frame.f_back.f_back.f_code.co_filename)
+
+for reader in readers():
+    with scratch() as folder:
+        sys.setprofile(called)
+        whole(reader, folder)
+        sys.setprofile(None)
+here = __import__("os").getcwd()
+print(*(file[len(here) + 1:] for file in found if file.startswith(here)))
+"""
 
 
 def test_a_strip_is_scaled_before_it_is_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -307,6 +307,19 @@ def test_long_parameters_on_a_full_disk_stop_nobody(
     assert "No space left" in caplog.text
 
 
+@pytest.mark.parametrize("content", ["{", "[1]", "\0"])
+def test_long_parameters_beside_damaged_ones_stop_nobody(
+    folder: Path, content: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    tracker = build(folder)
+    tracker.open()
+    (folder / "params.json").write_text(content)
+    tracker.log_params({"long": "y" * 251})
+    tracker.close("FINISHED")
+    assert client(folder).get_run(identity(folder)).data.params == {"long": "y" * 249 + "…"}
+    assert "params.json: cannot be read as parameters" in caplog.text
+
+
 def test_many_parameters(folder: Path) -> None:
     params = {f"group.key{i}": i for i in range(350)}  # the store takes 100 at once
     tracker = build(folder)

@@ -3,6 +3,7 @@
 import importlib
 import json
 import logging
+import os
 import shlex
 import shutil
 import time
@@ -13,7 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, final
 
+from framework.errors import DataError
 from framework.storage.files import write_whole
+from framework.storage.plain_values import read_json
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import (
     SIDECAR,
@@ -273,10 +276,11 @@ class MlflowTracker(Tracker):
     def _keep_whole(self, params: dict[str, str]) -> None:
         path = self.folder / "params.json"
         try:
-            earlier = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+            earlier = read_json(path, "parameters") if os.path.lexists(path) else {}
             write_whole(path, json.dumps({**earlier, **params}, indent=1).encode())
-        except OSError as error:
-            _log.warning("Parameters too long for the store are not in %s either: %s.", path, error.strerror)
+        except (OSError, DataError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            _log.warning("Parameters too long for the store are not in %s either: %s", path, why)
         else:
             self.log_artifact(path)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from framework.errors import DataError
 from framework.geometry.meshes import read
+from framework.storage.reading import guarded, read_bytes
 
 SUBJECTS, POSES = 10, 10
 TEST = 200
@@ -72,10 +73,8 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
         DataError: no such list, a line that is no pair, or a pair of a scan that is not there.
     """
     file = pairs_file(folder, challenge)
-    try:
-        lines = file.read_text(encoding="ascii").split()
-    except (OSError, ValueError) as error:
-        raise DataError(f"{file}: the pairs of the challenge cannot be read ({error}).") from error
+    with guarded(file, "pairs of a challenge", "Wanted: two test scans a line, such as 000_001."):
+        lines = read_bytes(file).decode("ascii").split()
     found = []
     for number, line in enumerate(lines, 1):
         match = re.fullmatch(r"(\d{3})_(\d{3})", line)

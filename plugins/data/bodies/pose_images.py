@@ -10,18 +10,17 @@ from typing import Annotated
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
+from framework.datasets.images import opened
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
 from framework.geometry.light import eight_bit, linear
 from framework.renderer import Renderer
-from framework.storage.reading import guarded
 from framework.target import Target
 from plugins.data.bodies.figure import Figure, figure_of
 
@@ -156,10 +155,7 @@ class PoseFromImage(Data):
 
     def _picture_of(self, file: Path) -> Float[Tensor, "4 height width"]:
         _, height, width = self.input_shape
-        with (
-            guarded(file, "a picture", missing="wanted a picture. Mend the path."),
-            Image.open(file) as image,
-        ):
+        with opened(file) as image:
             if image.mode != "RGBA" or image.size != (width, height):
                 raise DataError(
                     f"{file}: {image.width} × {image.height} pixels, mode {image.mode}; wanted {width} × {height} and "

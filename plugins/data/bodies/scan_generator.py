@@ -97,7 +97,7 @@ class Crowd:
             **settings,
             "topologies": list(drawing.topologies),
             "body": _hash(self.body.template.tobytes(), self.body.faces.tobytes()),
-            "skins": [[file.name, _hash(file.read_bytes())] for some in self.skins for file in some],
+            "skins": [[file.name, _hash(skins.content(file))] for some in self.skins for file in some],
             "renderer": f"{type(renderer).__module__}.{type(renderer).__qualname__}",
         }
         self.root = cache.folder("human_scans") / _hash(repr(sorted(self.mark.items())).encode())

@@ -11,6 +11,7 @@ from numpy.random import Generator
 from framework.datasets import images
 from framework.errors import DataError
 from framework.geometry.light import linear
+from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies.anatomy import Anatomy
 from plugins.data.bodies.fabrics import Color, hue, noise
 
@@ -30,6 +31,16 @@ def files(folder: Path) -> list[Path]:
             "null."
         )
     return found
+
+
+def content(file: Path) -> bytes:
+    """A skin's file, whole.
+
+    Raises:
+        DataError: it is missing, or no regular file.
+    """
+    with guarded(file, "a picture of skin"):
+        return read_bytes(file)
 
 
 def read(file: Path) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,15 @@ def test_skins_are_worn_in_one_split_each(tmp_path):
         file.unlink()
     with pytest.raises(ConfigError, match="holds 2 skins; wanted three"):
         scan_generator._shared_out(str(tmp_path), True)
+
+
+def test_a_skin_that_is_no_file_gets_a_sentence(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "folder.png").mkdir()
+    for file in skins.files(tmp_path):
+        for reader in (skins.content, skins.read):
+            with pytest.raises(DataError, match=rf"{file.name}: cannot be read"):
+                reader(file)
 
 
 def test_supersampling_keeps_the_camera():

@@ -1,5 +1,6 @@
 """Z-spectra and maps in NIfTI, through nibabel (the extra `nifti`), which nothing else needs."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import nibabel
 import numpy as np
 
 from framework.errors import DataError
-from framework.storage.reading import inflated, read_bytes, room
+from framework.storage.reading import guarded, inflated, read_bytes, room
 
 PACKED = b"\x1f\x8b"
 
@@ -28,9 +29,19 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
         raise DataError(
             f"no {beside.name} beside it; wanted the offsets in ppm, one a line, as many as images."
         )
-    found["offsets"] = np.array([float(line) for line in beside.read_text(encoding="utf-8").split()])
-    if mask.is_file():
-        found["mask"] = np.asarray(_read(mask).dataobj, np.float64)
+    with guarded(beside, "offsets", "Wanted: numbers in ppm, one a line, as many as images."):
+        found["offsets"] = np.array([float(line) for line in read_bytes(beside).decode("utf-8").split()])
+        if len(found["offsets"]) != images.shape[-1]:
+            raise DataError(
+                f"{len(found['offsets'])} offsets for {images.shape[-1]} images of {file.name}; wanted one for each."
+            )
+    if os.path.lexists(mask):
+        with guarded(mask, "a mask", "Restore it, or take it away: every voxel with a number is meant then."):
+            found["mask"] = np.asarray(_read(mask).dataobj, np.float64)
+            if found["mask"].squeeze().shape != found["spectra"][..., 0].squeeze().shape:
+                raise DataError(
+                    f"of shape {found['mask'].shape}; wanted {images.shape[:-1]}, that of {file.name}."
+                )
     return found
 
 

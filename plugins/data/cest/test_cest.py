@@ -204,7 +204,7 @@ def broken(**changes):
         (broken(offsets=np.array([-500.0, -200, -100, 100, 200, 900])), "not in Hz"),
         (broken(spectra=np.full((4, 5, 6), np.nan)), "no voxel of 20"),
         (broken(spectra=np.full((4, 5, 6), 900.0)), "not divided by M0"),
-        (broken(mask=np.zeros((4, 5))), "no voxel of 0"),
+        (broken(mask=np.zeros((4, 5))), "its mask holds no voxel"),
         (broken(region=np.full((4, 5), 7)), "regions 7 to 7"),
     ],
 )

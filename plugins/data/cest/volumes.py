@@ -98,6 +98,8 @@ def _volume(found: Mapping[str, Any]) -> Volume:
     inside = _mask(found.get("mask"), spectra)
     whole = np.isfinite(spectra).all(-1)
     kept = inside & whole
+    if not inside.any():
+        raise DataError("its mask holds no voxel: nowhere is it above 0. Mend it, or leave it out.")
     if not kept.any():
         raise DataError(
             f"no voxel of {inside.sum()} within the mask is whole: each has a number that is not finite."
