@@ -162,6 +162,8 @@ class Needles(Data):
         noise = torch.randn(inputs.shape)
         if self.fault == "noise of numpy's":
             noise = torch.from_numpy(np.random.randn(*inputs.shape)).float()  # noqa: NPY002
+        if self.fault == "noise of one type alone":
+            noise = inputs.lerp(noise, torch.rand(len(inputs), 1, dtype=torch.float32))
         return {**batch, "input": inputs + 0.01 * noise}
 
     def fingerprint(self):
@@ -253,6 +255,7 @@ FAULTS = {
     "half of the batch": "augment",
     "a field is lost": "augment",
     "noise of numpy's": "augment",
+    "noise of one type alone": "augment",
     "no worker can have it": "workers",
     "read wants prepare": "own files",
     "read sorts": "own files",

@@ -96,6 +96,42 @@ def test_a_component_is_picked_for_each_sample_and_batch() -> None:
         torch.testing.assert_close(picked.sample(), wanted, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("sample_shape", [(), (2,), (3, 2)])
+@pytest.mark.parametrize("inner", [1, 4])
+def test_of_mixtures_in_a_mixture_only_what_is_drawn_is_computed(
+    sample_shape: tuple[int, ...], inner: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(0)
+    batch, outer = 2, 3
+    places = torch.arange(float(batch * outer * inner)).reshape(batch, outer, inner, 1)
+    component = Independent(Normal(places, torch.full_like(places, 1e-6)), 1)
+    log_weights = torch.randn(batch, outer, inner).log_softmax(-1)
+    log_weights[0, 1, 0] = -math.inf if inner > 1 else 0.0
+    mixtures = Mixture(log_weights, component)
+    index = torch.tensor([[1, 2], [0, 0], [1, 1]]).repeat(1000, 1)
+    computed = []
+    drawn = Normal.sample
+    monkeypatch.setattr(
+        Normal,
+        "sample",
+        lambda self, shape=(): computed.append(shape.numel() * self.loc.numel()) or drawn(self, shape),
+    )
+    found = pick(mixtures, index).sample(sample_shape)
+    assert found.shape == (*sample_shape, *index.shape, 1)
+    assert sum(computed) == found.numel()
+    which = found.round().long().squeeze(-1).reshape(-1, *index.shape)
+    row, of_outer, of_inner = which // (outer * inner), which // inner % outer, which % inner
+    assert torch.equal(row, torch.arange(batch).expand_as(row))
+    assert torch.equal(of_outer, index.expand_as(of_outer))
+    for number in range(batch * outer):
+        mine = of_inner[(row * outer + of_outer) == number]
+        shares = torch.bincount(mine, minlength=inner) / max(1, len(mine))
+        wanted = mixtures.log_weights.reshape(-1, inner)[number].exp()
+        assert ((shares - wanted).abs() <= 5 * (wanted * (1 - wanted) / max(1, len(mine))).sqrt())[
+            : inner * bool(len(mine))
+        ].all()
+
+
 def test_monte_carlo_entropy_agrees_with_quadrature() -> None:
     torch.manual_seed(0)
     component = Independent(

@@ -222,6 +222,19 @@ def test_augmented_against_scipy() -> None:
             np.testing.assert_allclose(varied[index, channel], expected, atol=2e-6)
 
 
+def test_augmented_is_the_same_while_a_model_of_float64_trains() -> None:
+    pixels = torch.randint(0, 256, (4, 3, 9, 9), dtype=torch.uint8)
+    found = []
+    try:
+        for kind in (torch.float32, torch.float64):
+            torch.set_default_dtype(kind)
+            torch.manual_seed(0)
+            found.append(augmented(pixels, torch.tensor([True, False, True, False]), 0.1))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(*found)
+
+
 def test_augmented_takes_an_empty_batch() -> None:
     none = torch.empty((0, 3, 8, 8), dtype=torch.uint8)
     assert augmented(none, torch.empty(0, dtype=torch.bool), 0.1).shape == (0, 3, 8, 8)

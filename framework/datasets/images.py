@@ -317,7 +317,8 @@ def augmented(
     its contrast changed by up to twice that. Random numbers come from torch's global CPU generator.
     """
     batch, _, height, width = images.shape
-    amount = (2 * torch.rand(5, batch) - 1) * jitter
+    # float32, whatever the default is while a model of float64 trains
+    amount = (2 * torch.rand(5, batch, dtype=torch.float32) - 1) * jitter
     scale = amount[0].exp()
     sign = 1 - 2 * mirrored.to("cpu", torch.float32)
     rows = _positions(height, scale, amount[1] * height).to(images.device)

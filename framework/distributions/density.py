@@ -315,6 +315,51 @@ def _(density: Mixture, value: Tensor) -> Slope | None:
     return Slope(torch.logsumexp(log_terms, -1), *means)
 
 
+@pick.register
+def _(density: Mixture, index: Tensor) -> Distribution:
+    return _PickedMixture(density, index)
+
+
+class _PickedMixture(Distribution):
+    """Samples of one mixture each of a batch (*batch, K) of them: only what is drawn of the components is computed.
+
+    Args:
+        density: the mixtures.
+        index: (*sample, *batch), which of K.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, density: Mixture, index: Tensor) -> None:
+        self.density = density
+        self.index = index
+        super().__init__(index.shape, density.event_shape, validate_args=False)
+
+    @torch.no_grad()
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        lead = (
+            torch.Size(sample_shape)
+            + self.index.shape[: self.index.dim() - len(self.density.batch_shape) + 1]
+        )
+        batch = self.density.batch_shape[:-1]
+        index = self.index.expand((*sample_shape, *self.index.shape)).reshape(lead.numel(), *batch)
+        items = max(1, self.density.batch_shape.numel())
+        rows = max(1, min(CHUNK // items, LARGEST // (items * max(1, self.event_shape.numel()))))
+        drawn = torch.cat([self._drawn(part) for part in index.split(rows)])
+        return drawn.reshape(*lead, *batch, *self.event_shape)
+
+    def _drawn(self, index: Tensor) -> Tensor:
+        """Of mixtures at `index` (sample, *batch)."""
+        weights = take(self.density.log_weights, index).exp()
+        count = weights.shape[-1]
+        which = torch.zeros_like(index)
+        if count > 1 and index.numel() > 0:  # torch.multinomial refuses to draw nothing
+            which = torch.multinomial(weights.reshape(-1, count), 1).reshape(index.shape)
+        # of every mixture the component that was drawn for the one that is meant; then that one
+        wide = which.unsqueeze(-1).expand(*index.shape, self.density.batch_shape[-1])
+        return pick(pick(self.density.components, wide), index).sample()
+
+
 @peaks.register
 def _(density: Mixture) -> Tensor:
     found = peaks(density.components).movedim(-1 - len(density.event_shape), 0)  # (K, peak, *batch, *event)

@@ -280,39 +280,48 @@ def _pictures(bench: Workbench, worst: Worst) -> None:
 
 
 def _augment(bench: Workbench, worst: Worst) -> None:
-    """A varied batch is a batch still, and a function of torch's seed alone."""
+    """A varied batch is a batch still, and a function of torch's seed alone; while a model of float64 trains, too."""
     data, train = bench.data, parts(bench.data)["train"]
-    for size in (min(16, len(train)), 1):
+    usual = torch.get_default_dtype()
+    for size, kind in ((min(16, len(train)), usual), (1, usual), (min(16, len(train)), torch.float64)):
         batch = fetched(train, list(range(size)))
+        if kind != usual:  # as the trainer does
+            batch = {
+                key: value.to(kind) if value.is_floating_point() else value for key, value in batch.items()
+            }
+        torch.set_default_dtype(kind)
+        try:
+            _varied(data, batch, f"batch of {size}{'' if kind == usual else ' in float64'}", worst)
+        finally:
+            torch.set_default_dtype(usual)
 
-        def varied(seed: int, other: int, batch: Batch = batch) -> Batch:
-            torch.manual_seed(seed)
-            np.random.seed(other)  # noqa: NPY002 - must not matter
-            random.seed(other)
-            return data.augment({key: value.clone() for key, value in batch.items()})
 
-        for seed in (SEED, SEED + 7):
-            found, where = varied(seed, 1), f"batch of {size}"
-            equal_fields(varied(seed, 2), found, f"{where}, one seed twice", worst)
-            worst.same(f"{where}: fields", sorted(found), sorted(batch))
-            if not data.varies:
-                equal_fields(found, batch, f"{where}, though nothing varies", worst)
-            for key in set(found) & set(batch):
-                new, old = found[key], batch[key]
-                worst.same(f"{where}: shape of {key}", tuple(new.shape), tuple(old.shape))
-                bytes_read = key == "input" and old.dtype == torch.uint8 and new.is_floating_point()
-                worst.count(
-                    new.dtype != old.dtype and not bytes_read,
-                    f"{where}: {key} of {new.dtype}, was {old.dtype}",
-                )
-                worst.count(
-                    bytes_read and not ((new >= 0) & (new <= 1)).all(), f"{where}: bytes beyond 0 to 1"
-                )
-                worst.count((~new.isfinite() & old.isfinite()).sum(), f"{where}: {key} no longer finite")
-            for key in ("index", "group"):
-                worst.same_bits(f"{where}: {key}", found[key], batch[key])
-            for row, target in enumerate(found["target"]):
-                _target(data, target, f"{where}, row {row}", worst)
+def _varied(data: Data, batch: Batch, where: str, worst: Worst) -> None:
+    def varied(seed: int, other: int) -> Batch:
+        torch.manual_seed(seed)
+        np.random.seed(other)  # noqa: NPY002 - must not matter
+        random.seed(other)
+        return data.augment({key: value.clone() for key, value in batch.items()})
+
+    for seed in (SEED, SEED + 7):
+        found = varied(seed, 1)
+        equal_fields(varied(seed, 2), found, f"{where}, one seed twice", worst)
+        worst.same(f"{where}: fields", sorted(found), sorted(batch))
+        if not data.varies:
+            equal_fields(found, batch, f"{where}, though nothing varies", worst)
+        for key in set(found) & set(batch):
+            new, old = found[key], batch[key]
+            worst.same(f"{where}: shape of {key}", tuple(new.shape), tuple(old.shape))
+            bytes_read = key == "input" and old.dtype == torch.uint8 and new.is_floating_point()
+            worst.count(
+                new.dtype != old.dtype and not bytes_read, f"{where}: {key} of {new.dtype}, was {old.dtype}"
+            )
+            worst.count(bytes_read and not ((new >= 0) & (new <= 1)).all(), f"{where}: bytes beyond 0 to 1")
+            worst.count((~new.isfinite() & old.isfinite()).sum(), f"{where}: {key} no longer finite")
+        for key in ("index", "group"):
+            worst.same_bits(f"{where}: {key}", found[key], batch[key])
+        for row, target in enumerate(found["target"]):
+            _target(data, target, f"{where}, row {row}", worst)
 
 
 def _workers(bench: Workbench, worst: Worst) -> None:

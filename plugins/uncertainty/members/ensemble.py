@@ -192,6 +192,10 @@ def vectorises(member: Predictor) -> bool:
     """Whether members like this one can be computed side by side."""
     if not isinstance(member, Model) or isinstance(member.head, Fitted):
         return False
+    if (
+        next(network(member).parameters(), None) is None
+    ):  # the head reads what nobody learned: nothing to lay out
+        return False
     return all(encoder.vectorises for encoder in member.encoders)
 
 

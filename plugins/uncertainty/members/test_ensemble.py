@@ -3,8 +3,10 @@ import copy
 import pytest
 import torch
 from torch import nn
+from torch.distributions import Categorical
 
 from framework.configuration.schema import build, resolve
+from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
@@ -255,6 +257,37 @@ def test_networks_that_do_not_vectorise_are_computed_one_after_the_other():
         assert whole.training_densities(inputs).batch_shape == (64, 2)
     whole.train().loss(inputs, target).mean().backward()
     assert all(parameter.grad is not None for parameter in whole.parameters())
+
+
+class Reading(DensityHead):
+    """Learns all there is to learn, of features as they are."""
+
+    direct = True
+    size = 4
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(4, 3)
+
+    def forward(self, raw):
+        return Categorical(logits=self.layer(raw))
+
+    def loss(self, raw, target):
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw, target):
+        raise AssertionError
+
+
+def test_heads_that_learn_all_there_is_are_mixed_too():
+    inputs, target = data()
+    wrapper = Ensemble(lambda: Model([], Reading(), (4,)), members=3)
+    assert wrapper.together is None
+    train(wrapper, torch.optim.SGD(wrapper.parameters(), 0.1), inputs, target)
+    found = wrapper.eval()(inputs)
+    alone = torch.stack([member(inputs).probs for member in wrapper.apart])
+    assert (alone.std(0) > 1e-3).any()
+    torch.testing.assert_close(found.log_prob(target).exp(), alone.mean(0).gather(1, target[:, None])[:, 0])
 
 
 @pytest.mark.parametrize("batch_norm", [False, True], ids=["together", "apart"])
