@@ -10,8 +10,15 @@ from torch import Tensor
 from plugins.density_head.matrix_fisher import quadrature, quaternions
 from plugins.density_head.matrix_fisher.functions import Frame, log_height
 
-CHUNK = 2**10
-"""Angles at which the density is integrated at once: arrays of 2 MB stay in the cache."""
+CHUNK = 2**18
+"""Points at which the density is evaluated at once: arrays of 2 MB stay in the cache."""
+FEW = {32: 19.0, 48: 54.0, 96: 236.0, 192: 368.0}
+"""Nodes of a plain rule, and the largest of λ up to which they do: Σ λᵢqᵢ² is c₀ - κ cos(a - φ) in each angle, κ at
+most half the largest λ, whatever the other angles are. Of exp(κ cos) the trapezium rule of N nodes on the circle errs
+by 2 I_N(κ)/I₀(κ), here below 1e-15 of the integral, and Gauss and Legendre's on half of it, times cos e, by less than
+1e-12 (measured over φ). Beyond, nodes follow the peaks."""
+MOST = 224
+"""Nodes there."""
 
 
 @torch.no_grad()
@@ -27,21 +34,30 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
     """
     shape = torch.broadcast_shapes(angle.shape, frame.falls.shape[:-1])
     parts = (quaternions.of_matrix(frame.left), quaternions.of_matrix(frame.right), frame.falls)
-    rows = [part.expand(*shape, part.shape[-1]).reshape(-1, part.shape[-1]).split(CHUNK) for part in parts]
-    angles = angle.double().expand(shape).reshape(-1).split(CHUNK)
-    found = [
-        _log_integral(one, left, right, falls, index)
-        for one, left, right, falls in zip(angles, *rows, strict=True)
-    ]
-    return torch.cat(found).reshape(shape) + log_height(frame.falls)
+    parts = [part.expand(*shape, part.shape[-1]).reshape(-1, part.shape[-1]) for part in parts]
+    angles = angle.double().expand(shape).reshape(-1)
+    bounds = torch.tensor(list(FEW.values()), dtype=torch.float64, device=angles.device)
+    kind = torch.bucketize(parts[2].amax(-1), bounds)  # NaN: the last
+    found = torch.empty_like(angles)
+    for number, count in enumerate([*FEW, None]):
+        for rows in (kind == number).nonzero()[:, 0].split(CHUNK // (count or MOST)):
+            chosen = (part[rows] for part in (angles, *parts))
+            found[rows] = _log_integral(*chosen, index, count)
+    return found.reshape(shape) + log_height(frame.falls)
 
 
-def _log_integral(angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int) -> Tensor:
-    """The integral over both other angles, without 1/k(λ)."""
+def _log_integral(
+    angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int, count: int | None
+) -> Tensor:
+    """The integral over both other angles, without 1/k(λ), by so many nodes; None: as many as it takes."""
     around = index == 1  # the azimuth is left to quadrature, otherwise the elevation
     log_density = _log_density(angle, left, right, falls, index)
     low, high = (-math.pi, math.pi) if around else (-math.pi / 2, math.pi / 2)
-    points, weights = quadrature.nodes(log_density, low, high, angle, periodic=around)
+    if count is None:
+        points, weights = quadrature.nodes(log_density, low, high, angle, periodic=around)
+    else:
+        plain = quadrature.equal if around else quadrature.gauss
+        points, weights = (part.to(angle.device) for part in plain(count, low, high))
     volume = torch.cos(angle[..., None] if around else points).abs() / (4 * math.pi)
     return torch.logsumexp(log_density(points) + torch.log(weights * volume), -1)
 

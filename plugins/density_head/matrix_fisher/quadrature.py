@@ -1,6 +1,7 @@
 """Integrals over one angle of functions with one or two peaks of any width, many at once."""
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import torch
@@ -80,6 +81,23 @@ def nodes(
     return torch.cat(points, -1), torch.cat(weights, -1)
 
 
+@cache
+def equal(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], Float[Tensor, "node"]]:
+    """Nodes and weights of the trapezium rule over one period."""
+    step = (high - low) / count
+    return low + step * torch.arange(count, dtype=torch.float64), torch.full(
+        (count,), step, dtype=torch.float64
+    )
+
+
+@cache
+def gauss(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], Float[Tensor, "node"]]:
+    """Nodes and weights of Gauss and Legendre."""
+    at, weights = np.polynomial.legendre.leggauss(count)
+    half = (high - low) / 2
+    return torch.from_numpy(low + half * (at + 1)), torch.from_numpy(half * weights)
+
+
 def maximum(
     log_density: Callable[[Tensor], Tensor], start: Float[Tensor, "*batch"], step: float
 ) -> Float[Tensor, "*batch"]:
@@ -117,9 +135,9 @@ def _half(length: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
     ]
     offsets, weights, start = [], [], torch.zeros_like(length)
     for count, end in zip(NODES, ends, strict=True):
-        at, weight = np.polynomial.legendre.leggauss(count)
-        y = start + (end - start) * torch.tensor((at + 1) / 2, device=length.device)
+        at, weight = (part.to(length.device) for part in gauss(count, 0.0, 1.0))
+        y = start + (end - start) * at
         offsets.append(width * torch.sinh(y))
-        weights.append((end - start) * torch.tensor(weight / 2, device=length.device) * width * torch.cosh(y))
+        weights.append((end - start) * weight * width * torch.cosh(y))
         start = end
     return torch.cat(offsets, -1), torch.cat(weights, -1)

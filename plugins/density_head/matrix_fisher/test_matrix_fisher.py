@@ -12,7 +12,7 @@ from framework.distributions.protocol import marginal, median, pick
 from framework.errors import ConfigError
 from framework.geometry.rotation import viewpoint_rotation
 from framework.target import Target
-from plugins.density_head.matrix_fisher import functions, quadrature, quaternions
+from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 from plugins.density_head.matrix_fisher.density import Angle, MatrixFisher
 from plugins.density_head.matrix_fisher.head import LARGEST_PARAMETER, parameter_of_raw
 from plugins.density_head.matrix_fisher.rows import TARGET, log_constant
@@ -260,6 +260,23 @@ def test_marginals_of_ridges_and_flat_directions_integrate_to_one(concentration,
             index != 1,
         )
         assert (weights * alone.log_prob(points[:, None]).exp()).sum().item() == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("index", [0, 1, 2])
+@pytest.mark.parametrize("count", angles.FEW)
+def test_few_nodes_do_up_to_their_bound(index, count, monkeypatch):
+    """At the bound itself, for peaks, ridges and flat directions, wherever they lie and far from them too."""
+    bound = angles.FEW[count]
+    falls = double([[1, 1, 1], [0.5, 1, 1], [0.01, 1, 1], [0.4, 0.6, 1], [0, 1, 1]]) * bound * (1 - 1e-9)
+    shapes = torch.diag_embed(falls.sum(-1, keepdim=True) / 4 - falls / 2)
+    rotations = torch.stack([random_rotations(len(shapes), seed) for seed in range(9)])
+    density = MatrixFisher(rotations @ shapes @ random_rotations(len(shapes), 10))
+    torch.testing.assert_close(density.frame.falls, falls.expand(9, -1, -1))
+    reach = math.pi / 2 - 0.02 if index == 1 else math.pi
+    places = torch.linspace(-reach, reach, 31).double()[:, None, None, None].expand(-1, 9, len(shapes), 1)
+    found = marginal(density, index).log_prob(places)
+    monkeypatch.setattr(angles, "FEW", {1500: 1e9})
+    torch.testing.assert_close(found, marginal(density, index).log_prob(places), rtol=0, atol=5e-12)
 
 
 @pytest.mark.parametrize("name", [*PARAMETERS, "concentrated", "ring"])
