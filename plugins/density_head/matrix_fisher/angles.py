@@ -41,8 +41,10 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
     found = torch.empty_like(angles)
     for number, count in enumerate([*FEW, None]):
         for rows in (kind == number).nonzero()[:, 0].split(CHUNK // (count or MOST)):
-            chosen = (part[rows] for part in (angles, *parts))
-            found[rows] = _log_integral(*chosen, index, count)
+            if len(rows) == 0:
+                continue
+            left, right, falls = (part[rows] for part in parts)
+            found[rows] = _log_integral(angles[rows], left, right, falls, index, count)
     return found.reshape(shape) + log_height(frame.falls)
 
 
