@@ -16,6 +16,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -299,6 +300,7 @@ def main() -> None:
             row[score], row[f"{score}_sem"] = compared(methods, {str(row["key"]): 1.0}, score)
     fingerprint = data.fingerprint()
     among_seeds = pooled(methods, "accuracy")
+    boosting = packages_distributions()["xgboost"] if "bps_xgboost" in methods else []
     known = (
         "No row has several: it is not in the errors."
         if math.isnan(among_seeds)
@@ -323,7 +325,7 @@ def main() -> None:
         "The column before the verdict is the distance from the bound, 0 or two points lost.\n\n"
         f"{claims(methods)}\n\n"
         f"{len(rows)} runs took {sum(row['seconds'] for row in rows) / 3600:.1f} hours of one core. "
-        f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *(['xgboost'] if 'bps_xgboost' in methods else []))}\n"
+        f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *boosting)}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
     sys.stdout.write(text)

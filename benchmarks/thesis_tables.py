@@ -8,7 +8,9 @@ where it was stopped. Each table's own script writes its page; thesis_tables.md 
 
 import argparse
 import json
+import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -196,17 +198,19 @@ def report() -> str:
         counted.update(own)
         spent = [took for sweep in own for took in seconds(FOLDER / sweep)]
         whole += sum(spent)
+        asked = sum(jobs(table.sweeps[sweep], table.seeds) for sweep in own)
         page = f"{table.script}.md"
         shown = f"[{page}]({page})" if HERE.with_name(page).exists() else page
         lines.append(
-            f"| {name} | {table.about} | {shown} | {len(spent) or 'not run'} | {sum(spent) / 60:.0f} |"
+            f"| {name} | {table.about} | {shown} | {len(spent)} of {asked} | {sum(spent) / 60:.0f} |"
         )
     return "\n".join(
         [
             "# The thesis's tables, run (synthetic data)",
             "",
             "Commands: `python benchmarks/thesis_tables.py --tell` prints them. Minutes: of all runs' clocks, each on "
-            "one core; pages take some minutes more. A table that was not run here has an older page, or none.",
+            "one core; pages take some minutes more. Each page says of which runs it is: of a table not yet run "
+            "whole, of some of these, or of older ones.",
             "",
             "| table | data | page | runs | minutes |",
             "|---|---|---|---:|---:|",
@@ -216,6 +220,12 @@ def report() -> str:
             "",
         ]
     )
+
+
+def jobs(words: Sequence[str], seeds: int) -> int:
+    """Of a multirun."""
+    choices = [len(re.findall(r"\[[^]]*\]|[^,]+", word.partition("=")[2])) for word in words]
+    return math.prod(choices) * (1 if any(word.startswith("seed=") for word in words) else seeds)
 
 
 def seconds(sweep: Path) -> Sequence[float]:
