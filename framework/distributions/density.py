@@ -11,6 +11,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular, circular, grid
 from framework.distributions.highest import crossings, highest
 from framework.distributions.panels import entropy_of_one, has_range
+from framework.distributions.picked import PickedMixture
 from framework.distributions.protocol import (
     Estimate,
     Normals,
@@ -101,11 +102,15 @@ class Mixture(Distribution):
         """Values (*sample, *batch, *event), split along the first dimension where all at once would fill the memory: a
         grid of angles on many samples of many components."""
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
-        components = max(1, self.log_weights.numel())
-        rows = max(1, min(CHUNK // components, LARGEST // (components * max(1, self.event_shape.numel()))))
-        if extra > 0 and value.shape[0] > rows and not torch.is_grad_enabled():
-            return value.split(rows)
+        if extra > 0 and value.shape[0] > self.rows and not torch.is_grad_enabled():
+            return value.split(self.rows)
         return [value]
+
+    @property
+    def rows(self) -> int:
+        """Values (*batch, *event) that are computed at once without gradient."""
+        components = max(1, self.log_weights.numel())
+        return max(1, min(CHUNK // components, LARGEST // (components * max(1, self.event_shape.numel()))))
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
@@ -317,47 +322,7 @@ def _(density: Mixture, value: Tensor) -> Slope | None:
 
 @pick.register
 def _(density: Mixture, index: Tensor) -> Distribution:
-    return _PickedMixture(density, index)
-
-
-class _PickedMixture(Distribution):
-    """Samples of one mixture each of a batch (*batch, K) of them: only what is drawn of the components is computed.
-
-    Args:
-        density: the mixtures.
-        index: (*sample, *batch), which of K.
-    """
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-
-    def __init__(self, density: Mixture, index: Tensor) -> None:
-        self.density = density
-        self.index = index
-        super().__init__(index.shape, density.event_shape, validate_args=False)
-
-    @torch.no_grad()
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        lead = (
-            torch.Size(sample_shape)
-            + self.index.shape[: self.index.dim() - len(self.density.batch_shape) + 1]
-        )
-        batch = self.density.batch_shape[:-1]
-        index = self.index.expand((*sample_shape, *self.index.shape)).reshape(lead.numel(), *batch)
-        items = max(1, self.density.batch_shape.numel())
-        rows = max(1, min(CHUNK // items, LARGEST // (items * max(1, self.event_shape.numel()))))
-        drawn = torch.cat([self._drawn(part) for part in index.split(rows)])
-        return drawn.reshape(*lead, *batch, *self.event_shape)
-
-    def _drawn(self, index: Tensor) -> Tensor:
-        """Of mixtures at `index` (sample, *batch)."""
-        weights = take(self.density.log_weights, index).exp()
-        count = weights.shape[-1]
-        which = torch.zeros_like(index)
-        if count > 1 and index.numel() > 0:  # torch.multinomial refuses to draw nothing
-            which = torch.multinomial(weights.reshape(-1, count), 1).reshape(index.shape)
-        # of every mixture the component that was drawn for the one that is meant; then that one
-        wide = which.unsqueeze(-1).expand(*index.shape, self.density.batch_shape[-1])
-        return pick(pick(self.density.components, wide), index).sample()
+    return PickedMixture(density.log_weights, density.components, index, density.rows)
 
 
 @peaks.register

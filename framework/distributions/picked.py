@@ -1,0 +1,48 @@
+"""Draws from mixtures that are components themselves: of each only what is drawn is computed."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+from framework.distributions.protocol import pick, take
+
+
+class PickedMixture(Distribution):
+    """Samples of one mixture each of a batch (*batch, K) of them; only `sample` is asked.
+
+    Args:
+        log_weights: (*batch, K, J), nats, normalised.
+        components: of the mixtures, batch_shape (*batch, K, J).
+        index: (*sample, *batch), which of K.
+        rows: samples that are drawn at once.
+    """
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, log_weights: Tensor, components: Distribution, index: Tensor, rows: int) -> None:
+        self.log_weights = log_weights
+        self.components = components
+        self.index = index
+        self.rows = rows
+        super().__init__(index.shape, components.event_shape, validate_args=False)
+
+    @torch.no_grad()
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        *batch, _, _ = self.log_weights.shape
+        lead = torch.Size(sample_shape) + self.index.shape[: self.index.dim() - len(batch)]
+        index = self.index.expand((*sample_shape, *self.index.shape)).reshape(lead.numel(), *batch)
+        drawn = torch.cat([self._drawn(part) for part in index.split(self.rows)])
+        return drawn.reshape(*lead, *batch, *self.event_shape)
+
+    def _drawn(self, index: Tensor) -> Tensor:
+        """Of mixtures at `index` (sample, *batch)."""
+        *_, mixtures, count = self.log_weights.shape
+        which = torch.zeros_like(index)
+        if count > 1 and index.numel() > 0:  # torch.multinomial refuses to draw nothing
+            weights = take(self.log_weights, index).exp()
+            which = torch.multinomial(weights.reshape(-1, count), 1).reshape(index.shape)
+        # of every mixture the component that was drawn for the one that is meant; then that one
+        wide = which.unsqueeze(-1).expand(*index.shape, mixtures)
+        return pick(pick(self.components, wide), index).sample()
