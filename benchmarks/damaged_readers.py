@@ -3,7 +3,7 @@
 import gzip
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -228,12 +228,16 @@ def lists(file: Path) -> object:
     return scan_layout.read_splits(file.parent)
 
 
+def beside(file: Path, sound: Mapping[str, bytes]) -> None:
+    """Write what belongs to a damaged file, by name, where it is not there yet."""
+    for name, content in sound.items():
+        if name != file.name and not file.with_name(name).exists():
+            file.with_name(name).write_bytes(content)
+
+
 def materials(file: Path) -> object:
     """An OBJ file with what it names, one of which is damaged."""
-    whole = {".obj": scenes.OBJ, ".mtl": scenes.MTL, ".png": image("PNG")}
-    for suffix, content in whole.items():
-        if suffix != file.suffix and not file.with_suffix(suffix).exists():
-            file.with_suffix(suffix).write_bytes(content)
+    beside(file, {"one.obj": scenes.OBJ, "one.mtl": scenes.MTL, "one.png": image("PNG")})
     return scene_files.read(file.with_suffix(".obj"))
 
 
@@ -333,14 +337,12 @@ def spectra() -> Iterator[Reader]:
 def nifti(file: Path) -> object:
     """A volume with its offsets and its mask, one of which is damaged."""
     found = whole.z_spectra()
-    content = {
+    sound = {
         "slice.nii": whole.nifti(found["spectra"]),
         "slice.offsets.txt": "\n".join(map(str, found["offsets"])).encode(),
         "slice.mask.nii.gz": gzip.compress(whole.nifti(found["mask"])),
     }
-    for name, sound in content.items():
-        if name != file.name and not file.with_name(name).exists():
-            file.with_name(name).write_bytes(sound)
+    beside(file, sound)
     return read_volume(file if file.name == "slice.nii.gz" else file.with_name("slice.nii"))
 
 

@@ -198,7 +198,7 @@ def report() -> str:
         counted.update(own)
         spent = [took for sweep in own for took in seconds(FOLDER / sweep)]
         whole += sum(spent)
-        asked = sum(jobs(table.sweeps[sweep], table.seeds) for sweep in own)
+        asked = sum(choices(table.sweeps[sweep], table.seeds) for sweep in own)
         page = f"{table.script}.md"
         shown = f"[{page}]({page})" if HERE.with_name(page).exists() else page
         lines.append(
@@ -222,10 +222,10 @@ def report() -> str:
     )
 
 
-def jobs(words: Sequence[str], seeds: int) -> int:
-    """Of a multirun."""
-    choices = [len(re.findall(r"\[[^]]*\]|[^,]+", word.partition("=")[2])) for word in words]
-    return math.prod(choices) * (1 if any(word.startswith("seed=") for word in words) else seeds)
+def choices(words: Sequence[str], seeds: int) -> int:
+    """How many runs a multirun has."""
+    of_each = [len(re.findall(r"\[[^]]*\]|[^,]+", word.partition("=")[2])) for word in words]
+    return math.prod(of_each) * (1 if any(word.startswith("seed=") for word in words) else seeds)
 
 
 def seconds(sweep: Path) -> Sequence[float]:

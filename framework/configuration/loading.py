@@ -32,7 +32,8 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
 
     `model(given)` is the density over the target, with batch_shape (batch,): of files, arrays, or what else the data
     set takes (`Data.inputs`); angles in radians, reals in their own unit, classes by their number in
-    `model.description.target.names`. Its other methods take inputs as the data set makes them.
+    `model.description.target.names`. Its other methods take inputs as the data set makes them. What is drawn (latent
+    variables, dropout, samples) comes from torch's global generator: `torch.manual_seed` before a call repeats it.
 
     Args:
         run_or_checkpoint: a run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.

@@ -15,9 +15,9 @@ CHUNK = 2**18
 FEW = {32: 19.0, 48: 54.0, 96: 236.0, 192: 368.0}
 """Nodes of a plain rule, and the largest of λ up to which they do: Σ λᵢqᵢ² is c₀ - κ cos(a - φ) in each angle, κ at
 most half the largest λ, whatever the other angles are. Of exp(κ cos) the trapezium rule of N nodes on the circle errs
-by 2 I_N(κ)/I₀(κ), here below 1e-15 of the integral, and Gauss and Legendre's on half of it, times cos e, by less than
-1e-12 (measured over φ). Beyond, nodes follow the peaks."""
-MOST = 224
+by 2 I_N(κ)/I₀(κ), here below 1e-15 of the integral; for Gauss and Legendre's on half of it the bounds were tried out
+(`test_few_nodes_do_up_to_their_bound`: 5e-12). Beyond, nodes follow the peaks."""
+MOST = 2 * quadrature.PEAKS * sum(quadrature.NODES)
 """Nodes there."""
 
 

@@ -192,9 +192,9 @@ def vectorises(member: Predictor) -> bool:
     """Whether members like this one can be computed side by side."""
     if not isinstance(member, Model) or isinstance(member.head, Fitted):
         return False
-    if (
-        next(network(member).parameters(), None) is None
-    ):  # the head reads what nobody learned: nothing to lay out
+    if not any(
+        True for _ in network(member).parameters()
+    ):  # the head learns all there is: nothing to lay out
         return False
     return all(encoder.vectorises for encoder in member.encoders)
 
