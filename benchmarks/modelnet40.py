@@ -133,6 +133,24 @@ CLAIMS: dict[str, tuple[Contrast, ...]] = {
     "3D convolutions are better than the plain network (§6.5.1)": (
         Contrast("distances, 32³", "+1.5", better("bps_conv3d", "bps_mlp_grid_32")),
     ),
+    "Vectors harm the plain network and help the convolutions (§6.5.1)": (
+        Contrast("plain: distances above vectors", "+1.8", better("bps_mlp", "bps_mlp_delta")),
+        Contrast("convolutions: vectors above distances", "+1.0", better("bps_conv3d_delta", "bps_conv3d")),
+    ),
+    "Turned copies of the training clouds help (§6.5.1)": (
+        Contrast("four instead of one", "+1.0, with a schedule", better("bps_mlp turned", "bps_mlp")),
+    ),
+    "PointNet's transforms help (Table 6.2)": (
+        Contrast("with and without", "+2.1", better("pointnet", "pointnet_vanilla")),
+    ),
+    "DeepSets is better than (Table 6.2)": (
+        Contrast("the plain network of 400 units", "+1.0", better("deepsets", "bps_mlp_400")),
+        Contrast("PointNet", "+0.7", better("deepsets", "pointnet")),
+        Contrast("itself with 100 points", "+8.0", better("deepsets", "deepsets_micro")),
+    ),
+    "Ten convolutional networks are better than one (Table 6.2)": (
+        Contrast("mean of their probabilities", "+0.8", better("bps_conv3d_ensemble", "bps_conv3d_unpadded")),
+    ),
 }
 
 
@@ -243,6 +261,8 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
         cut = config["encoder"].get("tdf", {}).get("truncation", 1.0)
         if cut != 1:
             method, key = f"{method}, cut off at {cut:g} cells", f"{key} {cut:g}"
+        if key == "bps_mlp" and config["data"]["rotations"] > 1:
+            method, key = f"{method}, {config['data']['rotations']} turns of each cloud", f"{key} turned"
         model = framework.load(path.parent)
         right, nll = on_test(model, clouds, labels)
         if abs(right.mean() - numbers["accuracy"]) > 2 / len(right):

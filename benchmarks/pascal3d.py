@@ -40,6 +40,8 @@ COLUMNS = {
     "parameters": "parameters",
 }
 
+PAIRS = (("scvae", "von_mises"),)
+"""Compared too, class by class."""
 THESIS = {
     "fixed_kappa": "−0.07 ± 0.15, 0.81, 12.6",
     "von_mises": "1.17 ± 0.07, 0.84, 10.7",
@@ -88,6 +90,14 @@ def over_classes(rows: list[dict[str, Any]]) -> str:
                 cell += f" ({gap.mean():+.{figures}f} ± {error:.{figures}f})"
             cells.append(cell)
         lines.append(f"| {method} | {' | '.join(cells)} | {THESIS.get(method, '–')} |")
+    for one, other in PAIRS:
+        if one in found and other in found:
+            gap = (found[one] - found[other])[:, 0]
+            error = gap.std(ddof=1) / len(gap) ** 0.5
+            lines += [
+                "",
+                f"{one} − {other}: {gap.mean():+.2f} ± {error:.2f} nats, above 0 in {(gap > 0).sum()} classes.",
+            ]
     return "\n".join(lines)
 
 

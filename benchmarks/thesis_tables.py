@@ -84,7 +84,9 @@ TABLES = {
                     *("vanilla_128", "vanilla_512", "temperature", "platt", "mc_dropout", "ensemble"),
                     *("outlier_exposure", "adversarial", "everything"),
                 ),
-            )
+            ),
+            "moons_rates": (methods("moons", "mc_dropout"), "encoder.mlp.dropout=0.1,0.3"),
+            "moons_both": (methods("moons", "ensemble"), "objective=[adversarial]"),
         },
         "moons",
     ),
@@ -129,6 +131,7 @@ TABLES = {
         "classes of generated CAD models",
         {
             "modelnet40_quick": (methods("modelnet40", *(name for name in MODELNET if name not in SLOW)),),
+            "modelnet40_turned": (methods("modelnet40", "bps_mlp"), "data.rotations=4"),
             "modelnet40_slow": (methods("modelnet40", *SLOW), "seed=0"),
         },
         "modelnet40",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.composition import (
     command_line,
@@ -154,6 +154,35 @@ def test_an_error_of_ours_is_not_taken_for_a_mistake() -> None:
 def test_what_a_replaced_choice_leaves_is_dropped() -> None:
     values = plain(composed("encoder=[mlp]", "+encoder.other.width=3"))
     assert list(values["encoder"]) == ["mlp"]
+
+
+SETS_ITS_HEAD = [
+    name
+    for name in EXPERIMENTS
+    if re.search("^density_head:", (folder() / f"experiment/{name}.yaml").read_text(encoding="utf-8"), re.M)
+]
+
+
+@pytest.mark.parametrize("head", ["von_mises", "mixture", "gaussian", "categorical", "bernoulli_image"])
+@pytest.mark.parametrize("name", SETS_ITS_HEAD)
+def test_what_an_experiment_sets_of_its_head_can_be_taken_out_for_another(name: str, head: str) -> None:
+    """Each key that the other head does not know is named, with the words that leave it out, and those do."""
+    from framework.configuration.assembly import resolve_all
+
+    words: list[str] = []
+    while True:
+        values = plain(composed(f"experiment={name}", f"density_head={head}", *words))
+        try:
+            resolve_all(values)
+        except ConfigError as error:
+            unknown = re.search(r"(density_head\.\S+): unknown key", str(error))
+            if unknown is None or OmegaConf.select(OmegaConf.create(values), unknown[1]) is None:
+                break  # Hydra deletes no null
+            found = re.search(r"(~density_head\.\S+) leaves out what an experiment sets", str(error))
+            assert found is not None and found[1] not in words, error
+            words.append(found[1])
+        else:
+            break
 
 
 def test_plural_groups_keep_their_order() -> None:

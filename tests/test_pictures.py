@@ -519,6 +519,33 @@ def test_odd_comparisons_are_drawn(rows: list[dict], tmp_path: Path) -> None:
     drawn(diagram(rows), tmp_path)
 
 
+@pytest.mark.parametrize("panels", [1, 2, 4])
+@pytest.mark.parametrize("times", [(1.19,), (1.19, 1.19), (1e-5, 1e6)])
+@pytest.mark.parametrize("error", [3.0, 0.0, -5.0, 1e-300])
+def test_a_result_alone_stands_in_the_middle_of_its_panels(
+    panels: int, times: tuple[float, ...], error: float, tmp_path: Path
+) -> None:
+    """As of a sweep over seeds alone."""
+    keys = [f"error {panel}" for panel in range(panels)]
+    rows = [{"method": "a", "class": "car", "ms": time} | dict.fromkeys(keys, error) for time in times]
+    figure = error_against_run_time(
+        rows,
+        dict(zip(keys, keys, strict=True)),
+        {},
+        title="",
+        synthetic=False,
+        machine="m",
+        time="ms",
+        group="class",
+    )
+    drawn(figure, tmp_path)
+    for axes in figure.axes[:panels]:
+        places = axes.transAxes.inverted().transform(
+            axes.transData.transform([(time, error) for time in times])
+        )
+        assert (places > 0.04).all() and (places < 0.96).all(), places
+
+
 def test_many_methods_and_classes_stay_apart(tmp_path: Path) -> None:
     rows = [
         {"method": f"method {m}", "class": f"class {c}", "error": 1.0 + m + c, "ms": 1.0 + m}

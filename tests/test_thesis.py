@@ -99,7 +99,11 @@ SAID = {
         "trainer.max_epochs": 505,
         "batch_size": 512,
         "data.validation_share": 0,
-        "encoder.voxnet.dropout": None,  # 0.8 and 0.6: PUBLISHED of the plugin
+        "encoder.voxnet.dropout": [0.8, 0.6],
+    },
+    **{
+        f"modelnet40/bps_conv3d{kind}": {"encoder.voxnet.dropout": [0.8, 0.6], "trainer.max_epochs": 505}
+        for kind in ("", "_delta", "_unpadded")
     },
     "cest/mlp": {
         "data.preset": "ten",

@@ -111,6 +111,7 @@ def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_on
     assert curve.code == 0, curve.out
     rows = (curve.folder / "work_precision.csv").read_text(encoding="utf-8").splitlines()
     assert [row.split(",")[1] for row in rows[1:]] == ["1", "2", "3"]
+    assert {row.split(",")[0] for row in rows[1:]} == {results(once)["method"]}
     assert (curve.folder / "figures" / "work_precision.png").is_file()
     wrong = framework(
         "mode=work_precision",
@@ -202,3 +203,17 @@ def test_a_mistake_on_the_command_line_is_said_before_training(framework: Framew
     assert done.code == 2, done.out
     assert "Take it out with `~`" in done.out
     assert "Traceback" not in done.out
+
+
+@pytest.mark.parametrize(
+    ("wrappers", "code"),
+    [("conformal", 1), ("ensemble,conformal", 1), ("conformal,temperature", 1), ("ensemble,temperature", 0)],
+)
+def test_too_small_a_validation_split_is_said_before_training(
+    wrappers: str, code: int, framework: Framework
+) -> None:
+    done = framework(*SMALL, "data.validation=1", f"uncertainty=[{wrappers}]", "pictures=false", folder="few")
+    assert done.code == code, done.out
+    if code:
+        assert "got one sample of it; wanted 2 or more" in done.out
+        assert "run folder" not in done.out and not (done.folder / "run.json").exists()

@@ -128,8 +128,11 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
         known = list(model.model_fields)
         if fault["type"] == "extra_forbidden":
             key = str(fault["loc"][-1])
+            # of another plugin that an experiment had chosen; Hydra deletes no key whose value is null
+            left = path and fault["input"] is not None and "[" not in where
+            advice = f" ~{where} leaves out what an experiment sets." if left else ""
             raise ConfigError(
-                f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {', '.join(known) or 'none'}."
+                f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {', '.join(known) or 'none'}.{advice}"
             ) from None
         if fault["type"] == "missing":
             raise ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.") from None

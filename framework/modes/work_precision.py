@@ -65,8 +65,7 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
         repeats=options.repeats,
         seed=settings.seed,
     )
-    name = " + ".join([parts["density_head"]["name"], *(part["name"] for part in parts["uncertainty"])])
-    found = rows({name: curve}, better, synthetic=data.synthetic)
+    found = rows({session.method: curve}, better, synthetic=data.synthetic)
     path = run.folder / "work_precision.csv"
     csv(found, None, path)
     run.tracker.log_artifact(path)

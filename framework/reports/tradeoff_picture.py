@@ -132,6 +132,8 @@ def _panel(
     spreads = [np.array([_spread(row, key) for row in rows]) for rows in kept]
     everything = np.concatenate([np.zeros((0, 2)), *places])
     errors, bars = everything[:, 1], np.concatenate([np.zeros(0), *spreads])
+    first, last = (everything[:, 0].min(), everything[:, 0].max()) if len(everything) else (1.0, 1.0)
+    axes.set_xlim(first / _room(first, last), last * _room(first, last))
     bottom = -math.inf
     if lower and (errors >= 0).all():
         ends = np.concatenate([np.maximum(errors - bars, errors / 2), errors + bars])
@@ -140,7 +142,7 @@ def _panel(
         if floor is not None and floor.height > 0:
             # a reference known to rounding must not stretch the panel over ten decades
             low, high = min(low, max(floor.height, low / 100)), max(high, floor.height)
-        room = (high / low) ** 0.1 if high > low else 2.0
+        room = _room(low, high)
         bottom = low / room
         axes.set(yscale="log", ylim=(bottom, high * room))
         if floor is not None and floor.height > bottom:
@@ -204,7 +206,12 @@ def _legends(
         handles = [
             Line2D([], [], marker=marker, color=GREY, ls="", label=kind) for kind, marker in kinds.items()
         ]
-        figure.legend(handles=handles, loc="outside right upper", title=group, **style)
+        figure.legend(handles=handles, loc="outside right center", title=group, **style)
+
+
+def _room(low: float, high: float) -> float:
+    """Beyond the ends of a logarithmic axis, as a factor; one number alone stands in the middle."""
+    return (high / low) ** 0.1 if high > low else 2.0
 
 
 def _plain_ticks(axis: Axis) -> None:

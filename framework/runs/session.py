@@ -5,6 +5,7 @@ import logging
 import platform
 import warnings
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,6 +53,8 @@ from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, told
 from framework.training.checkpoint import WholeCheckpoints
 
+FEW = 8
+"""Up to so many validation samples calibration is tried before training: some wrappers want more than one."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
@@ -220,11 +223,12 @@ def tested(session: Session) -> Session:
 
 @torch.no_grad()
 def rehearse(session: Session) -> None:
-    """Give every metric two predictions of the untrained model, so that one which cannot read them says so now; of a
-    model that predicts nothing before it is fitted, look whether the true images are there.
+    """Give every metric two predictions of the untrained model, so that one which cannot read them says so now, and the
+    wrappers a validation split that may be too small for them; of a model that predicts nothing before it is fitted,
+    look whether the true images are there.
 
     Raises:
-        UserError: what the metric says.
+        UserError: what the metric or the wrapper says.
     """
     fitted, reads = (
         bool(fitted_models(session.predictor)),
@@ -245,6 +249,10 @@ def rehearse(session: Session) -> None:
     prediction = Prediction(density, some, session.settings.samples)
     for metric in session.metrics:
         metric.clone().update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
+    if len(validation) <= FEW:  # type: ignore[arg-type]
+        whole = fetched(validation, range(len(validation)))  # type: ignore[arg-type]
+        with torch.enable_grad():
+            deepcopy(session.predictor).eval().calibrate([whole])
 
 
 def for_trained(config: Config, *, prepare: bool = True) -> Session:
