@@ -73,8 +73,8 @@ def test_every_claim_is_of_rows_of_the_tables_and_is_printed():
     runs = {key: method(ease < share[key]) for key in named}
     text = claims(runs)
     assert text.count("\n") == 1 + len(CLAIMS) + sum(map(len, CLAIMS.values()))
-    assert [line.rsplit("**", 2)[1] for line in text.splitlines() if "| **" in line] == [
-        "held", "held", "held", "contradicted"
-    ]  # fmt: skip
+    verdicts = [line.rsplit("**", 2)[1] for line in text.splitlines() if "| **" in line]
+    assert verdicts[:4] == ["held", "held", "held", "contradicted"]
+    assert set(verdicts[4:]) == {"open"}, "rows that are right of the same clouds"
     del runs["voxnet"]
     assert "not run: voxnet | | open" in claims(runs)
