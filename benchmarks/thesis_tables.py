@@ -58,6 +58,7 @@ class Table(NamedTuple):
         seeds: most that are run of each sweep that does not name its own.
         alone: whether there is one run.
         convolves: whether `--bfloat16` is for it.
+        also: further scripts, each with a page of the same runs.
     """
 
     about: str
@@ -66,6 +67,7 @@ class Table(NamedTuple):
     seeds: int = 5
     alone: bool = False
     convolves: bool = False
+    also: tuple[str, ...] = ()
 
 
 def methods(group: str, *names: str) -> str:
@@ -126,6 +128,7 @@ TABLES = {
         "pascal3d",
         seeds=3,
         convolves=True,
+        also=("azimuths",),
     ),
     "6.1-6.3": Table(
         "classes of generated CAD models",
@@ -172,7 +175,7 @@ def main() -> None:
 
 
 def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> list[list[str]]:
-    """Of a table: its sweeps, and the page at last."""
+    """Of a table: its sweeps, and its pages at last."""
     table = TABLES[name]
     drawn = "seed=" + ",".join(str(seed) for seed in range(min(seeds, table.seeds)))
     said = (BFLOAT16, *SAID) if bfloat16 and table.convolves else SAID
@@ -186,7 +189,8 @@ def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> list[list[str]
         for sweep, words in table.sweeps.items()
     ]
     folders = [folder_of(sweep) + ("/0" if table.alone else "") for sweep in table.sweeps]
-    return [*found, [sys.executable, f"benchmarks/{table.script}.py", *folders]]
+    pages = [[sys.executable, f"benchmarks/{script}.py", *folders] for script in (table.script, *table.also)]
+    return [*found, *pages]
 
 
 def folder_of(sweep: str) -> str:
@@ -202,8 +206,7 @@ def report() -> str:
         spent = [took for sweep in own for took in seconds(FOLDER / sweep)]
         whole += sum(spent)
         asked = sum(choices(table.sweeps[sweep], table.seeds) for sweep in own)
-        page = f"{table.script}.md"
-        shown = f"[{page}]({page})" if HERE.with_name(page).exists() else page
+        shown = ", ".join(link(f"{script}.md") for script in (table.script, *table.also))
         lines.append(
             f"| {name} | {table.about} | {shown} | {len(spent)} of {asked} | {sum(spent) / 60:.0f} |"
         )
@@ -223,6 +226,10 @@ def report() -> str:
             "",
         ]
     )
+
+
+def link(page: str) -> str:
+    return f"[{page}]({page})" if HERE.with_name(page).exists() else page
 
 
 def choices(words: Sequence[str], seeds: int) -> int:
