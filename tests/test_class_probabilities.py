@@ -1,3 +1,5 @@
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
@@ -6,11 +8,13 @@ from hypothesis import strategies as st
 from scipy import special
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
+from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.checks import refuse_nan
 from framework.distributions.class_probabilities import class_probabilities, require_labels
 from framework.distributions.density import Mixture
 from framework.errors import DataError, UserError
+from framework.target import Target
 
 
 def categorical(logits):
@@ -108,6 +112,32 @@ def test_probabilities_that_do_not_sum_to_one_are_refused():
         class_probabilities(Listed(log_prob))
     with pytest.raises(UserError, match="row 0 sums to 0"):
         class_probabilities(Listed(torch.full((2, 1), -torch.inf)))
+
+
+GENERIC = {
+    "mixture": {"components": 2},
+    "uniform_floor": {},
+    "cvae": {"samples": 2, "training_samples": 2},
+    "scvae": {"samples": 2, "training_samples": 2},
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "chain", [chain for depth in (1, 2) for chain in product(GENERIC, repeat=depth)], ids="-".join
+)
+def test_few_draws_leave_probabilities_that_sum_to_one(chain, dtype):
+    config = {"name": "categorical"}
+    for name in reversed(chain):
+        config = {"name": name, **GENERIC[name], "component": config}
+    head = build("density_head", resolve("density_head", config), target=Target("class", ("a", "b", "c")))
+    torch.manual_seed(0)
+    # far from what is drawn every class may be so unlikely that its probability is no float64
+    raw = 3 * torch.randn(20, head.size, dtype=dtype)
+    with torch.no_grad():
+        found = class_probabilities(head.to(dtype)(raw))
+    assert found.shape == (20, 3) and (found >= 0).all()
+    np.testing.assert_allclose(found.sum(-1), 1, rtol=0, atol=1e-15)
 
 
 def test_labels_that_are_no_class_are_refused():

@@ -1,6 +1,8 @@
 """A trained model after its run: it takes what its user has, of each kind of data, when the training data are gone."""
 
 import base64
+import copy
+import pickle
 import shutil
 from functools import partial
 from importlib import import_module
@@ -13,10 +15,11 @@ import torch
 
 import framework as package
 from framework.configuration.assembly import build_predictor
+from framework.configuration.loading import find_checkpoint
 from framework.configuration.schema import resolve
 from framework.deployment.frozen import Frozen
 from framework.deployment.served import _load_pyfunc
-from framework.errors import DataError
+from framework.errors import CheckpointError, DataError
 from framework.geometry.meshes import read
 from framework.model import Predictor, fitted_models
 from framework.target import Target
@@ -89,6 +92,12 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
         torch.testing.assert_close(twin.mode, one.mode, rtol=1e-5, atol=1e-5)
         assert bool(torch.isfinite(twin.log_prob(here)).all())
         assert bool(torch.isfinite(one.log_prob(here)).all())
+    for copied in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+        torch.testing.assert_close(copied(str(files[0])).mode, density[0].mode, rtol=0, atol=0)
+        assert copied.double()(str(files[0])).log_prob(density[0].sample()).dtype == torch.float64
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(frozen))(files[0]), frozen(files[0]))
+    with pytest.raises(CheckpointError, match="asked of a Model; wanted a run folder"):
+        find_checkpoint(model)
     if kind == "registration":
         follows_the_scan(model, frozen, files[0], lines)
 

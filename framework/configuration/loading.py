@@ -44,29 +44,42 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     """
     predictor, description = load_with_description(run_or_checkpoint, uri=uri)
     predictor.description = description
-    data = reader(description)
-
-    frames = WeakTensorKeyDictionary()  # of the inputs that are being predicted for
-
-    def ready(model: nn.Module, given: tuple[Any]) -> Tensor:
-        batch = asked_of(predictor, data, *given)
-        frames[batch["input"]] = data.frame(batch)
-        return batch["input"]
-
-    def answered(model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
-        frame: Frame | None = frames.pop(inputs[0])
-        return density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
-
-    predictor.register_forward_pre_hook(ready)
-    predictor.register_forward_hook(answered)
+    user = User(reader(description))
+    predictor.register_forward_pre_hook(user.asks)
+    predictor.register_forward_hook(user.hears)
     return predictor
 
 
-def asked_of(predictor: Predictor, data: Data, given: Any) -> Batch:
-    """What a predictor reads, of what a user gives; errors as `Data.asked`."""
+class User:
+    """What a loaded model takes and answers, as its hooks: methods of an object, so that the model can be copied,
+    pickled and sent to another process with them.
+
+    Args:
+        data: the data set of the model; it makes inputs of what is given, and knows the unit of the answer.
+    """
+
+    def __init__(self, data: Data) -> None:
+        self.data = data
+        self.frames = WeakTensorKeyDictionary()  # of the inputs that are being predicted for
+
+    def asks(self, model: nn.Module, given: tuple[Any]) -> Tensor:
+        batch = asked_of(model, self.data, *given)
+        self.frames[batch["input"]] = self.data.frame(batch)
+        return batch["input"]
+
+    def hears(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
+        frame: Frame | None = self.frames.pop(inputs[0])
+        return density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
+
+    def __reduce__(self) -> tuple[type["User"], tuple[Data]]:
+        return User, (self.data,)  # weak references cannot be pickled, and no call is under way in the copy
+
+
+def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
+    """What a model reads, of what a user gives; errors as `Data.asked`."""
     batch = data.asked(given)
     inputs = batch["input"]
-    own = next(predictor.parameters(), inputs)
+    own = next(model.parameters(), inputs)
     # bytes are pixels, which encoders scale; any other number is one of the model's own type
     kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
     return {**batch, "input": inputs.to(own.device, kind)}
@@ -145,12 +158,17 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
     predictor.load_state_dict(dict(state))
 
 
-def find_checkpoint(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Path:
+def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Path:
     """The file meant by a run folder, a file or an MLflow run id.
 
     Raises:
-        CheckpointError: nothing is there.
+        CheckpointError: nothing is there, or it is no path or name.
     """
+    if not isinstance(run_or_checkpoint, (str, Path)):
+        raise CheckpointError(
+            f"A trained model was asked of a {type(run_or_checkpoint).__name__}; wanted a run folder, a checkpoint "
+            "file or an MLflow run id. Give what the model was loaded from."
+        )
     path = Path(run_or_checkpoint).expanduser()
     if path.is_file():
         return path

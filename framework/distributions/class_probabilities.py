@@ -1,10 +1,13 @@
 """Class probabilities of any density over classes, and labels that fit them: what metrics of classes share."""
 
+import math
+
 from jaxtyping import Float64, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.checks import refuse_nan
+from framework.distributions.protocol import estimate
 from framework.errors import DataError, UserError
 
 LARGEST_DEFECT = 0.01
@@ -15,14 +18,15 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
     """p(y = k) of each sample, in [0, 1], each row with sum 1 to float64.
 
     exp of log_prob at each class, in float64, over their sum: a float32 log_prob leaves sums of 1 ± 1e-7 (± 1e-3 where
-    logits reach 1e4), and a mixture's largest probability may exceed 1 by as much.
+    logits reach 1e4), and a mixture's largest probability may exceed 1 by as much. Where log_prob is estimated from
+    draws (`estimate`), class by class, the sum is as far from 1 as chance has it.
 
     Args:
         density: over classes, with batch_shape (batch,): `enumerate_support` lists them, class k the k-th.
 
     Raises:
-        UserError: a density that does not list its values, a probability that is NaN, or a sum that is not 1 within
-            1 %.
+        UserError: a density that does not list its values, a probability that is NaN, a sum that is not 1 within 1 %
+            though nothing is drawn, or is 0.
     """
     if not density.has_enumerate_support or tuple(density.event_shape):
         raise UserError(
@@ -30,16 +34,18 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
             f"{tuple(density.event_shape)}, which does not list classes; wanted a density over classes, such as "
             "density_head=categorical predicts. Leave out the metric that reads them, or choose such a head."
         )
-    probability = density.log_prob(density.enumerate_support()).double().exp().T
-    total = refuse_nan(probability.sum(-1), "predicted distributions over classes")
-    wrong = ~((total - 1).abs() < LARGEST_DEFECT)
+    found = estimate(density, density.enumerate_support())
+    log_prob = found.log_mean.double().T
+    total = refuse_nan(log_prob.exp().sum(-1), "predicted distributions over classes")
+    drawn = (found.samples > 0).any(0) & (log_prob > -math.inf).any(-1)
+    wrong = ~((total - 1).abs() < LARGEST_DEFECT) & ~drawn
     if wrong.any():
         raise UserError(
             f"{int(wrong.sum())} of {len(total)} predicted distributions over classes do not sum to 1: that of row "
             f"{int(wrong.nonzero()[0])} sums to {total[wrong][0].item():.6g}. Mend log_prob of the density head or "
             "wrapper that predicts them (`mode=check`)."
         )
-    return probability / total.unsqueeze(-1)
+    return log_prob.softmax(-1)
 
 
 def require_labels(target: Int[Tensor, "batch"], classes: int) -> Int[Tensor, "batch"]:
