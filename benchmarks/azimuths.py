@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.jobs import processor_seconds, record
 from benchmarks.machine import machine
 from framework.configuration.assembly import build_data
 from framework.configuration.loading import load_with_description
@@ -150,8 +151,7 @@ def main() -> None:
     runs = 0
     for path in sorted(path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")):
         row = json.loads(path.read_text(encoding="utf-8"))
-        job = json.loads(path.with_name("job.json").read_text(encoding="utf-8"))
-        minutes[row["method"]].setdefault(row["data"], []).append((job["ended"] - job["started"]) / 60)
+        minutes[row["method"]].setdefault(row["data"], []).append(processor_seconds(record(path.parent)) / 60)
         answers = of_run(path.parent, loaders)
         if answers is not None:
             values = [question(answers) for question in QUESTIONS.values()]
@@ -159,7 +159,7 @@ def main() -> None:
             runs += 1
     classes = sorted(set.intersection(*(set(each) for each in found.values() if each)))
     lines = [
-        f"| method | classes | {' | '.join(QUESTIONS)} | minutes a run, all classes |",
+        f"| method | classes | {' | '.join(QUESTIONS)} | processor minutes a run, all classes |",
         "|---|---:|" + "---:|" * (len(QUESTIONS) + 1),
     ]
     for method, each in found.items():
@@ -170,8 +170,8 @@ def main() -> None:
         f"The models of [pascal3d.md](pascal3d.md) on the test images of the classes without symmetry; a quarter of "
         "the images is blurred. Means over classes, each the mean of its seeds, ± the standard error over classes; "
         f"{len(classes)} classes have every method. The median has the least expected deviation of {SAMPLES} draws "
-        "(eq. 3.24). Turned round: an error above 135°; sure of it: nine tenths of the mass within 45° of the point. "
-        "Minutes by the clock of one core, some beside other work.\n\n" + "\n".join(lines) + "\n\n"
+        "(eq. 3.24). Turned round: an error above 135°; sure of it: nine tenths of the mass within 45° of the "
+        "point.\n\n" + "\n".join(lines) + "\n\n"
         f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")

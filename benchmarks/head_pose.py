@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.jobs import processor_seconds, record
 from benchmarks.machine import machine
 from framework.reports.table import Better, aggregate, markdown
 
@@ -33,7 +34,7 @@ COLUMNS = {
     "maad_deg": "MAAD °",
     "log_likelihood": "log-likelihood (nats)",
     "milliseconds_per_sample": "ms / image",
-    "minutes": "minutes a run",
+    "minutes": "processor minutes a run",
     "thesis": "thesis: MAAD °, log-likelihood (its own data)",
 }
 BETTER: Better = {"maad_deg": "lower", "log_likelihood": "higher"}
@@ -62,7 +63,7 @@ def results(folders: list[Path]) -> list[dict[str, Any]]:
     rows = []
     for path in (path for folder in folders for path in folder.glob("*/results.json")):
         found = json.loads(path.read_text(encoding="utf-8"))
-        job = json.loads((path.parent / "job.json").read_text(encoding="utf-8"))
+        job = record(path.parent)
         data, _, method = found["experiment"].partition("/")
         if "density_head.backbones=each" in job["overrides"]:
             method += "_each"
@@ -71,7 +72,7 @@ def results(folders: list[Path]) -> list[dict[str, Any]]:
         precision = [word.partition("=")[2] for word in job["overrides"] if "precision" in word] or [
             "32-true"
         ]
-        minutes = (job["ended"] - job["started"]) / 60
+        minutes = processor_seconds(job) / 60
         told = {"data": data, "angle": angle, "method": method, "minutes": minutes, "precision": precision[0]}
         rows.append(found | told)
     order, places = list(METHODS), [key[:2] for key in THESIS]
@@ -118,8 +119,8 @@ def main() -> None:
         "# Tables 3.1 and 3.2: head poses (synthetic data)\n\n"
         "Generated heads in the layouts of IDIAP, CAVIAR and TownCentre; a model for each angle, trained with "
         f"{' or '.join(sorted({row['precision'] for row in rows}))}. "
-        "± is the standard deviation over seeds, of one seed the standard error over test images; minutes by the "
-        "clock, beside other runs. The thesis's numbers are of the real sets, with standard errors over "
+        "± is the standard deviation over seeds, of one seed the standard error over test images; milliseconds "
+        "beside other runs. The thesis's numbers are of the real sets, with standard errors over "
         "test images: orderings compare, numbers do not. Command: `python benchmarks/thesis_tables.py 3.1-3.2`.\n\n"
         f"{chr(10).join(tables)}\n"
         "## Against one concentration\n\n"

@@ -28,6 +28,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
+from benchmarks.jobs import processor_seconds, record
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
@@ -73,7 +74,7 @@ COLUMNS = {
     "megabytes": "checkpoint, MB",
     "one_ms": "ms, batch of 1",
     "many_ms": "ms / cloud, 256",
-    "seconds": "whole run, s",
+    "seconds": "whole run, processor s",
     "epochs": "epochs",
     "n": "seeds",
     "thesis": "thesis: accuracy (ModelNet40), FLOPs, parameters",
@@ -250,7 +251,6 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
     rows = []
     for path in sorted(sweep.glob("*/results.json")):
         numbers = json.loads(path.read_text(encoding="utf-8"))
-        job = json.loads((path.parent / "job.json").read_text(encoding="utf-8"))
         config = yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8"))
         key = numbers["experiment"].rpartition("/")[2]
         table, method, *thesis = ROWS[key]
@@ -288,7 +288,7 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
             }
             | {"one_ms": 1e3 * one, "many_ms": 1e3 * many / len(some)}
             | {"megabytes": (path.parent / "checkpoints" / "model.ckpt").stat().st_size / 1e6}
-            | {"seconds": job["ended"] - job["started"], "synthetic": numbers["synthetic"]}
+            | {"seconds": processor_seconds(record(path.parent)), "synthetic": numbers["synthetic"]}
             | {"epochs": "at once" if fitted else str(config["trainer"]["max_epochs"])}
         )
     return rows

@@ -21,6 +21,7 @@ from matplotlib.image import imread
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
+from benchmarks.jobs import processor_seconds, record
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
@@ -58,7 +59,7 @@ COLUMNS = {
     "ood_entropy": "OOD entropy",
     "auroc": "AUROC",
     "milliseconds_per_sample": "ms / sample",
-    "seconds": "whole run, s",
+    "seconds": "whole run, processor s",
     "n": "seeds",
 }
 BETTER: Better = {
@@ -106,14 +107,13 @@ def results(sweeps: list[Path]) -> list[dict[str, Any]]:
     rows = []
     for path in sorted(path for sweep in sweeps for path in sweep.glob("*/results.json")):
         found = json.loads(path.read_text(encoding="utf-8"))
-        job = json.loads((path.parent / "job.json").read_text(encoding="utf-8"))
         key = variant(
             yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8")), found["experiment"]
         )
         kept = {name: found[name] for name in COLUMNS if name in found}
         rows.append(
             {**kept, "key": key, "method": METHODS[key], "seed": found["seed"], "folder": str(path.parent)}
-            | {"seconds": job["ended"] - job["started"], "synthetic": found["synthetic"]}
+            | {"seconds": processor_seconds(record(path.parent)), "synthetic": found["synthetic"]}
         )
     order = list(METHODS)
     return sorted(rows, key=lambda row: (order.index(row["key"]), row["seed"]))
@@ -275,7 +275,7 @@ def main() -> None:
     seeds = sorted({row["seed"] for row in rows})
     text = (
         "# Table 2.1: uncertainty on the two moons (synthetic data)\n\n"
-        f"{len(rows)} runs, {took:.0f} minutes of their clocks on a core each: "
+        f"{len(rows)} runs, {took:.0f} processor minutes: "
         "`python benchmarks/thesis_tables.py 2.1`. "
         "A seed draws data and weights; all methods of a seed have the same data, 5000 test points. ± is the standard "
         "deviation over seeds. Run times on one thread, in batches of 100, each "

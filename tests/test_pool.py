@@ -78,6 +78,11 @@ elif what == "exit":
     sys.exit(7)
 elif what == "kill" or what == "once" and tries == 1:
     os.kill(os.getpid(), signal.SIGKILL)
+elif what == "work" or what == "work_once":
+    while time.process_time() < 0.5:
+        pass
+    if what == "work_once" and tries == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
 elif what == "environment":
     (folder / "environment.json").write_text(json.dumps(dict(os.environ)))
 elif what == "meet":
@@ -250,6 +255,27 @@ def test_a_job_that_was_killed_is_started_again_when_asked(app: App) -> None:
     assert code == 1
     assert [app.tries(number) for number in range(3)] == [2, 2, 1]
     assert [app.record(number)["status"] for number in range(3)] == ["completed", "died", "failed"]
+
+
+def test_the_processor_time_of_all_tries_is_recorded(app: App) -> None:
+    assert app("what=ok,work,work_once", "hydra.launcher.retries=1", "hydra.launcher.jobs=3")[0] == 0
+    idle, once, twice = (app.record(number)["processor_seconds"] for number in range(3))
+    assert 0 < idle < 0.5 <= once < 1 <= twice
+
+
+def test_processor_time_is_not_known_where_the_sweep_was_killed_or_the_config_changed(app: App) -> None:
+    process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=1")
+    app.until_ready(0)
+    process.kill()
+    process.wait()
+    (app.folder / "release").touch()
+    assert app("what=hold", "x=0,1", "hydra.launcher.jobs=1")[0] == 0
+    assert app.record(0)["processor_seconds"] is None
+    assert app.record(1)["processor_seconds"] > 0
+    config = app.folder / "conf" / "config.yaml"
+    config.write_text(config.read_text().replace("value: 1", "value: 2"))
+    assert app("what=hold", "x=0,1", "hydra.launcher.jobs=1")[0] == 0
+    assert app.record(0)["processor_seconds"] > 0
 
 
 def test_as_many_at_once_as_asked_for(app: App) -> None:

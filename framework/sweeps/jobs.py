@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -37,8 +38,9 @@ class Job:
     """One job of a sweep.
 
     Its record, job.json, holds number, overrides, key and config as here, command, pid, tries, started and
-    ended (seconds since 1970), error and status: "queued", "running", "completed", "failed" (it exited with
-    an error) or "died" (it was killed, or stopped by a signal).
+    ended (seconds since 1970; of the last try), processor_seconds (of all tries, all threads and processes of the
+    job; null where the sweep itself was killed in one of them), error and status: "queued", "running", "completed",
+    "failed" (it exited with an error) or "died" (it was killed, or stopped by a signal).
 
     Attributes:
         key: hash of the overrides: which job of the sweep it is.
@@ -162,9 +164,12 @@ def run(
                 else:
                     slot = min(set(range(at_once)) - {one.slot for one in running})
                     running.append(_start(job, slot, lock, _environment(at_once, slot, devices, parent)))
-            for one in [one for one in running if one.process.poll() is not None]:
+            for one in list(running):
+                spent = _processor_seconds()
+                if one.process.poll() is None:
+                    continue
                 running.remove(one)
-                _end(one)
+                _end(one, _processor_seconds() - spent)
                 if parent is not None:
                     sending.submit(_sync, one.job.folder)
                 if one.job.record["status"] == "died" and one.job.attempts <= retries and not received:
@@ -220,12 +225,26 @@ def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | 
     return environment
 
 
+def _processor_seconds() -> float:
+    """Of the children that were waited for, and theirs."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def _spent(record: Mapping[str, Any], config: str) -> float | None:
+    """Processor seconds of the tries that this one continues; None where nobody saw one of them end."""
+    if record.get("config") != config:
+        return 0.0
+    return None if record.get("ended") is None else record.get("processor_seconds")
+
+
 def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str]) -> _Running:
     job.attempts += 1
     (job.folder / VALUE).unlink(missing_ok=True)
     job.update(
         status="running",
         tries=job.record.get("tries", 0) + 1,
+        processor_seconds=_spent(job.record, job.config),
         config=job.config,
         command=[*COMMAND, *job.arguments],
         started=time.time(),
@@ -249,7 +268,12 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str]) -> _R
     return _Running(job, process, slot, lock)
 
 
-def _end(one: _Running) -> None:
+def _end(one: _Running, seconds: float) -> None:
+    """Record how a job ended.
+
+    Args:
+        seconds: processor time of this try.
+    """
     code = one.process.returncode
     job = one.job
     with suppress(ProcessLookupError):  # what a killed job left behind: data loaders, the other ranks
@@ -264,11 +288,12 @@ def _end(one: _Running) -> None:
         status, error = "died", f"stopped by {signal.Signals(code - 128).name}"
     else:
         status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
-    job.update(status=status, error=error, ended=time.time())
+    before = job.record["processor_seconds"]
+    spent = None if before is None else before + seconds
+    job.update(status=status, error=error, ended=time.time(), processor_seconds=spent)
     os.close(one.lock)
-    seconds = job.record["ended"] - job.record["started"]
     log.info(
-        f"#{job.number} {status} after {seconds:.1f} s"
+        f"#{job.number} {status} after {job.record['ended'] - job.record['started']:.1f} s"
         + (f": {error} ({job.folder / CONSOLE})" if error else "")
     )
 

@@ -53,23 +53,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("root", nargs="?", help="the folder that holds FAUST's `test`; none: generated")
     parser.add_argument("--out", type=Path, default=Path("outputs/faust"), help="default: outputs/faust")
     given = parser.parse_args(arguments)
-    predictor, description = load_with_description(given.checkpoint)
-    part = description.config["data"]
-    if part["name"] not in ("registration", "faust"):
-        raise ConfigError(
-            f"{given.checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration` or "
-            "`faust`, whose target is a mesh."
-        )
-    data: Data = build("data", resolve("data", part))
-    folder = people_root(part.get("body")) if given.root is None else Path(given.root).expanduser()
+    registered, generated = model(given.checkpoint)
+    folder = generated() if given.root is None else Path(given.root).expanduser()
     marked = "" if read_mark(folder) is None else " (synthetic)"
-
-    @torch.no_grad()
-    def registered(scan: Path) -> np.ndarray:
-        batch = data.asked(scan)
-        local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
-        return denormalised(local, batch["centre"], batch["scale"])[0].float().numpy()
-
     for challenge in CHALLENGES:
         found = answered(registered, folder, challenge, given.out)
         error = "not available, FAUST keeps its registrations to itself"
@@ -78,6 +64,33 @@ def main(arguments: list[str]) -> None:
                 f"{np.mean(found.error_cm):.2f} cm, of the worst pair {max(found.error_cm):.2f} cm{marked}"
             )
         sys.stdout.write(f"{challenge}: {found.pairs} pairs in {found.file}; error {error}\n")
+
+
+def model(
+    checkpoint: str,
+) -> tuple[Callable[[Path], Float[np.ndarray, "vertex 3"]], Callable[[], Path]]:
+    """A trained model as two functions: a scan's file to the vertices registered to it, metres; and the root of
+    people in FAUST's layout who are generated (once) of the body that the model knows.
+
+    Raises:
+        ConfigError: a checkpoint of another data set.
+    """
+    predictor, description = load_with_description(checkpoint)
+    part = description.config["data"]
+    if part["name"] not in ("registration", "faust"):
+        raise ConfigError(
+            f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration` or `faust`, "
+            "whose target is a mesh."
+        )
+    data: Data = build("data", resolve("data", part))
+
+    @torch.no_grad()
+    def registered(scan: Path) -> np.ndarray:
+        batch = data.asked(scan)
+        local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
+        return denormalised(local, batch["centre"], batch["scale"])[0].float().numpy()
+
+    return registered, lambda: people_root(part.get("body"))
 
 
 def answered(
