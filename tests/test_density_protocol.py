@@ -296,11 +296,9 @@ def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> No
         flat = Reshaped(density, (density.batch_shape.numel(),))
         every = torch.arange(len(made.target.names)).unsqueeze(1).expand(-1, *flat.batch_shape)
         labels = torch.stack([flat.log_prob(label).exp() for label in every], -1)
-        if (labels.sum(-1) - 1).abs().max() < 1e-6:  # a bound is refused
-            close(class_probabilities(flat), labels / labels.sum(-1, keepdim=True))
-        else:
-            with pytest.raises(UserError, match="do not sum to 1"):
-                class_probabilities(flat)
+        # of few draws, or of a bound, it may be far from 1
+        assert (labels.sum(-1) - 1).abs().max() < 1e-6 or found.samples.gt(0).any()
+        close(class_probabilities(flat), labels / labels.sum(-1, keepdim=True))
         warm = temper(density, WARM)
         if not sampled(made) and kind != "stacked":
             power = torch.stack(
