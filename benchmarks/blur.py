@@ -44,9 +44,14 @@ UNIFORM = -math.log(2 * math.pi)
 CUT = -3.0
 """Nats: below, the axis of the curves is compressed."""
 DEVIATIONS = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
-"""Of the Gaussian, pixels of the 75-pixel crop."""
+"""Of the Gaussian, in pixels of a crop of SIDE; images of another size are blurred by the same share of theirs."""
+SIDE = 75
 IMAGES = 1000
 COLUMNS = {"method": "method", "n": "seeds"} | {f"blur_{d:g}": f"σ = {d:g}" for d in DEVIATIONS}
+
+
+def seen(images: torch.Tensor, deviation: float) -> torch.Tensor:
+    return blurred(images, deviation * images.shape[-1] / SIDE)
 
 
 @torch.no_grad()
@@ -56,7 +61,7 @@ def log_likelihoods(model: Predictor, images: torch.Tensor, pan: torch.Tensor) -
     for deviation in DEVIATIONS:
         torch.manual_seed(0)
         parts = [
-            marginal(model(blurred(some, deviation)), 0).log_prob(angle)
+            marginal(model(seen(some, deviation)), 0).log_prob(angle)
             for some, angle in zip(images.split(100), pan.split(100), strict=True)
         ]
         found[f"blur_{deviation:g}"] = torch.cat(parts).double().mean().item()
@@ -108,7 +113,7 @@ def curves(rows: list[dict[str, object]], path: Path) -> None:
         f"mean of {len(seeds)} seeds, band: standard deviation" if len(seeds) > 1 else "one seed, so no band"
     )
     upper.set_title(f"{several}; the axis is compressed below {CUT:g}".replace("-", "−"), fontsize=9)
-    lower.set_xlabel("standard deviation of the Gaussian blur (pixels of 75)")
+    lower.set_xlabel(f"standard deviation of the Gaussian blur (pixels of {SIDE})")
     figure.supylabel("mean log-likelihood of the pan angle (nats)", fontsize=10)
     upper.legend(fontsize=9, frameon=False)
     saved(figure, path.with_suffix(""), True)
@@ -138,14 +143,14 @@ def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: P
     )
     grid = figure.subplots(2, len(shown), height_ratios=(1, 1.2))
     for column, deviation in enumerate(shown):
-        seen = blurred(image, deviation)
-        grid[0, column].imshow(picture(seen))
+        one = seen(image, deviation)
+        grid[0, column].imshow(picture(one))
         grid[0, column].set_axis_off()
         grid[0, column].set_title(f"blur of {deviation:g} px")
         axes = grid[1, column]
         for name, model in models.items():
             torch.manual_seed(0)
-            angles, log_density = circular_grid(marginal(model(seen[None]), 0))
+            angles, log_density = circular_grid(marginal(model(one[None]), 0))
             colour = COLOURS[list(METHODS).index(name)]
             axes.plot(
                 angles.rad2deg(), log_density[:, 0].exp(), color=colour, label=METHODS[name], linewidth=1.2
@@ -205,7 +210,8 @@ def main(sweeps: list[Path], root: str | None) -> None:
     named = [{**row, "method": METHODS[method(row)]} for row in compared(rows)]
     text = (
         f"# Log-likelihood of the pan under Gaussian blur: {label}\n\n"
-        f"Nats, {len(fields['target'])} test images at 75 pixels, models trained without blur; ± is the standard "
+        f"Nats, {len(fields['target'])} test images of {fields['input'].shape[-1]} pixels, models trained "
+        f"without blur, whose deviations are in pixels of {SIDE}; ± is the standard "
         f"deviation over seeds. The uniform density has {UNIFORM:.2f}. Commands in `blur.py`, pictures "
         f"`blur.png` (Figure 3.7) and `blur_strip.png` (Figure 3.8).\n\n{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.jobs import processor_seconds, record
+from benchmarks.jobs import processor_seconds, record, settings
 from benchmarks.machine import machine
 from framework.reports.table import Better, aggregate, markdown
 
@@ -69,12 +69,8 @@ def results(folders: list[Path]) -> list[dict[str, Any]]:
             method += "_each"
         angles = [word for word in job["overrides"] if word.startswith("data.angles=")]
         angle = angles[0].partition("=")[2].strip("[]") if angles else "pan"
-        precision = [word.partition("=")[2] for word in job["overrides"] if "precision" in word] or [
-            "32-true"
-        ]
         minutes = processor_seconds(job) / 60
-        told = {"data": data, "angle": angle, "method": method, "minutes": minutes, "precision": precision[0]}
-        rows.append(found | told)
+        rows.append(found | {"data": data, "angle": angle, "method": method, "minutes": minutes})
     order, places = list(METHODS), [key[:2] for key in THESIS]
     return sorted(
         rows,
@@ -107,7 +103,12 @@ def differences(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    rows = results([Path(folder) for folder in sys.argv[1:]])
+    folders = [Path(folder) for folder in sys.argv[1:]]
+    rows = results(folders)
+    size, epochs, batch, precision = settings(
+        [path.parent for folder in folders for path in folder.glob("*/results.json")],
+        *("data.image_size", "trainer.max_epochs", "batch_size", "trainer.precision"),
+    )
     tables = []
     for _, group in groupby(rows, key=lambda row: (row["data"], row["angle"])):
         compared = aggregate(list(group), by=["data", "angle", "method"])
@@ -117,8 +118,8 @@ def main() -> None:
         tables.append(markdown(compared, COLUMNS, better=BETTER))
     text = (
         "# Tables 3.1 and 3.2: head poses (synthetic data)\n\n"
-        "Generated heads in the layouts of IDIAP, CAVIAR and TownCentre; a model for each angle, trained with "
-        f"{' or '.join(sorted({row['precision'] for row in rows}))}. "
+        "Generated heads in the layouts of IDIAP, CAVIAR and TownCentre; a model for each angle: images of "
+        f"{size} pixels, {epochs} epochs in batches of {batch}, {precision}. "
         "± is the standard deviation over seeds, of one seed the standard error over test images; milliseconds "
         "beside other runs. The thesis's numbers are of the real sets, with standard errors over "
         "test images: orderings compare, numbers do not. Command: `python benchmarks/thesis_tables.py 3.1-3.2`.\n\n"

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.jobs import settings
 from benchmarks.machine import machine
 from framework.configuration.assembly import build_data
 from framework.configuration.loading import load_with_description
@@ -105,7 +106,11 @@ def main() -> None:
     torch.set_num_threads(1)
     loaders: dict[str, Batches] = {}
     rows = []
-    for path in (path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")):
+    paths = [path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")]
+    size, epochs, batch = settings(
+        [path.parent for path in paths], "data.image_size", "trainer.max_epochs", "batch_size"
+    )
+    for path in paths:
         row = json.loads(path.read_text(encoding="utf-8"))
         rows.append({**row, "milliseconds_per_sample": milliseconds(path.parent, loaders)})
     rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))
@@ -113,10 +118,10 @@ def main() -> None:
     threads = sorted({row["threads"] for row in rows})
     text = (
         "# Table 3.3: five density heads on synthetic PASCAL3D+\n\n"
-        "Embedded default (generated objects, 48 px crops), `biternion_vgg`, 30 epochs, batch 16; the commands are in "
-        "`pascal3d.py`. ± is the standard deviation over seeds, or the standard error over the test set for one seed. "
-        "`diningtable` looks the same after 180° (two true azimuths: the least mass a density gives to one, within "
-        "45°), `bottle` from everywhere (the gap between its azimuth entropy and log 2π).\n\n"
+        f"Embedded default (generated objects, {size} px crops), `biternion_vgg`, {epochs} epochs, batch {batch}; the "
+        "commands are in `pascal3d.py`. ± is the standard deviation over seeds, or the standard error over the test "
+        "set for one seed. `diningtable` looks the same after 180° (two true azimuths: the least mass a density gives "
+        "to one, within 45°), `bottle` from everywhere (the gap between its azimuth entropy and log 2π).\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{over_classes(rows)}\n\n"
         f"{len(rows)} runs, {threads} CPU threads each. {machine('torch', 'pytorch-lightning')}\n"
     )

@@ -27,6 +27,9 @@ from framework.storage.generated import read_mark
 from plugins.data.bodies.faust import CHALLENGES, Challenge, pairs, test_registration, test_scan
 from plugins.data.bodies.faust_generator import people_root
 
+Registered = Callable[[Path], Float[np.ndarray, "vertex 3"]]
+"""A scan's file to the vertices registered to it, metres."""
+
 
 class Answered(NamedTuple):
     """Of one challenge.
@@ -68,9 +71,8 @@ def main(arguments: list[str]) -> None:
 
 def model(
     checkpoint: str,
-) -> tuple[Callable[[Path], Float[np.ndarray, "vertex 3"]], Callable[[], Path]]:
-    """A trained model as two functions: a scan's file to the vertices registered to it, metres; and the root of
-    people in FAUST's layout who are generated (once) of the body that the model knows.
+) -> tuple[Registered, Callable[[], Path]]:
+    """A trained model, and what gives the root of people in FAUST's layout: they are generated, once, of its body.
 
     Raises:
         ConfigError: a checkpoint of another data set.
@@ -93,16 +95,14 @@ def model(
     return registered, lambda: people_root(part.get("body"))
 
 
-def answered(
-    registered: Callable[[Path], Float[np.ndarray, "vertex 3"]], root: Path, challenge: Challenge, out: Path
-) -> Answered:
+def answered(registered: Registered, root: Path, challenge: Challenge, out: Path) -> Answered:
     """Correspondences of every pair through registered meshes.
 
     A vertex of the first scan goes to the nearest vertex of the mesh registered to it, and from there to the same
     vertex of the mesh registered to the second scan (thesis §6.5.2).
 
     Args:
-        registered: a scan's file to the vertices registered to it, metres; asked once for each.
+        registered: asked once for each scan.
 
     Raises:
         DataError: no pairs, or a scan that cannot be read.
