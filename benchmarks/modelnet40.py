@@ -3,8 +3,9 @@
     python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its two sweeps, to run one by one
 
 That is three seeds of every row that takes about five minutes or less on one core (`modelnet40_quick`), and one of the
-others (`modelnet40_slow`); some hours on two cores. Add `--bfloat16` where /proc/cpuinfo lists avx512_bf16;
-elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others with fewer rows:
+others (`modelnet40_slow`), but for two that take hours by themselves (`thesis_tables.BY_HAND`). Add `--bfloat16` where
+/proc/cpuinfo lists avx512_bf16; elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others
+with fewer rows:
 
     python benchmarks/modelnet40.py outputs/thesis_tables/modelnet40_quick outputs/thesis_tables/modelnet40_slow
 
@@ -318,6 +319,7 @@ def main() -> None:
             del row[name]
         for score in SCORES:
             row[score], row[f"{score}_sem"] = compared(methods, {str(row["key"]): 1.0}, score)
+    missing = [words for key, (_, words, *_) in ROWS.items() if key not in methods]
     fingerprint = data.fingerprint()
     among_seeds = pooled(methods, "accuracy")
     boosting = packages_distributions()["xgboost"] if "bps_xgboost" in methods else []
@@ -333,7 +335,8 @@ def main() -> None:
         "thesis's figures are of ModelNet40 and a GPU's thousands of epochs: orderings compare, numbers do not. "
         "Latencies on one thread, encoding included. FLOPs are those of matrix products and convolutions. Epochs are "
         "what two cores allow; rates were chosen on the validation split of an earlier, easier generated set. "
-        "Commands in `modelnet40.py`. Of several seeds numbers are means.\n\n"
+        "Commands in `modelnet40.py`. Of several seeds numbers are means. "
+        f"{'Not run: ' + '; '.join(missing) + '.' if missing else 'Every row was run.'}\n\n"
         f"{markdown(table, COLUMNS, better=BETTER)}\n\n"
         "± of accuracy and NLL is the standard error over new test clouds and new seeds: the variance over clouds of "
         "the mean over seeds, and the variance among seeds beyond what clouds explain over the number of seeds. The "
