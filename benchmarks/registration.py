@@ -156,16 +156,20 @@ def trained(run: Path, split) -> list[str]:
     with torch.inference_mode():
         vertices = timed(lambda: median(model(cloud), 1))
     rows = {"all": found, **found.get("groups", {})}
-    keys = ("vertex_error_cm", "vertex_error_median_cm", "vertex_error_95_cm")
+    keys = ("vertex_error_median_cm", "vertex_error_95_cm")
     return [
         f"`experiment={found['experiment']}`: {minutes} processor minutes from start to report, "
         f"computing its features included. From a cloud of {cloud.shape[1]} points to a density of all vertices and "
         f"its median, by `framework.load`, one core: {vertices:.2f} ms. Vertex error of held-out bodies (synthetic), "
-        "centimetres:",
+        "centimetres (± standard error over scans):",
         "",
         "| scans | mean | median | 95 % |",
         "|---|---:|---:|---:|",
-        *(f"| {name} | {' | '.join(f'{row[key]:.2f}' for key in keys)} |" for name, row in rows.items()),
+        *(
+            f"| {name} | {row['vertex_error_cm']:.2f} ± {row['vertex_error_cm_sem']:.2f} | "
+            f"{' | '.join(f'{row[key]:.2f}' for key in keys)} |"
+            for name, row in rows.items()
+        ),
     ]
 
 
