@@ -5,7 +5,7 @@
 
 Writes registration.md beside this file; of the first run also its error and, of both, those of the correspondences that
 FAUST's challenges ask for, on people generated in its layout; of a scan (one is in the folder REAL_DATA_ROOT) the
-picture registration.png. Run it alone: it times one thread.
+picture registration.png. Times are the processor's, of one thread.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from jaxtyping import Float
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks.jobs import processor_seconds, record
-from benchmarks.machine import machine
+from benchmarks.machine import machine, milliseconds
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.reports.table import format_number
@@ -45,15 +45,8 @@ THESIS: dict[Challenge, float] = {"intra": 2.33, "inter": 4.53}
 
 
 def timed(call: Callable[[], object], repeats: int = 100) -> float:
-    """Median milliseconds of a call, after a warm-up."""
-    for _ in range(10):
-        call()
-    found = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        found.append(time.perf_counter() - start)
-    return 1e3 * middle(found)
+    """Median milliseconds of processor time of a call, of all its threads."""
+    return milliseconds(call, repeats, time.process_time)
 
 
 def residuals(data) -> dict[int, float]:
@@ -183,9 +176,9 @@ def table_64(runs: list[Path]) -> list[str]:
         def timed_registered(
             scan: Path, registered: Registered = registered
         ) -> Float[np.ndarray, "vertex 3"]:
-            start = time.perf_counter()
+            start = time.process_time()
             found = registered(scan)
-            took.append(time.perf_counter() - start)
+            took.append(time.process_time() - start)
             return found
 
         experiment = json.loads((run / "results.json").read_text(encoding="utf-8"))["experiment"]

@@ -287,3 +287,10 @@ def test_single_values_beside_a_swept_experiment_are_swept_too() -> None:
 )
 def test_other_commands_are_left_as_they_are(given: list[str]) -> None:
     assert command_line(given) == given
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_last_epoch_of_an_experiment_is_validated(name: str) -> None:
+    """Else the weights that are kept, of the lowest validation loss, are never the last ones."""
+    trainer = plain(composed(f"experiment={name}"))["trainer"]
+    assert trainer["keep"] == "last" or trainer["max_epochs"] % trainer["check_val_every_n_epoch"] == 0
