@@ -40,7 +40,7 @@ def test_a_table_whose_runs_are_not_here_keeps_its_line(runs: Path) -> None:
     assert row(page, "2.1") == ["2.1", "moons", "page", "45 of 45", "19", "elsewhere"]
     assert row(page, "3.3")[3:5] == ["1 of 72", "1.5"]
     assert row(page, "3.3")[5].endswith(datetime.date.fromtimestamp(1.8e9).isoformat())
-    assert row(page, "6.4")[3:] == ["0 of 1", "0.0", "not available"]
+    assert row(page, "6.4")[3:] == ["0 of 2", "0.0", "not available"]
 
 
 def test_only_completed_jobs_count_and_unknown_times_say_so(runs: Path) -> None:
