@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.jobs import processor_seconds, record
 from benchmarks.machine import machine
-from framework.reports.table import NOT_AVAILABLE
+from framework.reports.table import NOT_AVAILABLE, format_number
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[1]
@@ -245,7 +245,8 @@ def report(page: str) -> str:
             "|---|---|---|---:|---:|---|",
             *lines,
             "",
-            f"On two cores, two runs at once, the whole should take {sum(map(minutes_of, lines)) / 120:.1f} hours. "
+            "On two cores, two runs at once, the whole should take "
+            f"{format_number(sum(map(minutes_of, lines)) / 120)} hours. "
             f"{machine('torch', 'pytorch-lightning')}",
             "",
         ]
@@ -253,10 +254,11 @@ def report(page: str) -> str:
 
 
 def minutes_of(line: str) -> float:
-    """What all runs of a table would take, by those that have run; NaN where none has."""
+    """What all runs of a table would take, by those that have run; NaN where none has, or
+    an older line counts minutes by the clock."""
     runs, minutes = line.split(" | ")[3:5]
     done, _, asked = runs.partition(" of ")
-    known = re.fullmatch(r"[\d.]+", minutes) is not None and int(done) > 0
+    known = re.fullmatch(r"[\d.]+", minutes) is not None and int(done) > 0 and "by the clock" not in line
     return float(minutes) * int(asked) / int(done) if known else math.nan
 
 
