@@ -245,8 +245,8 @@ def report(page: str) -> str:
             "|---|---|---|---:|---:|---|",
             *lines,
             "",
-            "On two cores, two runs at once, the whole should take "
-            f"{format_number(sum(map(minutes_of, lines)) / 120)} hours. "
+            "Hours that the whole takes two cores, two runs at once: "
+            f"{format_number(sum(map(minutes_of, lines)) / 120)}. "
             f"{machine('torch', 'pytorch-lightning')}",
             "",
         ]
