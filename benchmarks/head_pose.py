@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.jobs import processor_seconds, record, settings
 from benchmarks.machine import machine
+from benchmarks.speed import milliseconds
 from framework.reports.table import Better, aggregate, markdown
+from framework.training.batches import Batches
 
 HERE = Path(__file__).resolve()
 METHODS = {
@@ -60,6 +63,8 @@ THESIS = {
 
 
 def results(folders: list[Path]) -> list[dict[str, Any]]:
+    torch.set_num_threads(1)
+    loaders: dict[str, Batches] = {}
     rows = []
     for path in (path for folder in folders for path in folder.glob("*/results.json")):
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -69,8 +74,11 @@ def results(folders: list[Path]) -> list[dict[str, Any]]:
             method += "_each"
         angles = [word for word in job["overrides"] if word.startswith("data.angles=")]
         angle = angles[0].partition("=")[2].strip("[]") if angles else "pan"
-        minutes = processor_seconds(job) / 60
-        rows.append(found | {"data": data, "angle": angle, "method": method, "minutes": minutes})
+        taken = {
+            "milliseconds_per_sample": milliseconds(path.parent, loaders),
+            "minutes": processor_seconds(job) / 60,
+        }
+        rows.append(found | {"data": data, "angle": angle, "method": method} | taken)
     order, places = list(METHODS), [key[:2] for key in THESIS]
     return sorted(
         rows,
@@ -121,7 +129,7 @@ def main() -> None:
         "Generated heads in the layouts of IDIAP, CAVIAR and TownCentre; a model for each angle: images of "
         f"{size} pixels, {epochs} epochs in batches of {batch}, {precision}. "
         "± is the standard deviation over seeds, of one seed the standard error over test images; milliseconds "
-        "beside other runs. The thesis's numbers are of the real sets, with standard errors over "
+        "on one thread. The thesis's numbers are of the real sets, with standard errors over "
         "test images: orderings compare, numbers do not. Command: `python benchmarks/thesis_tables.py 3.1-3.2`.\n\n"
         f"{chr(10).join(tables)}\n"
         "## Against one concentration\n\n"

@@ -19,9 +19,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.jobs import settings
 from benchmarks.machine import machine
-from framework.configuration.assembly import build_data
-from framework.configuration.loading import load_with_description
-from framework.evaluation.splits import cost
+from benchmarks.speed import milliseconds
 from framework.reports.table import aggregate, markdown
 from framework.training.batches import Batches
 
@@ -49,18 +47,6 @@ THESIS = {
     "scvae": "1.15 ± 0.07, 0.84, 12.2",
 }
 """Table 3.3's last column, of its own data."""
-
-
-def milliseconds(run: Path, loaders: dict[str, Batches]) -> float:
-    """Run time of one prediction of a trained model, one thread."""
-    model, description = load_with_description(run)
-    category = str(description.config["data"]["category"])
-    if category not in loaders:
-        data = build_data(description.config)
-        data.prepare()
-        loaders[category] = Batches(data, batch_size=16, workers=0, seed=0)
-    batch = next(iter(loaders[category].test_dataloader()))
-    return cost(model, batch, samples=1000, device=torch.device("cpu")).milliseconds_per_sample
 
 
 def over_classes(rows: list[dict[str, Any]]) -> str:

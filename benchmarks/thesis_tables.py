@@ -46,7 +46,7 @@ MODELNET = sorted(
 )
 SLOW = (
     *("bps_conv3d", "bps_conv3d_delta", "bps_conv3d_unpadded"),
-    *("deepsets", "pointnet", "pointnet_vanilla", "pointnet2_single"),
+    *("deepsets", "pointnet", "pointnet_vanilla", "pointnet2_single", "voxnet"),
 )
 """Rows of Tables 6.1 to 6.3 that take five minutes and more: one seed, three of the others."""
 
