@@ -150,7 +150,9 @@ def test_what_a_resumed_run_computes_is_not_changed(
     assert "threads, workers, logger.uri may be given" in done.out
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)]
+)
 def test_a_signal_saves_and_says_so(
     framework: Framework, whole: Done, tmp_path: Path, number: int, code: int
 ) -> None:
@@ -178,6 +180,22 @@ def test_a_signal_saves_and_says_so(
     assert [path.name for path in best.parent.iterdir()] == ["model.ckpt"], (
         "a finished run keeps its model alone"
     )
+
+
+def test_a_run_that_was_never_to_be_resumed_is_resumed_when_asked(
+    framework: Framework, whole: Done, tmp_path: Path
+) -> None:
+    stop = [
+        "+data.signal_at=14",
+        f"+data.signal_number={int(signal.SIGTERM)}",
+        f"+data.signal_marker={tmp_path / 'm'}",
+    ]
+    stopped = framework(*QUIET, *stop, "resume=never", f"hydra.run.dir={tmp_path / 'run'}")
+    assert stopped.code == 143, stopped.out
+    resumed = framework(f"resume={stopped.folder}")
+    assert resumed.code == 0, resumed.out
+    assert "resuming from" in resumed.out
+    assert stopped.losses() == whole.losses()
 
 
 def test_a_nan_label_stops_before_the_weights_are_touched(framework: Framework) -> None:
