@@ -42,11 +42,19 @@ def column_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(OTHER_NAMES.get(name, name) for name in small)
 
 
-def text_lines(content: bytes, comment: bytes = b"#") -> list[bytes]:
-    """The lines that are neither blank nor a comment, without their comments."""
+def text_lines(content: bytes, comment: bytes = b"#", names: Sequence[bytes] = ()) -> list[bytes]:
+    """The lines that are neither blank nor a comment, without their comments.
+
+    Args:
+        comment: what begins a comment, anywhere in a line.
+        names: first words of lines whose rest is a name, which may hold what begins a comment elsewhere.
+    """
     plain = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if comment in plain:
-        plain = re.sub(re.escape(comment) + rb"[^\n]*", b"", plain)
+        cut = re.escape(comment) + rb"[^\n]*"
+        if names:  # a whole line with a name is found first, and stays
+            cut = rb"^([ \t]*(?:" + b"|".join(map(re.escape, names)) + rb")[ \t][^\n]*)|" + cut
+        plain = re.sub(cut, rb"\1" if names else b"", plain, flags=re.MULTILINE)
     return [line for line in plain.split(b"\n") if line and not line.isspace()]
 
 
