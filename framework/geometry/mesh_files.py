@@ -219,7 +219,8 @@ def xyz(content: bytes) -> Parsed:
     A first line of as many names (`x y z red …`, also as a comment) names the columns; else they are column_4 and on.
     """
     plain = re.sub(rb"[,;\t]", b" ", content)
-    first = plain.lstrip().split(b"\n", 1)[0].decode("latin-1").lstrip("#/ ").split()
+    head = re.split(rb"[\r\n]", plain.lstrip(), maxsplit=1)[0].lstrip(b"#/ ")
+    first = [word.decode("utf-8", "replace") for word in head.split()]  # text has blanks that bytes have not
     named = bool(first) and column_names(first)[:3] == XYZ
     lines = text_lines(re.sub(rb"//[^\n]*", b"", plain))
     if named and lines and lines[0].split()[0].lower() == b"x":
