@@ -1,6 +1,7 @@
 """Textures against torch's own sampling, and what faces say of themselves against one another."""
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -125,16 +126,26 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
         joined([covered(), other])
 
 
+@pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ({"images": ()}, "without images"),
+        ({"images": (torch.tensor(1.0),)}, "shape ()"),
+        ({"images": (torch.zeros(4, 3),)}, "shape (4, 3)"),
         ({"images": (torch.zeros(0, 4, 3),)}, "shape (0, 4, 3)"),
         ({"images": (torch.zeros(2, 2, 3), torch.zeros(2, 2, 1))}, "shape (2, 2, 1)"),
         ({"images": (torch.zeros(2, 2, 3, dtype=torch.uint8),)}, "torch.uint8; wanted floating point"),
         ({"uv": torch.full((30, 2), torch.nan)}, "not finite"),
         ({"uv": torch.full((30, 2), 1e9)}, "beyond 1e+06"),
         ({"uv": torch.zeros(30, 3)}, "shape (30, 3)"),
+        ({"uv": torch.zeros(30)}, "shape (30,)"),
+        ({"uv": torch.zeros(30, 2, dtype=torch.int64)}, "uv came as torch.int64"),
+        ({"faces": torch.zeros(4, 3)}, "texture.faces came as torch.float32; wanted whole numbers"),
+        ({"faces": torch.zeros(12, dtype=torch.int64)}, "texture.faces came with the shape (12,)"),
+        ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "texture.faces came with the shape (4, 4)"),
+        ({"faces": torch.full((4, 3), -1)}, "-1 to -1; wanted 0 to 29"),
+        ({"shown": torch.zeros(4)}, "texture.shown came as torch.float32; wanted whole numbers"),
         ({"faces": torch.full((4, 3), 99)}, "99 to 99; wanted 0 to 29"),
         ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, "came for 5 faces"),
         ({"shown": torch.zeros(3, dtype=torch.int64)}, "shown with the shape (3,)"),
@@ -143,16 +154,21 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
     ],
 )
 def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
-    change: dict[str, object], sentence: str
+    change: dict[str, object],
+    sentence: str,
+    road: Callable[[Rasterizer, Scene, Sequence[str]], dict[str, Tensor]],
 ) -> None:
     corners = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
     faces = torch.arange(12).reshape(4, 3)
     texture = Texture((torch.rand(2, 2, 3),), torch.rand(30, 2), faces)
     for name, value in change.items():
         object.__setattr__(texture, name, value)  # past the type checks that only tests have
-    with pytest.raises(ValueError) as caught:
-        Rasterizer()(Scene(corners, faces, None, camera(), texture))
-    assert sentence in str(caught.value)
+    scene = Scene(corners, faces, None, camera(), texture)
+    for channels in (("color",), ("uv",), ("mask", "color")):
+        with pytest.raises(ValueError) as caught:
+            road(Rasterizer(), scene, channels)
+        assert sentence in str(caught.value)
+    assert set(road(Rasterizer(), scene, ("mask", "depth"))) == {"mask", "depth"}  # which read none of it
 
 
 def test_the_blended_picture_refuses_textures() -> None:
