@@ -115,6 +115,54 @@ def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None
         assert scene.texture.shown is not None and set(scene.texture.shown.tolist()) == {-1, 0}
 
 
+WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+@pytest.mark.parametrize("count", [100, 300, 40_000])
+@pytest.mark.parametrize("textured", list(itertools.product([False, True], repeat=2)), ids=str)
+@pytest.mark.parametrize(("kind", "other"), list(itertools.product(WHOLE, repeat=2)), ids=str)
+def test_joined_indices_are_those_of_int64_whatever_types_came(
+    kind: torch.dtype, other: torch.dtype, textured: tuple[bool, bool], count: int
+) -> None:
+    """Of many vertices, places and images before few: sums that none of the smaller types holds."""
+
+    def subject(count: int, kind: torch.dtype, cover: bool) -> Scene:
+        most = min(count, torch.iinfo(kind).max)
+        faces = torch.tensor([[0, 1, most - 1], [2, most - 2, 1]]).to(kind)
+        images = tuple(torch.full((1, 1, 3), 0.5) for _ in range(min(most, 130) - 1))
+        shown = torch.tensor([0, len(images) - 1]).to(kind)
+        texture = Texture(images, torch.zeros(count, 2), faces.long(), shown.long())
+        scene = Scene(
+            torch.zeros(count, 3), faces.long(), torch.zeros(count, 3), camera(), texture if cover else None
+        )
+        # past the type checks that only tests have, which know no uint8
+        for part, name, value in (
+            (scene, "faces", faces),
+            (texture, "faces", faces),
+            (texture, "shown", shown),
+        ):
+            object.__setattr__(part, name, value)
+        return scene
+
+    found = joined([subject(count, kind, textured[0]), subject(100, other, textured[1])])
+    # the same small numbers as int64, moved by hand
+    first, last = subject(count, kind, True), subject(100, other, True)
+    assert first.texture is not None and first.texture.shown is not None
+    assert last.texture is not None and last.texture.shown is not None
+    assert found.faces.tolist() == [*first.faces.tolist(), *(last.faces.long() + count).tolist()]
+    if found.texture is None:
+        assert not any(textured)
+        return
+    places, images = (count, len(first.texture.images)) if textured[0] else (0, 0)
+    nothing = torch.zeros(2, 3, dtype=torch.int64)
+    parts = [first.texture.faces if textured[0] else nothing]
+    parts += [last.texture.faces.long() + places if textured[1] else nothing]
+    assert found.texture.faces.tolist() == torch.cat(parts).tolist()
+    shown = first.texture.shown.tolist() if textured[0] else [-1, -1]
+    shown += (last.texture.shown.long() + images).tolist() if textured[1] else [-1, -1]
+    assert found.texture.shown is not None and found.texture.shown.tolist() == shown
+
+
 def test_subjects_of_other_channels_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
     with pytest.raises(ValueError, match="1 and 3 channels; wanted as many"):
