@@ -114,6 +114,46 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     assert status(killed) == "FINISHED"
 
 
+STOPS = ["trainer.patience=1", "trainer.max_epochs=30", "optimizer.learning_rate=0.3"]
+"""A run whose validation loss soon is higher than before."""
+
+
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("further", [[], ["+trainer.min_epochs=16", "trainer.keep=last"]], ids=["stops", "goes on"])
+def test_a_run_killed_after_it_stopped_early_trains_no_further(
+    framework: Framework, tmp_path: Path, every: int, further: list[str]
+) -> None:
+    killed = framework(
+        *(*QUIET, *STOPS, *further, f"trainer.check_val_every_n_epoch={every}"),
+        *("+data.signal_at=0", f"+data.signal_marker={tmp_path / 'marker'}"),
+    )
+    assert killed.code == -signal.SIGKILL, "in its pictures"
+    told = re.compile(r"^stopped early at epoch \d+, kept \d+$", re.MULTILINE)
+    losses, results = killed.losses(), (killed.folder / "results.json").read_text()
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert killed.losses() == losses
+    assert told.findall(resumed.out) == told.findall(killed.out) != []
+    again = (killed.folder / "results.json").read_text()
+    assert json.loads(again)["log_likelihood"] == json.loads(results)["log_likelihood"]
+
+
+def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, tmp_path: Path) -> None:
+    """Killed in the epoch after the first validation that was no better, of which two end it."""
+    patient = [*QUIET, *STOPS, "trainer.patience=2", "pictures=false"]
+    whole = framework(*patient, folder="whole")
+    assert whole.code == 0, whole.out
+    validated = list(whole.values("validation/loss").items())
+    worse = next(step for (step, loss), (_, before) in zip(validated[1:], validated, strict=False) if loss >= before)
+    killed = framework(
+        *patient, f"+data.signal_at={worse + 3}", f"+data.signal_marker={tmp_path / 'marker'}", folder="killed"
+    )
+    assert killed.code == -signal.SIGKILL
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert killed.losses() == whole.losses()
+
+
 def test_a_rate_that_waits_for_the_validation_loss_goes_on_with_the_same_bits(
     framework: Framework, tmp_path: Path
 ) -> None:
