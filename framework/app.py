@@ -10,7 +10,8 @@ from framework.errors import ConfigError, UserError
 
 
 def main() -> None:
-    """Entry of `python -m framework`; exits 0, 1 (failed), 2 (refused), 130 (interrupted) or 143 (terminated)."""
+    """Entry of `python -m framework`; exits 0, 1 (failed), 2 (refused), 130 (interrupted),
+    143 (terminated) or 129 (its terminal was closed)."""
     # Hydra prints its own errors and exits unless told to raise them.
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"

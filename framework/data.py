@@ -88,7 +88,7 @@ class Data(ABC):
     """Names by which results are also reported apart (object classes, say); one name where there is one."""
     synthetic: bool
     """Whether the samples were generated."""
-    skipped: int
+    skipped: int = 0
     """How many samples were left out because they could not be read (only when the config allows it)."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:

@@ -36,7 +36,7 @@ class DensityHead(nn.Module, ABC):
     group: ClassVar[str] = "density_head"
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]]
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     """Attributes that trade error for run time and may be set at any time after training, with the values worth
     trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
     direct: ClassVar[bool] = False

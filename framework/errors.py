@@ -1,12 +1,33 @@
 """The errors a user can cause; each message says what came, what was wanted and what to do."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from itertools import islice
 
 
 class UserError(Exception):
-    """Something the user can mend. Printed as a sentence, without a stack trace."""
+    """Something the user can mend. Printed as a sentence, without a stack trace.
+
+    One that is raised in a worker of a `DataLoader` torch raises anew, of the same class, with the worker's stack trace
+    for a message: of that the sentence alone is kept.
+    """
+
+    def __init__(self, *said: object) -> None:
+        super().__init__(*(_sentence(one, type(self)) if isinstance(one, str) else one for one in said))
+
+
+def _sentence(said: str, kind: type[UserError]) -> str:
+    """What the error said, out of the text that `torch._utils.ExceptionWrapper` makes of it."""
+    if not re.match(r"Caught \w+ in .*\.\nOriginal Traceback \(most recent call last\):\n", said):
+        return said
+    # an error that was raised from another comes after that one's trace
+    between = r"\n\n(?:The above|During handling of the above) exception,? .*:\n\n(?=Traceback )"
+    trace = re.split(between, said)[-1].removesuffix("\n")
+    # every line before the sentence is indented; that of a class of a script names no module
+    name = rf"(?:{re.escape(kind.__module__)}\.)?{re.escape(kind.__qualname__)}"
+    found = re.search(rf"^{name}(?:: (.*))?\Z", trace, re.DOTALL | re.MULTILINE)
+    return (found[1] or "") if found else said
 
 
 class ConfigError(UserError):

@@ -40,7 +40,7 @@ class Metric(torchmetrics.Metric, ABC):
     """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
     A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own."""
 
-    better: ClassVar[dict[str, Literal["higher", "lower"]]]
+    better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
     """Which way a column is better, for those of `columns` that have a better way."""
 
     @abstractmethod

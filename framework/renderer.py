@@ -98,7 +98,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
         )
     counts = [len(scene.vertices) for scene in scenes]
     first = accumulate(counts[:-1], initial=0)
-    faces = [scene.faces + start for scene, start in zip(scenes, first, strict=True)]
+    faces = [_moved(scene.faces, start) for scene, start in zip(scenes, first, strict=True)]
     colors = None
     if any(scene.colors is not None for scene in scenes):
         channels = next(scene.colors.shape[1] for scene in scenes if scene.colors is not None)
@@ -111,6 +111,11 @@ def joined(scenes: Sequence[Scene]) -> Scene:
         )
     vertices = torch.cat([scene.vertices for scene in scenes])
     return Scene(vertices, torch.cat(faces), colors, scenes[0].camera, _joined_textures(scenes))
+
+
+def _moved(indices: Tensor, by: int) -> Tensor:
+    """Indices that count from elsewhere. Types that hold them may not hold their sum: 200 + 100 is 44 in uint8."""
+    return (indices if indices.is_floating_point() else indices.long()) + by
 
 
 def _joined_textures(scenes: Sequence[Scene]) -> Texture | None:
@@ -127,12 +132,12 @@ def _joined_textures(scenes: Sequence[Scene]) -> Texture | None:
     for scene in scenes:
         texture = scene.texture
         if texture is None:
-            faces.append(torch.zeros_like(scene.faces))
-            shown.append(scene.faces.new_full((len(scene.faces),), -1))
+            faces.append(torch.zeros_like(scene.faces, dtype=torch.int64))
+            shown.append(scene.faces.new_full((len(scene.faces),), -1, dtype=torch.int64))
             continue
         of_faces = texture.faces.new_zeros(len(texture.faces)) if texture.shown is None else texture.shown
-        shown.append(torch.where(of_faces < 0, of_faces, of_faces + len(images)))
-        faces.append(texture.faces + corners)
+        shown.append(torch.where(of_faces < 0, of_faces, _moved(of_faces, len(images))))
+        faces.append(_moved(texture.faces, corners))
         places.append(texture.uv)
         images += texture.images
         corners += len(texture.uv)

@@ -25,7 +25,7 @@ class Uncertainty(Predictor):
     group: ClassVar[str] = "uncertainty"
     bibtex: ClassVar[str]
     """What to cite, as BibTeX."""
-    knobs: Mapping[str, tuple[int, ...]]
+    knobs: Mapping[str, tuple[int, ...]] = {}
     """Attributes that trade error for run time and may be set at any time after training, with the values worth
     trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
 

@@ -9,6 +9,7 @@ import gc
 import json
 import os
 import runpy
+import signal
 import sys
 from multiprocessing import get_context
 from typing import Any
@@ -21,6 +22,7 @@ def run(
     arguments: list[str], environment: dict[str, str], folder: str, packages: list[str], output: str
 ) -> None:
     """The command; this process ends with it."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests may run under nohup
     os.dup2(os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
     os.dup2(1, 2)
     os.chdir(folder)

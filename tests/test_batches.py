@@ -49,7 +49,7 @@ class Sums(Data):
     def train(self) -> Dataset[Batch]:
         generator = torch.Generator().manual_seed(1)
         rows = torch.randn(SAMPLES, 8, generator=generator)
-        fields = Fields(input=rows, target=rows.sum(1), index=torch.arange(SAMPLES))
+        fields = Fields(input=rows, target=rows.sum(1, keepdim=True), index=torch.arange(SAMPLES))
         return Single(fields) if self.single else fields
 
     def validation(self) -> Dataset[Batch]:

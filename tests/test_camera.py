@@ -1,12 +1,14 @@
 """Where a camera sees a point: against OpenCV's documented formula and kornia's camera."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
 
-from framework.geometry.camera import Camera, canonical_camera, look_from
+from framework.geometry.camera import Camera, canonical_camera, focal_length, look_from
 from framework.geometry.rotation import viewpoint_rotation
 
 
@@ -77,3 +79,75 @@ def test_canonical_points_have_a_gradient_in_points_and_lens() -> None:
         return Camera(turned, torch.ones(3), focal, principal, 24, 20).canonical(points)
 
     assert torch.autograd.gradcheck(seen, (points, focal, principal))
+
+
+WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+@pytest.mark.parametrize("kind", WHOLE, ids=str)
+@pytest.mark.parametrize("default", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("learned", [False, True])
+def test_whole_numbers_are_seen_where_the_same_floats_are(
+    kind: torch.dtype, default: torch.dtype, learned: bool
+) -> None:
+    points = torch.randint(0, 9, (20, 3), generator=torch.Generator().manual_seed(0))
+    seen = look_from(0.7, 0.4, -0.2, distance=40.0, field_of_view=0.8, size=(48, 65))
+    if learned:
+        seen = replace(seen, focal=torch.tensor([50.5, 60.25]), principal=torch.tensor([10.5, 12.75]))
+    before = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(default)
+        for method in (seen.projected, seen.canonical):
+            found, wanted = method(points.to(kind)), method(points.to(default))
+            torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    finally:
+        torch.set_default_dtype(before)
+
+
+WRONG = {
+    "rotation": (torch.eye(4), torch.eye(3)[None], torch.eye(3)[:2], torch.ones(3)),
+    "translation": (torch.ones(1), torch.ones(2), torch.ones(1, 3), torch.tensor(1.0)),
+    "focal": ((8.0,), (), (8.0, 8.0, 8.0), 8.0, [8.0], np.ones(3), ((8.0, 8.0), (8.0, 8.0))),
+}
+WRONG["focal"] += tuple(torch.ones(shape) for shape in ((1,), (3,), (), (1, 2), (2, 1), (0,)))
+WRONG["principal"] = WRONG["focal"]
+"""Shapes that no camera is made of."""
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, value) for name in WRONG for value in WRONG[name]], ids=repr
+)
+def test_what_no_camera_is_made_of_gets_a_sentence(name: str, value: object) -> None:
+    seen = look_from(0.7, 0.4, -0.2, distance=6.0, field_of_view=0.8, size=(48, 64))
+    object.__setattr__(seen, name, value)  # past the type checks that only tests have
+    for method in (seen.projected, seen.canonical):
+        with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \("):
+            method(torch.ones(5, 3))
+
+
+@pytest.mark.parametrize("number", [2.0, 2])
+def test_a_lens_may_be_any_two_numbers(number: float) -> None:
+    seen = look_from(0.7, 0.4, -0.2, distance=6.0, field_of_view=0.8, size=(48, 64))
+    wanted = replace(seen, focal=(2.0, 2.0), principal=(2.0, 2.0)).projected(torch.ones(5, 3))
+    for lens in ((number, number), [number, number], np.array([number] * 2), torch.tensor([number] * 2)):
+        for name in ("focal", "principal"):
+            object.__setattr__(seen, name, lens)
+        torch.testing.assert_close(seen.projected(torch.ones(5, 3)), wanted, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("angle", [40.0, 180.0, math.pi, 3.2, 0.0, -0.8, math.nan, math.inf, -math.inf])
+def test_a_field_of_view_in_degrees_is_refused(angle: float) -> None:
+    for ask in (
+        lambda: look_from(0.3, 0.2, 0.1, distance=4.0, field_of_view=angle, size=(48, 64)),
+        lambda: focal_length(48, angle),
+    ):
+        with pytest.raises(ValueError, match=r"field_of_view came as .*; wanted radians.*math\.radians"):
+            ask()
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.1, math.radians(40), 1.5, 3.0, 3.14159])
+def test_the_edges_of_an_image_are_seen_at_half_the_field_of_view(angle: float) -> None:
+    height = 48
+    seen = look_from(0.0, 0.0, 0.0, distance=4.0, field_of_view=angle, size=(height, 64))
+    assert seen.focal[0] == seen.focal[1] == focal_length(height, angle)
+    assert 2 * math.atan2(height / 2, float(seen.focal[1])) == pytest.approx(angle, rel=1e-9)

@@ -12,8 +12,33 @@ from importlib import import_module
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
-from torch.distributions import Dirichlet, Distribution, Independent, Laplace, Normal
+from scipy.stats import (
+    bernoulli,
+    beta,
+    binom,
+    cauchy,
+    chi2,
+    expon,
+    f,
+    gamma,
+    geom,
+    gumbel_r,
+    halfcauchy,
+    halfnorm,
+    invgamma,
+    laplace,
+    lognorm,
+    nbinom,
+    norm,
+    pareto,
+    poisson,
+    t,
+    uniform,
+    vonmises,
+    weibull_min,
+)
+from torch import Tensor, distributions
+from torch.distributions import Categorical, Dirichlet, Distribution, Independent, Laplace, Normal
 
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
@@ -634,6 +659,174 @@ def test_defaults_do_not_claim_to_be_exact() -> None:
         marginal(Dirichlet(torch.ones(3)), 0)
     with pytest.raises(UserError, match=r"protocol\.tempered\.register"):
         tempered(Dirichlet(torch.ones(3)), WARM)
+
+
+LOC = torch.linspace(-2, 3, 12, dtype=torch.float64).reshape(2, 2, 3)
+WIDE = 0.5 + LOC.square() / 4
+SHARE = (LOC / 3).sigmoid()
+FAMILIES = {
+    "normal": (distributions.Normal(LOC, WIDE), norm(LOC, WIDE)),
+    "laplace": (distributions.Laplace(LOC, WIDE), laplace(LOC, WIDE)),
+    "cauchy": (distributions.Cauchy(LOC, WIDE), cauchy(LOC, WIDE)),
+    "student": (distributions.StudentT(WIDE + 2, LOC, WIDE), t(WIDE + 2, LOC, WIDE)),
+    "gumbel": (distributions.Gumbel(LOC, WIDE), gumbel_r(LOC, WIDE)),
+    "half normal": (distributions.HalfNormal(WIDE), halfnorm(0, WIDE)),
+    "half cauchy": (distributions.HalfCauchy(WIDE), halfcauchy(0, WIDE)),
+    "uniform": (distributions.Uniform(LOC, LOC + WIDE), uniform(LOC, WIDE)),
+    "von Mises": (distributions.VonMises(LOC, WIDE), vonmises(WIDE, LOC)),
+    "gamma": (distributions.Gamma(WIDE, 2 * WIDE), gamma(WIDE, scale=1 / (2 * WIDE))),
+    "inverse gamma": (distributions.InverseGamma(WIDE, WIDE), invgamma(WIDE, scale=WIDE)),
+    "chi-squared": (distributions.Chi2(WIDE), chi2(WIDE)),
+    "beta": (distributions.Beta(WIDE, 1 + WIDE), beta(WIDE, 1 + WIDE)),
+    "weibull": (distributions.Weibull(WIDE, 1 + WIDE), weibull_min(1 + WIDE, scale=WIDE)),
+    "pareto": (distributions.Pareto(WIDE, 1 + WIDE), pareto(1 + WIDE, scale=WIDE)),
+    "exponential": (distributions.Exponential(WIDE), expon(scale=1 / WIDE)),
+    "log-normal": (distributions.LogNormal(LOC, WIDE), lognorm(WIDE, scale=LOC.exp())),
+    "kumaraswamy": (distributions.Kumaraswamy(WIDE, 1 + WIDE), None),
+    "f": (distributions.FisherSnedecor(WIDE, 1 + WIDE), f(WIDE, 1 + WIDE)),
+    "poisson": (distributions.Poisson(WIDE), poisson(WIDE)),
+    "bernoulli": (distributions.Bernoulli(SHARE), bernoulli(SHARE)),
+    "bernoulli by logits": (distributions.Bernoulli(logits=LOC), bernoulli(LOC.sigmoid())),
+    "geometric": (distributions.Geometric(SHARE), geom(SHARE, loc=-1)),
+    "binomial": (distributions.Binomial(5, SHARE), binom(5, SHARE)),
+    "negative binomial": (distributions.NegativeBinomial(5, SHARE), nbinom(5, 1 - SHARE)),
+    # whose parameters were of another shape
+    "of one width": (distributions.Normal(LOC, 2.0), norm(LOC, 2)),
+    "of one row": (distributions.Laplace(LOC[0, 0], WIDE), laplace(LOC[0, 0], WIDE)),
+    "expanded": (distributions.Gumbel(LOC[0], WIDE[0]).expand((2, 2, 3)), gumbel_r(LOC[0], WIDE[0])),
+}
+"""A density of one number in torch, over a batch, and the same one in SciPy."""
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_marginal_of_a_product_is_its_factor(family: str) -> None:
+    base, reference = FAMILIES[family]
+    density = Independent(base, 1)
+    torch.manual_seed(0)
+    value = density.sample((4,))
+    assert density.log_prob(value).isfinite().all()
+    for one in (density, Independent(density, 0), Independent(base.expand((5, 2, 2, 3)), 1)):
+        batch = one.batch_shape
+        total = torch.zeros(4, *batch, dtype=torch.float64)
+        wide = value if batch == (2, 2) else value.unsqueeze(1)
+        for index in range(3):
+            factor = marginal(one, index)
+            assert (factor.batch_shape, tuple(factor.event_shape)) == (batch, (1,))
+            here = wide[..., index : index + 1]
+            found = factor.log_prob(here)
+            close(found, base.log_prob(value)[..., index].reshape(wide.shape[:-1]).expand(found.shape), 1e-12)
+            assert factor.sample((3,)).shape == (3, *batch, 1)
+            total = total + found
+            if reference is not None:
+                column = reference.logpmf if hasattr(reference.dist, "logpmf") else reference.logpdf
+                wanted = torch.as_tensor(column(value.numpy()))[..., index].reshape(wide.shape[:-1])
+                close(found, wanted.expand(found.shape), 1e-6)
+        close(total, one.log_prob(wide), 1e-12)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_one_of_several_products_is_picked_without_drawing_the_others(family: str) -> None:
+    base, _ = FAMILIES[family]
+    density = Independent(base, 1)
+    index = torch.tensor([[0, 1], [1, 0], [1, 1]])
+    picked = pick(density, index)
+    assert isinstance(picked, Independent)
+    torch.manual_seed(0)
+    every = density.sample()
+    value = every[torch.arange(2), index]
+    found = picked.log_prob(value)
+    for place in range(3):
+        for item in range(2):
+            close(found[place, item], density.log_prob(every)[item, index[place, item]], 1e-12)
+    assert picked.sample((5,)).shape == (5, 3, 2, 3)
+
+
+@pytest.mark.parametrize("given", [{"probs": SHARE}, {"logits": LOC}], ids=["shares", "logits"])
+@pytest.mark.parametrize("kind", [distributions.Bernoulli, distributions.Geometric, distributions.Binomial])
+def test_what_was_asked_of_a_product_before_changes_no_marginal(kind: type, given: dict[str, Tensor]) -> None:
+    """torch computes shares from logits, or the reverse, when they are asked and then keeps both."""
+    fresh, asked = (Independent(kind(**given), 1) for _ in range(2))
+    assert asked.base_dist.probs.shape == asked.base_dist.logits.shape
+    value = torch.zeros(2, 2, 1, dtype=torch.float64)
+    for index in range(3):
+        close(marginal(asked, index).log_prob(value), marginal(fresh, index).log_prob(value), 1e-12)
+
+
+class Own(Laplace):
+    """Made of one number; what it answers is its base's."""
+
+    def __init__(self, wide: Tensor) -> None:
+        super().__init__(wide, wide)
+
+
+@pytest.mark.parametrize(
+    "density",
+    [
+        Independent(
+            distributions.TransformedDistribution(
+                Normal(LOC, WIDE), [distributions.AffineTransform(1.0, 2.0)]
+            ),
+            1,
+        ),
+        Independent(
+            distributions.MixtureSameFamily(Categorical(logits=LOC), Normal(LOC, WIDE)).expand((3, 2, 2)), 1
+        ),
+        Independent(distributions.RelaxedBernoulli(torch.tensor(1.0), SHARE), 1),
+        Independent(distributions.ContinuousBernoulli(SHARE), 1),
+        Independent(Categorical(logits=LOC), 1),
+        Independent(Normal(LOC, WIDE), 2),
+        Independent(distributions.MultivariateNormal(LOC, torch.eye(3, dtype=torch.float64)), 1),
+        Independent(Dirichlet(WIDE), 0),
+    ],
+    ids=[
+        "transformed",
+        "mixture",
+        "relaxed",
+        "continuous",
+        "classes",
+        "a matrix",
+        "joint normals",
+        "dirichlet",
+    ],
+)
+def test_a_product_whose_factors_are_not_known_says_what_to_do(density: Distribution) -> None:
+    with pytest.raises(UserError, match=r"has no marginal .*protocol\.marginal\.register"):
+        marginal(density, 1)
+
+
+def test_the_marginal_of_a_subclass_is_as_its_base_says() -> None:
+    density = Independent(Own(WIDE), 1)
+    value = density.sample()
+    for index in range(3):
+        here = slice(index, index + 1)
+        close(
+            marginal(density, index).log_prob(value[..., here]),
+            Laplace(WIDE, WIDE).log_prob(value)[..., index],
+            1e-12,
+        )
+    joint = Independent(distributions.MultivariateNormal(LOC, torch.diag_embed(WIDE.square())), 0)
+    close(marginal(joint, 2).log_prob(LOC[..., 2:] + 1), Normal(LOC, WIDE).log_prob(LOC + 1)[..., 2], 1e-12)
+
+
+@pytest.mark.parametrize(
+    "family", ["normal", "laplace", "cauchy", "gumbel", "of one width", "of one row", "student", "gamma"]
+)
+def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: str) -> None:
+    base, reference = FAMILIES[family]
+    density = Independent(base, 1)
+    value = LOC + torch.tensor([-1e3, -2.0, 0.0, 0.3, 50.0], dtype=torch.float64).reshape(5, 1, 1, 1)
+    found = each_cdf(density, value)
+    columns = [cdf(marginal(density, index), value[..., index : index + 1]) for index in range(3)]
+    if family in ("student", "gamma"):
+        assert found is None and columns == [None] * 3
+        return
+    assert found is not None
+    with np.errstate(over="ignore"):
+        wanted = reference.cdf(value.numpy())
+    close(found, torch.as_tensor(wanted), 1e-12)
+    close(found, torch.stack([column for column in columns if column is not None], -1), 1e-12)
+    single = Independent(type(base)(base.loc.float(), base.scale.float()), 1)
+    assert each_cdf(single, value).dtype == torch.float64
 
 
 def test_what_draws_nothing_says_so() -> None:

@@ -233,3 +233,19 @@ def test_on_a_part_of_the_circle_with_a_logarithm_at_its_ends() -> None:
     both = Mixture(torch.zeros(2, 2).double(), Stacked([elevation, elevation]))
     for density in (elevation, both):
         assert density.entropy().tolist() == pytest.approx([1.0, 1.0], abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", [VonMises, Normal], ids=["angle", "real"])
+def test_of_more_peaks_than_can_be_compared_draws_tell_it(
+    kind: type, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No array of all pairs, which of 25,000 components would take 5 GB."""
+    count = 25_000
+    spread = 4.0 if kind is VonMises else 0.5
+    whole = mixture_of([0.0] * count, [-1.0, 1.5] * (count // 2), [spread] * count, kind)
+    pair = mixture_of([0.0, 0.0], [-1.0, 1.5], [spread] * 2, kind)
+    torch.manual_seed(0)
+    with caplog.at_level(logging.WARNING):
+        found = whole.entropy()
+    assert "means over 1024 draws" in caplog.text
+    torch.testing.assert_close(found, pair.entropy(), rtol=0, atol=0.1)

@@ -185,6 +185,66 @@ def test_points_that_are_not_finite_are_named_or_dropped(tmp_path):
         read(at(tmp_path, ".xyz", b"nan 0 0\n0 0 inf\n"), drop_non_finite=True)
 
 
+ODD = [
+    chr(code) for code in (0x0B, 0x0C, 0x1C, 0x1D, 0x1E, 0x1F, 0x85, 0xA0, 0xC5, 0xE0, 0x2028, 0x2029, 0x3000)
+]
+"""What ends a line of Python's text or is a blank in it, and letters that hold such bytes: Å is C3 85, à C3 A0."""
+
+
+def written(letter):
+    """Its bytes in UTF-8, and in Latin-1 where that has it."""
+    return {letter.encode(), letter.encode("latin-1", "ignore") or letter.encode()}
+
+
+@pytest.mark.parametrize("letter", ODD, ids=[f"U+{ord(letter):04X}" for letter in ODD])
+@pytest.mark.parametrize("eol", [b"\n", b"\r\n", b"\r"])
+@pytest.mark.parametrize("statement", [b"comment", b"obj_info"])
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_header_of_ply_ends_its_lines_as_ply_says(tmp_path, letter, eol, statement, binary):
+    for odd in written(letter):
+        said = statement + b" by " + odd + b" K" + odd + b"re" + odd + b"\n"
+        content = HEAD.replace(b"element", said + b"element", 1) + said + FACE + END
+        content = content.replace(b"\n", eol) + (POINTS + b"3 0 1 2\n").replace(b"\n", eol)
+        if binary:
+            points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+            faces = struct.pack("<B3i", 3, 0, 1, 2)
+            content = content.split(b"0 0 0" + eol)[0].replace(b"ascii", b"binary_little_endian")
+            content += points + faces
+        mesh = read(at(tmp_path, ".ply", content))
+        np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        assert mesh.faces.tolist() == [[0, 1, 2]]
+
+
+def test_data_behind_a_header_may_begin_with_the_byte_of_a_line_end(tmp_path):
+    for first, eol in ((b"\n", b"\r"), (b"\r", b"\r\n"), (b"\n", b"\n"), (b"\n", b"\r\n")):
+        lines = [b"ply", b"format binary_little_endian 1.0", b"element vertex 1", b"property uchar level"]
+        lines += [b"property float " + axis for axis in (b"x", b"y", b"z")] + [b"end_header", b""]
+        content = eol.join(lines) + first + np.array([1, 2, 3], "<f4").tobytes()
+        mesh = read(at(tmp_path, ".ply", content))
+        assert mesh.attribute(["level"]).tolist() == [[first[0]]]
+        assert mesh.vertices.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize("letter", ODD, ids=[f"U+{ord(letter):04X}" for letter in ODD])
+@pytest.mark.parametrize("eol", [b"\n", b"\r\n", b"\r"])
+def test_names_of_columns_may_hold_any_letter(tmp_path, letter, eol):
+    if letter in "\x0b\x0c":
+        return  # blanks in ASCII, too
+    name = f"k{letter}re"
+    table = f"x y z {name} weight\n1 2 3 4 5\n".encode()
+    header = (
+        HEAD.replace(b"vertex 3", b"vertex 1") + f"property float {name}\nproperty float weight\n".encode()
+    )
+    for suffix, content in (
+        (".xyz", table),
+        (".xyz", b"# " + table),
+        (".ply", header + END + b"1 2 3 4 5\n"),
+    ):
+        mesh = read(at(tmp_path, suffix, content.replace(b"\n", eol)))
+        assert mesh.columns == (name.lower(), "weight")
+        assert mesh.attribute([name.lower(), "weight"]).tolist() == [[4, 5]]
+
+
 # ---- files that are refused ------------------------------------------------------------------------------
 
 STL = binary_stl(TETRAHEDRON[FACES])

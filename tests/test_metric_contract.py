@@ -4,6 +4,9 @@ import pytest
 import torch
 from scipy.integrate import quad
 
+from framework.configuration.registry import installed
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError
 from framework.metric import Metric
 from framework.target import Target
 from framework.testing.metrics import Cardioid, density_about, examine_metric
@@ -12,6 +15,7 @@ from framework.testing.rows import MetricRow
 CLASSES = Target("class", ("a", "b", "c"))
 ANGLE = Target("angle", ("azimuth",))
 REALS = Target("real", ("x", "y"))
+IMAGES = Target("image", ("red", "green", "blue"), size=(8, 8))
 
 
 class Contrast(Metric):
@@ -97,3 +101,19 @@ def test_broader_densities_have_more_entropy_about_the_same_place(target):
     torch.testing.assert_close(narrow.entropy(), same.entropy(), rtol=0, atol=0)
     assert (broad.entropy() > narrow.entropy()).all()
     torch.testing.assert_close(broad.mode, narrow.mode)
+
+
+@pytest.mark.parametrize("target", [CLASSES, ANGLE, REALS, IMAGES], ids=lambda target: target.kind)
+@pytest.mark.parametrize("name", installed("metric"))
+def test_a_metric_takes_a_kind_of_target_or_says_why_not(name, target):
+    try:
+        parts = resolve("metric", name)
+    except ConfigError as error:  # what has no default must be given
+        assert "is missing" in str(error)
+        return
+    try:
+        built = build("metric", parts, target=target)
+    except ConfigError as error:
+        assert len(str(error).split()) > 8  # a sentence
+    else:
+        assert built.columns

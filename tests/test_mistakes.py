@@ -1,12 +1,15 @@
 """A hundred mistyped commands: each ends with one sentence that says what to do, and is no run."""
 
 import os
+import re
 import shlex
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra.core.global_hydra import GlobalHydra
 
 from framework.app import main
@@ -137,28 +140,139 @@ FOLDERS = cache(composition.config_folders)
 """Found once for all commands."""
 
 
+Said = Callable[[list[str]], str]
+
+
+@pytest.fixture
+def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Said:
+    """What a command that is a mistake says, in one line; in an empty folder, which it leaves empty."""
+
+    def say(command: list[str]) -> str:
+        monkeypatch.setattr(composition, "config_folders", FOLDERS)
+        (tmp_path / "here").mkdir()
+        monkeypatch.chdir(tmp_path / "here")
+        monkeypatch.setattr(sys, "argv", ["framework", *command])
+        monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+        try:
+            with pytest.raises(SystemExit) as ended:
+                main()
+        finally:
+            os.environ.pop("HYDRA_FULL_ERROR", None)
+            GlobalHydra.instance().clear()
+        said = capfd.readouterr().err
+        assert ended.value.code in (1, 2)
+        assert said.startswith("error: ")
+        assert said.endswith("\n")
+        assert said.count("\n") == 1, said
+        assert not [*(tmp_path / "here").rglob("*.*")], "a mistake is no run"
+        return said
+
+    return say
+
+
 @pytest.mark.parametrize("row", MISTAKES.strip().splitlines())
-def test_a_mistake_gets_one_sentence(
-    row: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(composition, "config_folders", FOLDERS)
+def test_a_mistake_gets_one_sentence(row: str, said: Said) -> None:
     command, _, wanted = row.partition(" | ")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["framework", *shlex.split(command)])
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    assert wanted in said(shlex.split(command))
+
+
+TOP = b"# @package _global_\n"
+DAMAGED = {
+    "cut": (
+        TOP + b"seed: [1, 2\n",
+        r"mine\.yaml, line 3, column 1: while parsing a flow sequence, expected ',' or '\]'",
+    ),
+    "quote": (TOP + b'seed: "abc\n', r"mine\.yaml, line 3, column 1: while scanning a quoted scalar"),
+    "tab": (TOP + b"trainer:\n\tmax_epochs: 1\n", r"mine\.yaml, line 3, column 1: .* found character '\\t'"),
+    "twice": (TOP + b"seed: 1\nseed: 2\n", r"mine\.yaml, line 3, column 1: .* found duplicate key seed"),
+    "two documents": (b"---\nseed: 1\n---\nseed: 2\n", r"mine\.yaml, line 3, column 1: .*another document"),
+    "alias": (TOP + b"seed: *none\n", r"mine\.yaml, line 2, column 7: found undefined alias"),
+    "tag": (
+        TOP + b"seed: !!python/object:os.system x\n",
+        r"mine\.yaml, line 2, column 7: could not determine",
+    ),
+    "key": (TOP + b"? [1, 2]\n: 3\n", r"mine\.yaml, line 2, column 3: .* found unhashable key"),
+    "null key": (TOP + b"null: 4\n", r"In 'experiment/mine': Incompatible key type 'NoneType'"),
+    "null byte": (TOP + b"seed: 1\x00\n", r"#x0000: .*mine\.yaml\", position 27"),
+    "latin-1": (
+        TOP + b"seed: M\xfcller\n",
+        r"In 'experiment/mine': byte 0xfc at position 27 is not UTF-8\. Save",
+    ),
+    "utf-16": ("seed: 1\n".encode("utf-16"), r"In 'experiment/mine': byte 0xff at position 0 is not UTF-8"),
+    "list": (TOP + b"- seed\n- 1\n", r"In 'experiment/mine': .*Wanted keys and values"),
+    "list of keys": (TOP + b"- seed: 1\n", r"In 'experiment/mine': .*Wanted keys and values"),
+    "number": (
+        TOP + b"3\n",
+        r"In 'experiment/mine': Invalid loaded object type: int\. Wanted keys and values",
+    ),
+    "text": (
+        b"just words\n",
+        r"chosen as experiment sets nothing at the top level\. Wanted `# @package _global_`",
+    ),
+    "no package": (
+        b"seed: 1\n",
+        r"chosen as experiment sets nothing at the top level\. Wanted `# @package _global_`",
+    ),
+    "nothing": (b"", r"chosen as experiment sets nothing at the top level"),
+    "other package": (b"# @package nosuch\nseed: 1\n", r"nosuch: unknown key"),
+    "unknown key": (TOP + b"seeds: 1\n", r"seeds: unknown key\. Did you mean 'seed'\?"),
+    "open interpolation": (TOP + b"seed: ${oops\n", r"In 'experiment/mine': no viable .* \(at seed\)"),
+    "interpolation": (
+        TOP + b"seed: ${nosuch.key}\n",
+        r"'nosuch\.key' not found \(at seed\)\. Give it a value",
+    ),
+    "resolver": (TOP + b"seed: ${nosuch:key}\n", r"Unsupported interpolation type nosuch \(at seed\)"),
+    "defaults is text": (TOP + b"defaults: moons\n", r"'experiment/mine', defaults must be a list .*Wanted"),
+    "defaults is a mapping": (
+        TOP + b"defaults:\n  /data: moons\n",
+        r"'experiment/mine', defaults must be a list",
+    ),
+    "default is a number": (
+        TOP + b"defaults:\n  - 3\n",
+        r"In 'experiment/mine': Unsupported type in defaults : int",
+    ),
+    "name is a number": (
+        TOP + b"defaults:\n  - override /data: 3\n",
+        r"'experiment/mine': Unsupported item value",
+    ),
+    "two in one": (
+        TOP + b"defaults:\n  - /a: b\n    /c: d\n",
+        r"experiment/mine: Too many keys in default item",
+    ),
+    "no such config": (
+        TOP + b"defaults:\n  - override /data: mons\n",
+        r"'data/mons'\. Did you mean 'moons'\?",
+    ),
+    "no such group": (
+        TOP + b"defaults:\n  - override /dta: moons\n",
+        r"'experiment/mine': Could not override 'dta'",
+    ),
+    "no override": (TOP + b"defaults:\n  - /data: moons\n", r"Multiple values for data\. To override"),
+    "no data": (TOP + b"defaults:\n  - override /data: null\n", r"No data is chosen"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_a_file_that_is_no_config_gets_one_sentence(kind: str, said: Said, tmp_path: Path) -> None:
+    content, wanted = DAMAGED[kind]
+    (tmp_path / "own" / "experiment").mkdir(parents=True)
+    (tmp_path / "own" / "experiment" / "mine.yaml").write_bytes(content)
+    told = said([f"--config-dir={tmp_path / 'own'}", "experiment=mine"])
+    assert re.search(wanted, told), told
+
+
+def test_a_file_that_a_run_reads_is_not_taken_for_a_config() -> None:
     try:
-        with pytest.raises(SystemExit) as ended:
-            main()
-    finally:
-        os.environ.pop("HYDRA_FULL_ERROR", None)
-        GlobalHydra.instance().clear()
-    said = capsys.readouterr().err
-    assert ended.value.code in (1, 2)
-    assert said.startswith("error: ")
-    assert said.endswith("\n")
-    assert said.count("\n") == 1, said
-    assert wanted in said
-    assert not [*tmp_path.rglob("*.*")], "a mistake is no run"
+        b"\xfc".decode()
+    except UnicodeDecodeError as error:
+        assert composition.sentence(error) is None
+    assert composition.sentence(ValueError("Unsupported type in defaults : int")) is None
+    try:
+        raise RuntimeError("cannot go on") from yaml.parser.ParserError(
+            "while reading", None, "no YAML", None
+        )
+    except RuntimeError as error:
+        assert "no YAML. This cannot be read as YAML" in str(composition.sentence(error))
 
 
 def test_there_are_a_hundred() -> None:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import subprocess
 import sys
 from functools import partial
@@ -343,6 +344,87 @@ def test_chamfer_has_gradients():
     assert left.grad is not None and left.grad[:, :12].isfinite().all() and (left.grad[:, 12:] == 0).all()
 
 
+LONG = np.longdouble
+"""Squares of float64 numbers within its range."""
+
+
+def by_loops(a, b):
+    """Eq. 6.6 in extended precision, and its derivative in both clouds."""
+    a, b = a.astype(LONG), b.astype(LONG)
+    slopes = [np.zeros_like(a), np.zeros_like(b)]
+    total = LONG(0)
+    for one, other, here, there in ((a, b, *slopes), (b, a, *slopes[::-1])):
+        nearest_point = ((one[:, None] - other) ** 2).sum(-1).argmin(1)
+        offset = one - other[nearest_point]
+        total += (offset**2).sum(-1).mean()
+        here += 2 * offset / len(one)
+        np.add.at(there, nearest_point, -2 * offset / len(one))
+    return total, slopes
+
+
+@DTYPES
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize("share", [1.0, 1e-3])
+@pytest.mark.parametrize(
+    "exponent", [-310, -200, -160, -45, -40, -30, -23, -19, -15, 0, 15, 18, 19, 20, 30, 38, 150, 160, 300]
+)
+def test_chamfer_is_right_wherever_a_number_can_hold_it(exponent, share, padded, dtype):
+    """Beside an ordinary pair of clouds; where none can, a sentence and never infinity or 0."""
+    limit = torch.finfo(dtype)
+    if not limit.tiny * limit.eps < 10.0**exponent < limit.max / 10:
+        return
+    generator = np.random.default_rng(9)
+    clouds = []
+    for count, most in ((40, 60), (30, 35)):
+        extreme = torch.tensor(ball(count, generator)).to(dtype) * 10.0**exponent
+        extreme[: count // 2] *= share
+        plain = torch.tensor(ball(most, generator)).to(dtype)
+        whole = torch.full((2, most, 3), math.nan, dtype=dtype)
+        whole[0], whole[1, :count] = plain, extreme
+        clouds.append(whole if padded else extreme[None])
+    sizes = [torch.tensor([60, 40]), torch.tensor([35, 30])] if padded else [None, None]
+    wanted, slopes = by_loops(
+        *(cloud[-1, :count].numpy() for cloud, count in zip(clouds, (40, 30), strict=True))
+    )
+    a, b = (cloud.clone().requires_grad_() for cloud in clouds)
+    if not limit.tiny <= wanted <= limit.max / 1.01:
+        try:
+            found = float(chamfer(a, b, *sizes)[-1].detach())
+        except DataError as error:
+            side = "near each other .* smaller unit" if wanted < 1 else "far from each other .* larger unit"
+            assert re.search(side, str(error)) and f"Clouds {len(clouds[0]) - 1} of" in str(error)
+        else:  # with fewer digits
+            assert 0 < found < limit.tiny * 1.01 and abs(found - wanted) <= 3 * limit.tiny * limit.eps
+        return
+    found = chamfer(a, b, *sizes)[-1]
+    assert float(found.detach()) == pytest.approx(float(wanted), rel=20 * limit.eps)
+    found.backward()
+    for cloud, slope in ((a, slopes[0]), (b, slopes[1])):
+        assert cloud.grad is not None and cloud.grad.isfinite().all()
+        own = cloud.grad[-1, : len(slope)].numpy().astype(LONG)
+        assert np.abs(own - slope).max() <= 20 * limit.eps * np.abs(slope).max() + limit.tiny * limit.eps
+        assert (cloud.grad[-1, len(slope) :] == 0).all()
+
+
+@DTYPES
+def test_chamfer_of_equal_clouds_is_0_at_every_scale(dtype):
+    for exponent in (-300, -40, -23, 0, 20, 37, 300):
+        if torch.finfo(dtype).tiny < 10.0**exponent < torch.finfo(dtype).max:
+            cloud = (torch.tensor(ball(20)).to(dtype) * 10.0**exponent)[None].requires_grad_()
+            found = chamfer(cloud, cloud.flip(1))
+            assert found.item() == 0
+            found.backward()
+            assert cloud.grad is not None and (cloud.grad == 0).all()
+
+
+def test_chamfer_has_second_derivatives():
+    generator = np.random.default_rng(7)
+    a = torch.tensor(ball(5, generator))[None].requires_grad_()
+    b = torch.tensor(ball(6, generator))[None].requires_grad_()
+    sizes = torch.tensor([4]), torch.tensor([6])
+    assert torch.autograd.gradgradcheck(lambda x, y: chamfer(x, y, *sizes), (a, b))
+
+
 @DTYPES
 @pytest.mark.parametrize("kind", ["torus", "rounded", "duplicates", "one place", "clusters"])
 @pytest.mark.parametrize("size", [1, 97, 5000])
@@ -392,6 +474,40 @@ def test_two_readings_of_the_chunks_normalise_as_the_formula():
     found = torch.cat([normal(chunk, middle.mean, reach.norm) for chunk in chunks])
     wanted = local / np.linalg.norm(local, axis=1).max()
     assert float((found - torch.tensor(wanted)).abs().max()) < 1e-9
+
+
+@DTYPES
+@pytest.mark.parametrize("columns", [3, 5])
+@pytest.mark.parametrize("size", [1, 10, 100])
+def test_one_buffer_may_bring_all_chunks(size, columns, dtype):
+    """Filled anew for each, as a reader of large files does; queries and centre are of a buffer, too."""
+    generator = np.random.default_rng(11)
+    cloud = torch.tensor(generator.normal(size=(100, columns)), dtype=dtype) + 3
+    queries, centre = torch.tensor(ball(20, generator), dtype=dtype), torch.tensor([1.0, 2, 3]).double()
+
+    def read(chunks, asked, centre):
+        parts = Middle(), Reach(centre), Stream(asked)
+        asked.mul_(0), centre.mul_(0)
+        for chunk in chunks:
+            for part in parts:
+                part.add(chunk)
+        middle, reach, stream = parts
+        return [middle.mean, torch.tensor(reach.norm), *stream.result()]
+
+    def filled_again():
+        buffer = torch.empty(size, columns, dtype=dtype)
+        for chunk in cloud.split(size):
+            yield buffer.copy_(chunk)
+        buffer.fill_(math.nan)
+
+    again = read(filled_again(), queries.clone(), centre.clone())
+    wanted = nearest(cloud[None, :, :3], queries)
+    torch.testing.assert_close(again[0], cloud[:, :3].double().mean(0), rtol=1e-12, atol=0)
+    assert float(again[1]) == pytest.approx(
+        float((cloud[:, :3].double() - centre).norm(dim=1).max()), rel=1e-6
+    )
+    assert torch.equal(again[2], wanted.distance[0]) and torch.equal(again[3], wanted.index[0])
+    assert torch.equal(again[4], cloud[wanted.index[0]])
 
 
 def test_a_stream_refuses_what_is_empty_bad_or_other():

@@ -1,15 +1,23 @@
 """Discovery by entry points: lazy, clash-proof, and one broken package disturbs nobody else."""
 
-from importlib.metadata import EntryPoint
+import re
+import sys
+from importlib.metadata import EntryPoint, PathDistribution
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 
 import framework.configuration.registry as registry
 from framework.configuration.assembly import entries
-from framework.configuration.registry import GROUPS, config_folders, find, installed, load
+from framework.configuration.composition import PluginConfigs, register
+from framework.configuration.composition import folder as folder_of_configs
+from framework.configuration.registry import GROUPS, config_folders, find, installed, load, refused
 from framework.errors import ConfigError
-from framework.modes.plugins import describe
+from framework.modes.plugins import describe, show
+from framework.runs.provenance import package_versions
 
 
 class Distribution:
@@ -28,20 +36,67 @@ def fake(monkeypatch: pytest.MonkeyPatch):
     """Pretend that packages are installed; gives the list to fill."""
     entries: list[EntryPoint] = []
     installed.cache_clear()
+    refused.cache_clear()
     monkeypatch.setattr(
         registry, "entry_points", lambda group: [item for item in entries if item.group == group]
     )
     yield entries
     installed.cache_clear()
+    refused.cache_clear()
 
 
-def test_one_name_from_two_packages_is_refused_naming_both(fake: list[EntryPoint]) -> None:
+def test_one_name_from_several_packages_is_refused_naming_all_and_breaks_only_itself(
+    fake: list[EntryPoint], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     fake += [
         entry("twin", "a.b:C", "framework.encoder", "first-package"),
         entry("twin", "d.e:F", "framework.encoder", "second-package"),
+        entry("twin", "a.b:C", "framework.encoder", "first-package"),
+        entry("triple", "a.b:C", "framework.metric", "first-package"),
+        entry("triple", "d.e:F", "framework.metric", "second-package"),
+        entry("triple", "g.h:I", "framework.metric", "third-package"),
+        entry("twin", "j.k:L", "framework.metric", "third-package"),
+        entry("other", "plugins.encoder.mlp.encoder:MLP", "framework.encoder", "third-package"),
     ]
-    with pytest.raises(ConfigError, match=r"'twin'.*first-package.*second-package"):
-        installed("encoder")
+    assert (list(installed("encoder")), list(installed("metric"))) == (["other"], ["twin"])
+    assert load("encoder", "other").group == "encoder"
+    for ask in (find, load):
+        with pytest.raises(
+            ConfigError, match=r"'twin': a\.b:C of first-package 1\.0 and d\.e:F of second-package"
+        ):
+            ask("encoder", "twin")
+        with pytest.raises(
+            ConfigError, match=r"'triple'.*first-package.*second-package.*third-package.*Uninstall"
+        ):
+            ask("metric", "triple")
+    with pytest.raises(ConfigError, match=r"called 'twim'\. Did you mean 'twin'\? Installed: other\."):
+        find("encoder", "twim")
+    monkeypatch.setenv("COLUMNS", "400")
+    show()
+    listed = capsys.readouterr().out
+    for told in ("twin  (refused) Several", "triple  (refused) Several", "other  ", "second-package 1.0"):
+        assert told in listed
+    assert listed.count("(none installed)") == len(GROUPS) - 2
+
+
+def test_what_is_left_of_a_package_disturbs_nobody(
+    fake: list[EntryPoint], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its files and entry points without the METADATA that name it."""
+    (tmp_path / "half-1.0.dist-info").mkdir()
+    (tmp_path / "half-1.0.dist-info" / "entry_points.txt").write_text(
+        "[framework.encoder]\nhalf = half:Encoder\n"
+    )
+    (left,) = PathDistribution(tmp_path / "half-1.0.dist-info").entry_points
+    vars(left)["dist"] = PathDistribution(tmp_path / "half-1.0.dist-info")
+    fake += [left, entry("whole", "plugins.encoder.mlp.encoder:MLP", "framework.encoder", "torch")]
+    assert list(installed("encoder")) == ["whole"]
+    assert "torch" in package_versions()
+    with pytest.raises(
+        ConfigError, match=r"'half' \(half:Encoder\) is of a package whose METADATA file is gone"
+    ):
+        load("encoder", "half")
+    show()
 
 
 def test_the_same_entry_seen_twice_is_no_clash(fake: list[EntryPoint]) -> None:
@@ -95,18 +150,94 @@ def test_a_missing_module_is_had_by_the_extra_that_asks_for_it(
         load("density_head", "trees")
 
 
-def test_two_plugins_with_one_config_are_refused(
+@pytest.mark.parametrize("names", [("one", "two"), ("same", "same")], ids=["two names", "one name"])
+def test_of_two_plugins_with_one_config_that_config_is_refused(
+    names: tuple[str, str], fake: list[EntryPoint], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, package in zip(names, ("package_one", "package_two"), strict=True):
+        folder = tmp_path / package / "conf" / "encoder"
+        folder.mkdir(parents=True)
+        (tmp_path / package / "__init__.py").write_text("raise RuntimeError('must not be imported')")
+        for config in ("same", f"of_{package}"):
+            text = f"# @package encoder.{config}\nname: {config}\n"
+            (folder / f"{config}.yaml").write_text(text)
+        fake += [entry(name, f"{package}.conf", "framework.conf", package)] * 2
+    monkeypatch.syspath_prepend(tmp_path)
+    assert len(config_folders()) == 2
+    monkeypatch.setattr(PluginConfigs, "folders", {})  # given back at the end
+    register()
+
+    def composed(chosen: str) -> set[str]:
+        with initialize_config_dir(str(folder_of_configs()), version_base="1.3"):
+            return set(compose("config", [f"encoder={chosen}", "experiment_name=x"]).encoder)
+
+    try:
+        assert composed("[of_package_one,of_package_two]") == {"of_package_one", "of_package_two"}
+        for chosen in ("same", "[of_package_one,same]"):
+            with pytest.raises(
+                ConfigError, match=r"encoder/same\.yaml.*package_one.*package_two.*Uninstall all but one"
+            ):
+                composed(chosen)
+    finally:
+        GlobalHydra.instance().clear()
+
+
+@pytest.mark.parametrize(
+    "value", ["", ".conf", "no_such_package.conf", "not a name.conf", "module_without_spec.conf"]
+)
+def test_a_config_folder_that_is_not_there_disturbs_nobody(
+    value: str, fake: list[EntryPoint], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = ModuleType("module_without_spec")
+    module.__spec__ = None
+    monkeypatch.setitem(sys.modules, "module_without_spec", module)
+    fake.append(entry("half", value, "framework.conf", "half-package"))
+    assert config_folders() == {}
+
+
+SOURCES = {
+    "latin-1": (
+        "# -*- coding: latin-1 -*-\nclass C:\n    'Müller et al.'\n".encode("latin-1"),
+        "Müller et al.",
+    ),
+    "utf-8 with a mark": (b"\xef\xbb\xbfclass C:\n    'Plain.'\n", "Plain."),
+    "latin-1 that does not say so": (
+        "class C:\n    'Müller'\n".encode("latin-1"),
+        r"\(broken: __init__\.py.*\)",
+    ),
+    "an encoding that is none": (b"# -*- coding: nothing -*-\nclass C:\n    'Text.'\n", r"\(broken: .*\)"),
+    "a null byte": (b"class C:\n    'a\x00'\n", r"\(broken: .*\)"),
+    "no Python": (b"class C\n", r"\(broken: __init__\.py line 1 does not parse\)"),
+    "far too deep": (b"x = " + b"(" * 5000 + b")" * 5000, r"\(broken: .*\)"),
+    "nothing": (b"", r"\(class not found\)"),
+}
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_any_source_is_described_or_called_broken(
+    source: str, fake: list[EntryPoint], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, wanted = SOURCES[source]
+    (tmp_path / "package_odd").mkdir()
+    (tmp_path / "package_odd" / "__init__.py").write_bytes(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    fake.append(entry("odd", "package_odd:C", "framework.encoder", "odd-package"))
+    told = describe("encoder", installed("encoder")["odd"])
+    assert re.fullmatch(wanted, told.summary), told.summary
+    show()
+
+
+def test_a_class_that_is_not_whole_is_refused(
     fake: list[EntryPoint], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("package_one", "package_two"):
-        folder = tmp_path / name / "conf" / "encoder"
-        folder.mkdir(parents=True)
-        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('must not be imported')")
-        (folder / "same.yaml").write_text("name: same")
-        fake.append(entry(name, f"{name}.conf", "framework.conf", name))
+    text = "from framework.density_head import DensityHead\nclass Half(DensityHead):\n    def forward(self, raw): ...\n"
+    (tmp_path / "half_for_test.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ConfigError, match=r"'package_one' and 'package_two'.*both ship encoder/same\.yaml"):
-        config_folders()
+    fake.append(entry("half", "half_for_test:Half", "framework.density_head", "half-package"))
+    with pytest.raises(
+        ConfigError, match=r"'half'.*half-package 1\.0\) lacks .*loss.*framework\.density_head"
+    ):
+        load("density_head", "half")
 
 
 def test_a_plugin_may_not_configure_hydra(

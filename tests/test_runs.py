@@ -114,6 +114,46 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     assert status(killed) == "FINISHED"
 
 
+STOPS = ["trainer.patience=1", "trainer.max_epochs=30", "optimizer.learning_rate=0.3"]
+"""A run whose validation loss soon is higher than before."""
+
+
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("further", [[], ["+trainer.min_epochs=16", "trainer.keep=last"]], ids=["stops", "goes on"])
+def test_a_run_killed_after_it_stopped_early_trains_no_further(
+    framework: Framework, tmp_path: Path, every: int, further: list[str]
+) -> None:
+    killed = framework(
+        *(*QUIET, *STOPS, *further, f"trainer.check_val_every_n_epoch={every}"),
+        *("+data.signal_at=0", f"+data.signal_marker={tmp_path / 'marker'}"),
+    )
+    assert killed.code == -signal.SIGKILL, "in its pictures"
+    told = re.compile(r"^stopped early at epoch \d+, kept \d+$", re.MULTILINE)
+    losses, results = killed.losses(), (killed.folder / "results.json").read_text()
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert killed.losses() == losses
+    assert told.findall(resumed.out) == told.findall(killed.out) != []
+    again = (killed.folder / "results.json").read_text()
+    assert json.loads(again)["log_likelihood"] == json.loads(results)["log_likelihood"]
+
+
+def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, tmp_path: Path) -> None:
+    """Killed in the epoch after the first validation that was no better, of which two end it."""
+    patient = [*QUIET, *STOPS, "trainer.patience=2", "pictures=false"]
+    whole = framework(*patient, folder="whole")
+    assert whole.code == 0, whole.out
+    validated = list(whole.values("validation/loss").items())
+    worse = next(step for (step, loss), (_, before) in zip(validated[1:], validated, strict=False) if loss >= before)
+    killed = framework(
+        *patient, f"+data.signal_at={worse + 3}", f"+data.signal_marker={tmp_path / 'marker'}", folder="killed"
+    )
+    assert killed.code == -signal.SIGKILL
+    resumed = framework(f"resume={killed.folder}")
+    assert resumed.code == 0, resumed.out
+    assert killed.losses() == whole.losses()
+
+
 def test_a_rate_that_waits_for_the_validation_loss_goes_on_with_the_same_bits(
     framework: Framework, tmp_path: Path
 ) -> None:
@@ -150,7 +190,9 @@ def test_what_a_resumed_run_computes_is_not_changed(
     assert "threads, workers, logger.uri may be given" in done.out
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)]
+)
 def test_a_signal_saves_and_says_so(
     framework: Framework, whole: Done, tmp_path: Path, number: int, code: int
 ) -> None:
@@ -178,6 +220,22 @@ def test_a_signal_saves_and_says_so(
     assert [path.name for path in best.parent.iterdir()] == ["model.ckpt"], (
         "a finished run keeps its model alone"
     )
+
+
+def test_a_run_that_was_never_to_be_resumed_is_resumed_when_asked(
+    framework: Framework, whole: Done, tmp_path: Path
+) -> None:
+    stop = [
+        "+data.signal_at=14",
+        f"+data.signal_number={int(signal.SIGTERM)}",
+        f"+data.signal_marker={tmp_path / 'm'}",
+    ]
+    stopped = framework(*QUIET, *stop, "resume=never", f"hydra.run.dir={tmp_path / 'run'}")
+    assert stopped.code == 143, stopped.out
+    resumed = framework(f"resume={stopped.folder}")
+    assert resumed.code == 0, resumed.out
+    assert "resuming from" in resumed.out
+    assert stopped.losses() == whole.losses()
 
 
 def test_a_nan_label_stops_before_the_weights_are_touched(framework: Framework) -> None:

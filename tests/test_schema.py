@@ -1,17 +1,30 @@
 """From constructor signatures to checked configs: every fault becomes a sentence."""
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+import importlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date, timedelta
+from decimal import Decimal
+from enum import Enum, IntEnum
+from pathlib import Path
+from typing import Annotated, Any, Dict, List, Literal, NamedTuple, Optional, Tuple, Union  # noqa: UP035
+from uuid import UUID
 
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import Field
+from pydantic import AfterValidator, BaseModel, Field
+from typing_extensions import TypedDict
 
 import framework.configuration.schema as schema
+from framework.configuration.registry import GROUPS, installed
+from framework.configuration.registry import load as load_installed
 from framework.configuration.schema import build, forbid_targets, resolve
 from framework.encoder import Encoder
 from framework.errors import ConfigError
+from framework.storage import checkpoints
 
 
 class Toy(Encoder):
@@ -64,9 +77,13 @@ class Demanding(Toy):
         super().__init__((1,))
 
 
+CLASSES: dict[str, type] = {"toy": Toy, "demanding": Demanding, "framed": Framed}
+
+
 @pytest.fixture(autouse=True)
-def toys(monkeypatch: pytest.MonkeyPatch) -> None:
-    classes = {"toy": Toy, "demanding": Demanding, "framed": Framed}
+def toys(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
+    """The classes that are there by name; a test may add its own."""
+    classes = dict(CLASSES)
 
     def load(group: str, name: str) -> type:
         if name not in classes:
@@ -74,6 +91,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
         return classes[name]
 
     monkeypatch.setattr(schema, "load", load)
+    return classes
 
 
 def test_a_name_alone_takes_every_default() -> None:
@@ -139,6 +157,405 @@ def test_the_fields_of_a_value_are_keys_beside_the_others() -> None:
 def test_a_constructor_that_asks_for_the_unknown_is_told_what_there_is() -> None:
     with pytest.raises(ConfigError, match=r"asks the framework for `moon`.*may ask for: input_shape"):
         build("encoder", {"name": "demanding"}, input_shape=(1,))
+
+
+NOTHING = object()
+
+
+def taking(annotation: Any, default: Any = NOTHING, key: str = "value") -> type[Toy]:
+    """A class with one parameter, which its instances hold as `taken`."""
+
+    class Taking(Toy):
+        def __init__(self, input_shape: tuple[int, ...], **given: Any) -> None:
+            super().__init__(input_shape)
+            self.taken = given[key]
+
+    called = "" if default is NOTHING else " = default"
+    scope: dict[str, Any] = {"default": default, "annotation": annotation, "whole": Taking.__init__}
+    exec(
+        f"def __init__(self, input_shape, *, {key}: annotation{called}): whole(self, input_shape, {key}={key})",
+        scope,
+    )
+    Taking.__init__ = scope["__init__"]
+    return Taking
+
+
+class Color(Enum):
+    RED = "red"
+    BLUE = "blue"
+
+
+class Level(IntEnum):
+    LOW = 1
+    HIGH = 2
+
+
+class Corner(NamedTuple):
+    x: int
+    y: float = 0.5
+
+
+class Inner(BaseModel):
+    a: int = 1
+    where: Path = Path("/tmp")
+
+
+class Renamed(BaseModel):
+    a: int = Field(1, alias="first")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Value:
+    x: int = 1
+    color: Color = Color.RED
+
+
+@dataclass
+class Positional:
+    x: int
+    more: list[int] = field(default_factory=list)
+
+
+class Table(TypedDict):
+    x: int
+    where: Path
+
+
+KINDS: dict[str, tuple[Any, Any, Any]] = {
+    "int": (int, 3, 3),
+    "float": (float, -0.0, -0.0),
+    "not a number": (float, math.nan, math.nan),
+    "complex": (complex, 2j, 2j),
+    "bool": (bool, True, True),
+    "text": (str, "", ""),
+    "literal": (Literal["a", 3], "a", "a"),
+    "constraint": (Annotated[int, Field(gt=0)], 1, 1),
+    "path": (Path, Path("/tmp/x"), "/tmp/x"),
+    "enum": (Color, Color.BLUE, "blue"),
+    "enum of numbers": (Level, Level.HIGH, 2),
+    "model": (Inner, Inner(a=2, where=Path("/x")), {"a": 2, "where": "/x"}),
+    "model with aliases": (Renamed, Renamed(first=4), {"first": 4}),
+    "value": (Value, Value(x=4, color=Color.BLUE), {"x": 4, "color": "blue"}),
+    "positional": (Positional, Positional(1, [2]), {"x": 1, "more": [2]}),
+    "named tuple": (Corner, Corner(1, 2.0), (1, 2.0)),
+    "typed dict": (Table, {"x": 1, "where": Path("/x")}, {"x": 1, "where": "/x"}),
+    "date": (date, date(2020, 1, 31), "2020-01-31"),
+    "duration": (timedelta, timedelta(seconds=90), "PT1M30S"),
+    "decimal": (Decimal, Decimal("0.10"), "0.10"),
+    "identifier": (UUID, UUID(int=7), str(UUID(int=7))),
+    "set": (set[int], {3, 1, 2}, {1, 2, 3}),
+    "bare list": (List, [1, "a"], [1, "a"]),  # noqa: UP006
+    "bare tuple": (Tuple, (1, "a"), (1, "a")),  # noqa: UP006
+    "bare dict": (Dict, {"q": [1]}, {"q": [1]}),  # noqa: UP006
+    "anything": (Any, {"a": [1]}, {"a": [1]}),
+}
+"""Annotation, a value of it, and that as a config and a checkpoint hold it."""
+WRAPS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "itself": (lambda kind: kind, lambda one: one),
+    "optional": (lambda kind: Optional[kind], lambda one: one),  # noqa: UP045
+    "or none": (lambda kind: Union[kind, None], lambda one: one),  # noqa: UP007
+    "annotated": (lambda kind: Annotated[kind, Field(description="told")], lambda one: one),
+    "list": (lambda kind: list[kind], lambda one: [one, one]),
+    "tuple": (lambda kind: tuple[kind, ...], lambda one: (one, one)),
+    "sequence": (lambda kind: Sequence[kind], lambda one: [one]),
+    "dict": (lambda kind: dict[str, kind], lambda one: {"a": one}),
+    "mapping": (lambda kind: Mapping[str, kind], lambda one: {"a": one}),
+    "list of lists": (lambda kind: list[list[kind]], lambda one: [[one], []]),
+}
+
+
+def alike(found: Any, wanted: Any) -> bool:
+    """Equal and of one type, where NaN is NaN."""
+    return type(found) is type(wanted) and (found == wanted or repr(found) == repr(wanted))
+
+
+@pytest.mark.parametrize(
+    "kind, wrap",
+    # a value by itself has no key of its own, but one for each field
+    [(kind, wrap) for kind in KINDS for wrap in WRAPS if (kind, wrap) != ("value", "itself")],
+)
+def test_a_parameter_arrives_as_it_is_annotated_and_is_kept_as_plain_values(
+    kind: str, wrap: str, toys: dict[str, type], tmp_path: Path
+) -> None:
+    (annotation, value, plain), (around, several) = KINDS[kind], WRAPS[wrap]
+    toys["by default"] = taking(around(annotation), several(value))
+    toys["by config"] = taking(around(annotation))
+    for config in ({"name": "by default"}, {"name": "by config", "value": several(plain)}):
+        resolved = resolve("encoder", config)
+        assert alike(resolved["value"], several(plain))
+        assert alike(resolve("encoder", resolved), resolved)
+        assert alike(build("encoder", resolved, input_shape=(1,)).taken, several(value))
+    checkpoints.write({"value": several(plain)}, tmp_path / "one.ckpt")
+    assert alike(checkpoints.read(tmp_path / "one.ckpt"), {"value": several(plain)})
+
+
+@pytest.mark.parametrize(
+    "annotation", [list, Any, list[Any], dict[str, Any], list[list[int]], Inner, Positional]
+)
+def test_no_build_shares_an_object_with_another(annotation: Any, toys: dict[str, type]) -> None:
+    """Nor with the default or the config: whoever changes what he was given changes nobody else's."""
+    default: Any = {dict[str, Any]: {"a": [1]}, Inner: Inner(), Positional: Positional(1)}.get(
+        annotation, [[1], [2]]
+    )
+    toys["own"] = taking(annotation, default)
+    resolved = resolve("encoder", "own")
+    one, other = (build("encoder", resolved, input_shape=(1,)).taken for _ in range(2))
+    before = repr(default), repr(resolved)
+    (vars(one) if hasattr(one, "__dict__") else one).clear()
+    assert (repr(default), repr(resolved)) == before and repr(other) == before[0]
+    assert repr(build("encoder", resolve("encoder", "own"), input_shape=(1,)).taken) == before[0]
+
+
+def test_what_is_lazy_or_frozen_arrives_whole(toys: dict[str, type], tmp_path: Path) -> None:
+    toys["lazy"], toys["frozen"] = taking(Iterable[int], (1, 2)), taking(frozenset[int], frozenset({1, 2}))
+    for name, wanted in {"lazy": [1, 2], "frozen": frozenset({1, 2})}.items():
+        resolved = resolve("encoder", name)
+        checkpoints.write({"part": resolved}, tmp_path / "one.ckpt")
+        assert build("encoder", resolved, input_shape=(1,)).taken == wanted
+        assert resolve("encoder", resolved) == resolved
+
+
+def a_function() -> None:
+    """Nothing that a checkpoint keeps."""
+
+
+@pytest.mark.parametrize(
+    "annotation, default, message",
+    [
+        (
+            Callable[[], None],
+            a_function,
+            r"encoder\.value = .*it holds a function, which no checkpoint keeps",
+        ),
+        (torch.dtype, torch.float32, "it holds a dtype, which no checkpoint keeps"),
+        (Any, [{"a": torch.zeros(2)}], "it holds a Tensor, which no checkpoint keeps"),
+        (
+            Annotated[float, AfterValidator(math.radians)],
+            180.0,
+            "changes what it is given.*in its constructor",
+        ),
+        (
+            Annotated[Path, Field(strict=True)],
+            Path("/x"),
+            r"encoder\.value = '/x': .*That is how Taking keeps what it was given",
+        ),
+        (Annotated[int, Field(gt=0)], 0, r"encoder\.value = 0: Input should be greater than 0"),
+        (int, None, r"encoder\.value = None: Input should be a valid integer"),
+        ([int], [1], r"annotation of `value`, \[<class 'int'>\], cannot be (checked|evaluated)"),
+        ("Unknown", None, "annotation of `value`, Unknown, cannot be evaluated: NameError"),
+        ("list[", None, "cannot be evaluated: SyntaxError"),
+    ],
+)
+def test_what_cannot_be_kept_is_refused_before_anything_is_trained(
+    annotation: Any, default: Any, message: str, toys: dict[str, type]
+) -> None:
+    toys["odd"] = taking(annotation, default)
+    with pytest.raises(ConfigError, match=message):
+        resolve("encoder", "odd")
+
+
+@pytest.mark.parametrize("around", ["itself", "list", "dict", "optional"])
+@pytest.mark.parametrize("kind", [Inner, Positional, Value])
+def test_a_misspelt_key_within_a_parameter_is_named(kind: type, around: str, toys: dict[str, type]) -> None:
+    wrap, several = WRAPS[around]
+    toys["odd"] = taking(wrap(Optional[kind]))  # noqa: UP045
+    wrong = {Inner: "wher", Positional: "moer", Value: "colr"}[kind]
+    given = {"wher": 1} if kind is Inner else {"x": 1, wrong: 2}
+    with pytest.raises(ConfigError, match=rf"encoder\.value\..*{wrong}: unknown key\. Did you mean"):
+        resolve("encoder", {"name": "odd", "value": several(given)})
+
+
+@pytest.mark.parametrize(
+    "key", ["schema", "copy", "json", "model_config", "model_fields", "_scale", "__x", "dict", "value"]
+)
+def test_a_key_may_have_any_name(key: str, toys: dict[str, type], recwarn: pytest.WarningsRecorder) -> None:
+    toys["odd"] = taking(float, 3, key)
+    assert resolve("encoder", "odd") == {"name": "odd", key: 3.0}
+    assert build("encoder", resolve("encoder", {"name": "odd", key: "4"}), input_shape=(1,)).taken == 4.0
+    with pytest.raises(ConfigError, match=rf"encoder\.{key} = 'a': .*number"):
+        resolve("encoder", {"name": "odd", key: "a"})
+    assert not recwarn.list
+
+
+def test_a_part_may_be_annotated_in_many_ways(toys: dict[str, type]) -> None:
+    one = {
+        "plain": Encoder,
+        "optional": Optional[Encoder],  # noqa: UP045
+        "annotated": Annotated[Encoder, Field(description="told")],
+    }
+    several = {"list": list[Encoder], "tuple": tuple[Encoder, ...], "sequence": Sequence[Encoder] | None}
+    for name, annotation in (one | several).items():
+        toys[name] = taking(annotation)
+        config = {"name": name, "value": "toy" if name in one else ["toy", {"name": "toy", "width": 3}]}
+        taken = build("encoder", resolve("encoder", config), input_shape=(2,)).taken
+        if name in one:
+            assert isinstance(taken, Toy)
+        else:
+            assert [part.width for part in taken] == [8, 3]
+            assert type(taken) is (tuple if name == "tuple" else list)
+    assert (
+        build("encoder", resolve("encoder", {"name": "optional", "value": None}), input_shape=(2,)).taken
+        is None
+    )
+
+
+MODULE = """
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from framework.encoder import Encoder
+
+if TYPE_CHECKING:
+    from framework.target import Target
+
+
+class Later(Encoder):
+    bibtex = ""
+
+    def __init__(self, target: Target, /, input_shape: NoSuch, *, widths: list[int] = [1], inner: Encoder = None):
+        super().__init__()
+        self.target, self.input_shape, self.taken, self.inner = target, input_shape, widths, inner
+
+    def forward(self, inputs: Target) -> Target:
+        return inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outside:
+    side: Annotated[int, Field(gt=0)] = 4
+    more: list[Inside] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Inside:
+    x: int
+
+
+class Unread(Later):
+    def __init__(self, target: Target, input_shape: NoSuch, *, aim: Target | None = None):
+        super().__init__(target, input_shape)
+"""
+
+
+def test_annotations_of_what_the_framework_gives_are_never_evaluated(
+    toys: dict[str, type], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "written_later.py").write_text(MODULE, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("written_later")
+    toys["later"], toys["unread"] = module.Later, module.Unread
+    built = build("encoder", resolve("encoder", "later"), target="given", input_shape=(1,))
+    assert (built.target, built.input_shape, built.taken) == ("given", (1,), [1])
+    with pytest.raises(ConfigError, match=r"encoder\.widths\.0 = 'a'"):
+        resolve("encoder", {"name": "later", "widths": ["a"]})
+    with pytest.raises(ConfigError, match=r"Unread: the annotation of `aim`, .*Target.*TYPE_CHECKING"):
+        resolve("encoder", "unread")
+
+    @dataclass(frozen=True, kw_only=True)
+    class Here(module.Outside):
+        """Its base's annotations are names of the base's module."""
+
+        own: int = 2
+
+    toys["here"] = taking(Here)
+    assert resolve("encoder", "here") == {"name": "here", "side": 4, "more": [], "own": 2}
+    built = build("encoder", resolve("encoder", {"name": "here", "more": [{"x": 1}]}), input_shape=(1,))
+    assert built.taken == Here(more=[module.Inside(1)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nested:
+    """A value within a value, and an object made anew for each."""
+
+    frame: Frame = Frame(side=20, label="inner")
+    notes: list[str] = field(default_factory=lambda: ["a"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clash:
+    width: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Called:
+    name: str = "x"
+
+
+def test_values_hold_values(toys: dict[str, type]) -> None:
+    toys["usual"] = taking(Nested)
+    toys["given"] = taking(Nested, Nested(frame=Frame(side=30, label="given"), notes=["b"]))
+    assert resolve("encoder", "usual") == {
+        "name": "usual", "side": 20, "label": "inner", "inner": None, "notes": ["a"],
+    }  # fmt: skip
+    built = [build("encoder", resolve("encoder", "given"), input_shape=(1,)).taken for _ in range(2)]
+    assert built[0] == built[1] == Nested(frame=Frame(side=30, label="given"), notes=["b"])
+    assert built[0].notes is not built[1].notes
+    config = resolve("encoder", {"name": "usual", "side": 9, "inner": "toy"})
+    assert build("encoder", config, input_shape=(1,)).taken.frame.side == 9
+
+
+class TwoValues(Toy):
+    def __init__(self, input_shape: tuple[int, ...], *, one: Frame, two: Nested) -> None:
+        super().__init__(input_shape)
+
+
+class ValueAndKey(Toy):
+    def __init__(self, input_shape: tuple[int, ...], *, one: Clash, width: int = 2) -> None:
+        super().__init__(input_shape)
+
+
+class KeyAndValue(Toy):
+    def __init__(self, input_shape: tuple[int, ...], *, width: int = 2, one: Clash = Clash()) -> None:
+        super().__init__(input_shape)
+
+
+class NamedItself(Toy):
+    def __init__(self, input_shape: tuple[int, ...], *, name: str = "toy") -> None:
+        super().__init__(input_shape)
+
+
+class NamedByValue(Toy):
+    def __init__(self, input_shape: tuple[int, ...], *, one: Called = Called()) -> None:
+        super().__init__(input_shape)
+
+
+@pytest.mark.parametrize(
+    "cls, message",
+    [
+        (TwoValues, "TwoValues has the key 'side' twice, as a field of `one` and as a field of `two`"),
+        (ValueAndKey, "'width' twice, as a field of `one` and as the parameter `width`"),
+        (KeyAndValue, "'width' twice, as the parameter `width` and as a field of `one`"),
+        (NamedItself, "'name' twice, as the name of the plugin and as the parameter `name`.*Rename"),
+        (NamedByValue, "'name' twice, as the name of the plugin and as a field of `one`"),
+    ],
+)
+def test_a_key_that_stands_twice_is_named(cls: type, message: str, toys: dict[str, type]) -> None:
+    toys["twice"] = cls
+    for config in ("twice", {"name": "twice", "side": 9, "width": 1}):
+        with pytest.raises(ConfigError, match=message):
+            resolve("encoder", config)
+
+
+def test_a_loaded_model_is_built_with_none_for_what_only_training_needs(toys: dict[str, type]) -> None:
+    toys["initial"] = taking(Path)
+    resolved = resolve("encoder", {"name": "initial", "value": "/weights"})
+    assert build("encoder", {**resolved, "value": None}, input_shape=(1,)).taken is None
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_installed_plugin_is_kept_as_it_is_read(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schema, "load", load_installed)
+    for name in installed(group):
+        try:
+            resolved = resolve(group, name)
+        except ConfigError as error:
+            assert "is missing: Field required" in str(error), error
+        else:
+            assert alike(resolve(group, resolved), resolved), name
 
 
 plain = st.recursive(

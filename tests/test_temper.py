@@ -11,7 +11,8 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import circular, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import estimate, tempered
+from framework.distributions.normals import IndependentNormals, JointNormal
+from framework.distributions.protocol import estimate, marginal, median, tempered
 from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
 from framework.target import Target
@@ -274,3 +275,60 @@ def test_what_has_no_power_and_bad_temperatures_get_a_sentence():
     for bad in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="wanted a finite number above 0"):
             temper(Cardioid(torch.zeros(2, 1)), hot(bad))
+
+
+def test_of_classes_every_mixture_is_tempered_as_a_whole_and_none_changes_its_likeliest():
+    shares = torch.tensor([[[0.99, 0.005, 0.005], [0.2, 0.41, 0.39], [0.2, 0.41, 0.39]]], dtype=torch.float64)
+    components = Categorical(logits=shares.log(), validate_args=False)
+    weights = torch.zeros(1, 3, dtype=torch.float64)
+    wanted = special.softmax(np.log(shares.mean(1).numpy()) / 0.2, -1)
+    for density in (Mixture(weights, components), SampledMixture(weights, components, 3)):
+        found = temper(density, hot(0.2))
+        assert found.mode.item() == density.mode.item() == 0
+        np.testing.assert_allclose(found.probs.numpy(), wanted, rtol=1e-12)
+        assert (estimate(found, found.mode).standard_error > 0) == isinstance(density, SampledMixture)
+
+
+@pytest.mark.parametrize("kelvin", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("name", ["scvae", "cvae"])
+@pytest.mark.parametrize("more", [{}, {"tolerance": 0.1}], ids=["samples", "tolerance"])
+def test_of_classes_latent_densities_keep_their_likeliest(name, kelvin, more):
+    density = density_of(name, CLASSES, samples=40, hidden=8, scale=3.0, component="categorical", **more)
+    found = temper(density, hot(kelvin))
+    log_prob = torch.stack([found.log_prob(label) for label in found.enumerate_support()])
+    if kelvin != 1:  # else it is the density itself, whose bounds of few samples do not sum to 1
+        nothing = torch.zeros(4, dtype=torch.float64)
+        torch.testing.assert_close(log_prob.logsumexp(0), nothing, rtol=0, atol=1e-9)
+    own = torch.stack([density.log_prob(label) for label in density.enumerate_support()])
+    assert (log_prob.argmax(0) == own.argmax(0)).all()
+    kelvin = hot(kelvin).requires_grad_()
+    temper(density, kelvin).log_prob(density.enumerate_support()[0]).sum().backward()
+    assert kelvin.grad.isfinite()
+
+
+@pytest.mark.parametrize("batch", [(3,), (0,), (2, 0), (2, 3)], ids=str)
+@pytest.mark.parametrize("joint", [False, True], ids=["independent", "joint"])
+def test_normals_stay_normals_whatever_is_asked_of_them(joint, batch):
+    """Their median is their mean, exactly, and no question fails on an empty batch: marginals and powers too."""
+    torch.manual_seed(0)
+    mean = 1000 * torch.randn(*batch, 2).double()
+    scale = torch.rand(*batch, 2).double() + 0.5
+    root = torch.diag_embed(scale) + torch.tensor([[0.0, 0.0], [0.7, 0.0]]).double()
+    density = JointNormal(mean, root) if joint else IndependentNormals(mean, scale)
+    whole = root @ root.mT if joint else torch.diag_embed(scale.square())
+    for made, middle, spread in (
+        (density, mean, whole),
+        (temper(density, hot(2.5)), mean, 2.5 * whole),
+        (marginal(density, 1), mean[..., 1:], whole[..., 1:, 1:]),
+        (marginal(temper(density, hot(2.5)), 0), mean[..., :1], 2.5 * whole[..., :1, :1]),
+        (temper(marginal(density, 0), hot(0.5)), mean[..., :1], 0.5 * whole[..., :1, :1]),
+    ):
+        assert torch.equal(median(made, 100), middle)
+        value = middle + 0.3
+        found = made.log_prob(value)
+        assert found.shape == torch.Size(batch)
+        for index in np.ndindex(*batch):
+            wanted = stats.multivariate_normal(middle[index].numpy(), spread[index].numpy()).logpdf(
+                value[index]
+            )
+            assert found[index].item() == pytest.approx(wanted, rel=1e-10)

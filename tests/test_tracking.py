@@ -1274,6 +1274,20 @@ def test_the_folder_of_a_run_or_a_copy_of_its_checkpoints(
     assert run_folder(run_id) == folder
     shutil.move(folder, tmp_path / "moved")
     assert (run_folder(run_id) / "checkpoints" / "model.ckpt").read_text() == "weights"
+    # another run was made in the folder since, or what was there cannot be read
+    for left in ('{"run_id": "another"}', "{}", None):
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(tmp_path / "moved", folder)
+        (folder / "model.ckpt").write_text("another's weights")
+        described = folder / "run.json"
+        kept = json.loads(described.read_text(encoding="utf-8"))
+        if left is None:
+            described.unlink()
+        else:
+            described.write_text(json.dumps({**kept, **json.loads(left)}) if left != "{}" else left)
+        found = run_folder(run_id)
+        assert found != folder
+        assert (found / "checkpoints" / "model.ckpt").read_text() == "weights"
     with pytest.raises(CheckpointError, match="cannot be had from"):
         run_folder("0" * 32)
     with pytest.raises(CheckpointError, match="There is no tracking store"):

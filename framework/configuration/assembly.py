@@ -167,11 +167,17 @@ def build_metrics(resolved: Resolved, target: Target) -> "list[Metric]":
 
 
 def citations(resolved: Resolved) -> dict[str, str]:
-    """BibTeX of every plugin used, parts of parts included, keyed 'group name'."""
+    """BibTeX of every plugin used, parts of parts included, keyed 'group name'. Of a stored model's metrics and
+    objectives those that are installed: it predicts without the others."""
     found: dict[str, str] = {}
 
     def visit(group: str, part: Mapping[str, Any]) -> None:
-        cls = load(group, part["name"])
+        try:
+            cls = load(group, part["name"])
+        except ConfigError:
+            if group in ("metric", "objective"):
+                return
+            raise
         bibtex = str(getattr(cls, "bibtex", "")).strip()
         if bibtex:
             found[f"{group} {part['name']}"] = bibtex

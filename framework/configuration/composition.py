@@ -4,24 +4,29 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configuration.registry import config_folders
-from framework.errors import ConfigError, did_you_mean, nearest
+from framework.errors import ConfigError, did_you_mean, nearest, shown
 
 PLURAL = ("encoder", "uncertainty", "objective", "metric")
 """Groups of which an experiment may choose several; their configs are keyed by name."""
+GLOBAL = ("experiment", "preset", "debug")
+"""Groups whose configs stand at the top level."""
 FLAGS = ("--cfg=", "--package=", "--config-", "--info=", "--experimental-rerun=")
 """Of Hydra's, those that take a value."""
 
@@ -42,13 +47,36 @@ class PluginConfigs(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for name, path in self.folders.items():
-            search_path.append(provider=name, path=f"file://{path}")
+            search_path.append(provider=name, path=f"{PluginFolder.scheme()}://{path}")
+
+
+class PluginFolder(FileConfigSource):
+    """A plugin's config folder. Of a config that two plugins ship Hydra would take the first in silence."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "plugin"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        file = self._normalize_file_name(config_path)
+        shipped = [
+            f"{name!r} ({folder})"
+            for name, folder in PluginConfigs.folders.items()
+            if (folder / file).is_file()
+        ]
+        if len(shipped) > 1:
+            raise ConfigError(
+                f"{file} is a config of several plugins: {', '.join(shipped)}. Uninstall all but one of them, or "
+                "rename its config; everything else still works."
+            )
+        return super().load_config(config_path)
 
 
 def register() -> None:
     """Make plugin configs known to Hydra; call before composing. Twice is harmless."""
-    PluginConfigs.folders = config_folders()  # a clash is said here, not from inside Hydra
+    PluginConfigs.folders = config_folders()
     Plugins.instance().register(PluginConfigs)
+    Plugins.instance().register(PluginFolder)
     OmegaConf.register_new_resolver("first", lambda *values: next(filter(None, values)), replace=True)
 
 
@@ -182,10 +210,21 @@ def plain(config: DictConfig) -> dict[str, Any]:
     An experiment that tunes `encoder.a` and is run with `encoder=b` leaves an `encoder.a` without a name.
 
     Raises:
-        ConfigError: a value that must be given is not.
+        ConfigError: a value that must be given is not, or an experiment's keys do not stand at the top level.
     """
-    values = OmegaConf.to_container(config, resolve=True)
+    try:
+        values = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:  # an interpolation of what is not there
+        raise ConfigError(
+            f"{_in_its_config(error)}. Give it a value, or mend what stands between ${{ and }}."
+        ) from error
     assert isinstance(values, dict)
+    for group in GLOBAL:
+        if group in values:
+            raise ConfigError(
+                f"The config chosen as {group} sets nothing at the top level. Wanted `# @package _global_` as its "
+                f"first line, since its keys stand under `{group}` otherwise, and keys and values below it."
+            )
     for group in PLURAL:
         chosen = values.get(group) or {}
         values[group] = {
@@ -247,14 +286,67 @@ def sentence(error: BaseException) -> str | None:
         cause = cause.__cause__ or cause.__context__
     if isinstance(cause, OmegaConfBaseException) and cause.parent_node is not None and "not in" in str(cause):
         return _unknown(cause)
+    damaged = _damaged(error)
+    if damaged is not None:
+        return damaged
     if isinstance(error, OverrideParseException):
         return (
             f"{error.override!r} cannot be read; wanted key=value, quoted where it holds commas or brackets."
         )
     if isinstance(error, HydraException | OmegaConfBaseException):
-        said = str(error).split("\n\nSet the environment")[0].split("\nSee https://hydra.cc")[0]
-        return " ".join(said.split())
+        return _in_its_config(error)
     return None
+
+
+def _damaged(error: BaseException) -> str | None:
+    """What is wrong with a file that is no config at all; None for any other error."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, yaml.YAMLError):
+        cause = cause.__cause__
+    if isinstance(cause, yaml.MarkedYAMLError) and cause.problem_mark is not None:
+        mark = cause.problem_mark
+        during = f" {cause.context}," if cause.context else ""
+        return (
+            f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}:{during} {shown(cause.problem)}. "
+            "This cannot be read as YAML; mend it there."
+        )
+    if cause is not None:
+        return f"{shown(cause)}. This cannot be read as YAML; mend it there."
+    if isinstance(error, UnicodeDecodeError) and _being_composed(error):
+        byte = error.object[error.start]
+        return (
+            f"In {_being_composed(error)!r}: byte {byte:#04x} at position {error.start} is not UTF-8. "
+            "Save the file in that encoding."
+        )
+    no_config = "Cannot merge DictConfig with ListConfig" in str(error)
+    if no_config or (isinstance(error, ValueError | OSError) and _being_composed(error)):
+        return (
+            f"{_in_its_config(error)}. Wanted keys and values (`key: value`), and under `defaults`, where it has any, "
+            "a list of `- group: name`."
+        )
+    return None
+
+
+def _in_its_config(error: BaseException) -> str:
+    """What Hydra or OmegaConf says, in one line, after the name of the config that it says it of."""
+    said = (str(error) or str(error.__cause__ or "")).split("\n\nSet the environment")[0]
+    said = " ".join(said.split("\nSee https://hydra.cc")[0].split())
+    said = re.sub(r" full_key: (\S*) ?object_type=\w+", lambda key: f" (at {key[1]})" * bool(key[1]), said)
+    here = _being_composed(error)
+    return f"In {here!r}: {said}" if here and here not in said else said
+
+
+def _being_composed(error: BaseException) -> str | None:
+    """The config that Hydra was reading or adding when it failed, e.g. 'experiment/moons/scvae'."""
+    found = None
+    for frame, _ in walk_tb(error.__traceback__):
+        if frame.f_globals["__name__"] in (
+            "hydra._internal.config_repository",
+            "hydra._internal.config_loader_impl",
+        ):
+            default = frame.f_locals.get("default")
+            found = getattr(default, "config_path", None) or frame.f_locals.get("config_path") or found
+    return found if isinstance(found, str) else None
 
 
 def _unknown(cause: OmegaConfBaseException) -> str:

@@ -128,10 +128,16 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
 
 
 def checked(config: Mapping[str, Any]) -> Resolved:
-    """A stored config, checked again: a checkpoint can only choose among installed plugins and valid values."""
+    """A stored config, checked again: a checkpoint can only choose among installed plugins and valid values.
+
+    What a model predicts without (its data, metrics and objectives) is checked where it is used: the packages may be
+    missing where the model is deployed.
+    """
     resolved: Resolved = {}
     for group, part in config.items():
-        if isinstance(part, list):
+        if group in ("metric", "objective"):
+            resolved[group] = [dict(item) for item in part]
+        elif isinstance(part, list):
             resolved[group] = [resolve(group, item, f"{group}[{i}]") for i, item in enumerate(part)]
         elif group in ("encoder", "density_head", "uncertainty"):
             resolved[group] = resolve(group, part)

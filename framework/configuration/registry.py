@@ -1,6 +1,7 @@
 """The names of everything installed, read from package metadata; reading them imports nothing."""
 
 import re
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -17,19 +18,36 @@ Entry = Any
 
 @cache
 def installed(group: str) -> dict[str, Entry]:
-    """Name and entry point of everything installed under `framework.<group>`, sorted by name.
+    """Name and entry point of everything installed under `framework.<group>`, sorted by name; without the `refused`."""
+    return {name: found[0] for name, found in _entries(group).items() if name not in refused(group)}
 
-    Raises:
-        ConfigError: two distributions give different things the same name.
-    """
-    found: dict[str, Entry] = {}
-    for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
-        other = found.setdefault(entry.name, entry)
-        if other.value != entry.value:
-            raise ConfigError(
-                f"Two installed packages call a {group} {entry.name!r}: {other.value} of {origin(other)} "
-                f"and {entry.value} of {origin(entry)}. Uninstall one, or rename its entry point."
+
+@cache
+def refused(group: str) -> dict[str, str]:
+    """Names that cannot be used, each with a sentence that says why; all others still work."""
+    reasons = {}
+    for name, found in _entries(group).items():
+        if len(found) > 1:
+            things = " and ".join(f"{entry.value} of {origin(entry)}" for entry in found)
+            reasons[name] = (
+                f"Several installed packages call a {group} {name!r}: {things}. Uninstall all but one, or rename their "
+                "entry points."
             )
+        elif found[0].dist and not found[0].dist.name:  # a package that was removed by half
+            reasons[name] = (
+                f"The {group} {name!r} ({found[0].value}) is of a package whose METADATA file is gone. Install that "
+                "package again, or remove what is left of it."
+            )
+    return reasons
+
+
+def _entries(group: str) -> dict[str, list[Entry]]:
+    """By name, sorted, the entry points that are different things."""
+    found: dict[str, list[Entry]] = {}
+    for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
+        others = found.setdefault(entry.name, [])
+        if entry.value not in [other.value for other in others]:
+            others.append(entry)
     return found
 
 
@@ -42,12 +60,14 @@ def find(group: str, name: str) -> Entry:
     """The entry point called `name`.
 
     Raises:
-        ConfigError: nothing of that name is installed.
+        ConfigError: nothing of that name is installed, or it is one of the `refused`.
     """
     names = installed(group)
+    if name in refused(group):
+        raise ConfigError(refused(group)[name])
     if name not in names:
         raise ConfigError(
-            f"No {group} is called {quoted(name)}.{did_you_mean(name, names)} "
+            f"No {group} is called {quoted(name)}.{did_you_mean(name, [*names, *refused(group)])} "
             f"Installed: {', '.join(names) or 'none'}. "
             "A name added to a pyproject.toml counts only after `pip install -e .`."
         )
@@ -58,7 +78,7 @@ def load(group: str, name: str) -> type[Any]:
     """Import the class called `name`; the only place where a plugin is imported.
 
     Raises:
-        ConfigError: no such name, the import fails, or it is not an implementation of the group's base.
+        ConfigError: no such name, the import fails, or it is not a whole implementation of the group's base.
     """
     entry = find(group, name)
     try:
@@ -77,6 +97,12 @@ def load(group: str, name: str) -> type[Any]:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) does not derive from "
             f"the {group} base in framework.{group}. See that module's docstring for the contract."
+        )
+    missing = sorted(getattr(found, "__abstractmethods__", ()))
+    if missing:
+        raise ConfigError(
+            f"The {group} {name!r} ({entry.value}, of {origin(entry)}) lacks {', '.join(missing)}, which the "
+            f"framework calls. Write what framework.{group} says of them."
         )
     return found
 
@@ -104,28 +130,30 @@ def config_folders() -> dict[str, Path]:
     """Plugin name and config folder of every installed plugin that ships configs.
 
     Raises:
-        ConfigError: two plugins ship a config of one name, of which Hydra would silently take the first.
+        ConfigError: a plugin ships a config of Hydra itself.
     """
     folders: dict[str, Path] = {}
-    owner: dict[Path, str] = {}
     for entry in sorted(entry_points(group="framework.conf"), key=lambda entry: entry.name):
         package, *rest = entry.value.split(".")
-        spec = find_spec(package)  # of a top-level package: imports nothing
-        if spec is None or not spec.submodule_search_locations:
+        roots = package_folders(package)
+        if not roots:
             continue  # half-uninstalled: it can disturb nobody but its own users
-        folder = Path(next(iter(spec.submodule_search_locations)), *rest)
-        for file in sorted(folder.rglob("*.yaml")):
-            config = file.relative_to(folder)
-            if config.parts[0] == "hydra":
-                raise ConfigError(
-                    f"Plugin {entry.name!r} ({origin(entry)}) ships {config}: a plugin may not configure "
-                    "Hydra itself, whose logging config can run code. Uninstall it."
-                )
-            if config in owner:
-                raise ConfigError(
-                    f"Plugins {owner[config]!r} and {entry.name!r} ({origin(entry)}) both ship {config}. "
-                    "Uninstall one, or rename its config."
-                )
-            owner[config] = entry.name
-        folders[entry.name] = folder
+        folder = roots[0].joinpath(*rest)
+        own = next(folder.glob("hydra/**/*.yaml"), None)
+        if own is not None:
+            raise ConfigError(
+                f"Plugin {entry.name!r} ({origin(entry)}) ships {own.relative_to(folder)}: a plugin may not configure "
+                "Hydra itself, whose logging config can run code. Uninstall it."
+            )
+        if folder not in folders.values():
+            # two packages may give their folders one name, and both count
+            folders[f"{entry.name} of {origin(entry)}" if entry.name in folders else entry.name] = folder
     return folders
+
+
+def package_folders(package: str) -> list[Path]:
+    """Where a top-level package's files are; importing nothing, and empty where it is not found."""
+    with suppress(ImportError, ValueError):  # a name that is none, or a module that says nothing of itself
+        spec = find_spec(package)
+        return [Path(root) for root in (spec.submodule_search_locations if spec else None) or ()]
+    return []

@@ -6,20 +6,29 @@ and have their defaults there. A keyword-only parameter annotated with an abstra
 names it, it is built from that base's registry and arrives ready. One annotated with a dataclass of keyword-only
 fields is a *value*: its fields stand in the config beside the other keys, and it arrives made of them; the
 parameter's own default, where it has one, gives the keys their defaults.
+
+A checked config holds plain values only, since checkpoints keep it: a path is its text, an enum its value, a pydantic
+model or a dataclass a mapping of its fields. `build` reads them by the annotations again, so that each arrives as what
+its parameter is annotated with.
 """
 
 import inspect
 import re
-import types
-import typing
-from collections.abc import Mapping
-from dataclasses import is_dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from datetime import date, time, timedelta
+from decimal import Decimal
+from enum import Enum
 from functools import cache
-from typing import Any
+from pathlib import PurePath
+from typing import Any, get_args
+from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic_core import to_jsonable_python
 
-from framework.configuration.registry import group_of, load
+from framework.configuration.registry import load
+from framework.configuration.signature import arguments, parts, positional, signature
 from framework.errors import ConfigError, did_you_mean, quoted, shown
 
 
@@ -70,7 +79,7 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
             f"{shown(path)}.name is missing: write the name of a {group} (`mode=plugins` lists them)."
         )
     cls = load(group, name)
-    checked = check(_model(cls), values, path)
+    checked = _stored(cls, values, path)
     for key, part in parts(cls).items():
         value = checked[key]
         if value is None:
@@ -90,28 +99,27 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
         ConfigError: the constructor asks the framework for something it does not have here.
     """
     cls = load(group, config["name"])
-    values = {key: value for key, value in config.items() if key != "name"}
-    for key, part in parts(cls).items():
-        if values.get(key) is None:
-            continue
-        try:
-            if part.many:
-                values[key] = [build(part.group, item, **context) for item in values[key]]
-            else:
-                values[key] = build(part.group, values[key], **context)
-        except ConfigError as error:  # which the user may never have named
-            raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
     given = []
-    for parameter in _positional(cls):
+    for parameter in positional(cls):
         if parameter.name not in context:
             raise ConfigError(
                 f"{cls.__name__} asks the framework for `{parameter.name}`, which a {group} is not given here; "
                 f"it may ask for: {', '.join(context) or 'nothing'}. Keyword-only parameters come from the config."
             )
         given.append(context[parameter.name])
-    for key, kind in _values(cls).items():
-        values[key] = kind(**{field: values.pop(field) for field in _signature(kind)})
-    return cls(*given, **values)
+    stored = _defaults(cls) | {key: value for key, value in config.items() if key != "name"}
+    values = _validated(cls, _kept(cls, stored, group), group, nullable=True)
+    for key, part in parts(cls).items():
+        if values[key] is None:
+            continue
+        try:
+            if part.many:
+                values[key] = part.many(build(part.group, item, **context) for item in values[key])
+            else:
+                values[key] = build(part.group, values[key], **context)
+        except ConfigError as error:  # which the user may never have named
+            raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
+    return cls(*given, **arguments(cls, values))
 
 
 def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[str, Any]:
@@ -123,95 +131,170 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
     try:
         return model.model_validate(dict(values)).model_dump()
     except ValidationError as error:
-        fault = error.errors()[0]
-        where = shown(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
-        known = list(model.model_fields)
-        if fault["type"] == "extra_forbidden":
-            key = str(fault["loc"][-1])
-            # of another plugin that an experiment had chosen; Hydra deletes no key whose value is null
-            left = path and fault["input"] is not None and "[" not in where
-            advice = f" ~{where} leaves out what an experiment sets." if left else ""
-            raise ConfigError(
-                f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {', '.join(known) or 'none'}.{advice}"
-            ) from None
-        if fault["type"] == "missing":
-            raise ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.") from None
-        if fault["type"] == "literal_error":
-            expected = re.findall("'([^']*)'", fault.get("ctx", {})["expected"])
-            hint = did_you_mean(str(fault["input"]), expected)
-        else:
-            hint = ""
-        message = fault["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"{where} = {quoted(fault['input'])}: {message}.{hint}") from None
+        raise _refusal(error, path, list(model.model_fields)) from None
 
 
-class Part(typing.NamedTuple):
-    """A constructor parameter that is itself a plugin (`many`: a list of them)."""
-
-    group: str
-    many: bool
-
-
-@cache
-def parts(cls: type) -> dict[str, Part]:
-    """The keyword-only parameters of `cls` that are annotated with an abstract base."""
-    found = {}
-    for name, (annotation, _) in _signature(cls).items():
-        candidates = typing.get_args(annotation) if _is_union(annotation) else (annotation,)
-        for candidate in candidates:
-            many = typing.get_origin(candidate) in (list, tuple)
-            group = group_of(typing.get_args(candidate)[0] if many else candidate)
-            if group is not None:
-                found[name] = Part(group, many)
-    return found
+def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
+    """The first fault as a sentence; `known` are the keys where one is unknown."""
+    fault = error.errors()[0]
+    where = shown(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
+    if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):  # the latter of a dataclass
+        left = path and fault["input"] is not None and "[" not in where
+        return _unknown(where, str(fault["loc"][-1]), known, bool(left))
+    if fault["type"] == "missing":
+        return ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.")
+    hint = ""
+    if fault["type"] == "literal_error":
+        hint = did_you_mean(str(fault["input"]), re.findall("'([^']*)'", fault.get("ctx", {})["expected"]))
+    message = fault["msg"].removeprefix("Value error, ")
+    return ConfigError(f"{where} = {quoted(fault['input'])}: {message}.{hint}")
 
 
-@cache
-def _model(cls: type) -> type[BaseModel]:
-    fields: dict[str, Any] = {}
-    for name, (annotation, default) in _signature(cls).items():
-        fields[name] = (
-            Any if name in parts(cls) else annotation,
-            Field() if default is inspect.Parameter.empty else default,
-        )
-    return create_model(
-        cls.__name__,
-        __config__=ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=()),
-        **fields,
+def _unknown(where: str, key: str, known: Sequence[str], left: bool) -> ConfigError:
+    # of another plugin that an experiment had chosen; Hydra deletes no key whose value is null
+    advice = f" ~{where} leaves out what an experiment sets." if left else ""
+    return ConfigError(
+        f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {', '.join(known) or 'none'}.{advice}"
     )
 
 
-def _signature(cls: type) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of every key that `cls` has in the config."""
-    found = {}
-    for name, (annotation, default) in _keywords(cls).items():
-        if name in _values(cls):
-            fields = _signature(annotation)
-            found |= {key: (kind, getattr(default, key, own)) for key, (kind, own) in fields.items()}
-        else:
-            found[name] = annotation, default
+def _stored(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """`values` checked and completed by the defaults of `cls`, as plain values that give the same when read again.
+
+    Raises:
+        ConfigError: unknown key, missing key, a value of wrong type or range, or one that cannot be kept.
+    """
+    found = _kept(cls, _validated(cls, _defaults(cls) | dict(values), path), path)
+    try:
+        again = _kept(cls, _validated(cls, found, path), path)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error} That is how {cls.__name__} keeps what it was given, which its annotation does not take: "
+            "annotate the parameter with a type that also takes plain values."
+        ) from None
+    for key, value in found.items():
+        # NaN equals nothing
+        if again[key] != value and repr(again[key]) != repr(value):
+            raise ConfigError(
+                f"{shown(f'{path}.{key}')} = {quoted(value)} becomes {quoted(again[key])} when a checkpoint that "
+                f"keeps it is read: the annotation changes what it is given. Let {cls.__name__} compute that in its "
+                "constructor."
+            )
     return found
 
 
-def _values(cls: type) -> dict[str, type]:
-    keywords = _keywords(cls).items()
-    return {name: kind for name, (kind, _) in keywords if isinstance(kind, type) and is_dataclass(kind)}
+def _defaults(cls: type) -> dict[str, Any]:
+    return {key: own for key, (_, own) in signature(cls).items() if own is not inspect.Parameter.empty}
 
 
-def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of every keyword-only parameter."""
-    hints = typing.get_type_hints(cls.__init__, include_extras=True)
-    return {
-        parameter.name: (hints.get(parameter.name, Any), parameter.default)
-        for parameter in inspect.signature(cls.__init__).parameters.values()
-        if parameter.kind is parameter.KEYWORD_ONLY
-    }
+def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: bool = False) -> dict[str, Any]:
+    """The value of every key of `cls` as its annotation reads it.
+
+    `nullable`: None is taken as it is, since a loaded model is given None for what only training needs
+    (`Encoder.initial`).
+
+    Raises:
+        ConfigError: unknown key, missing key, or a value of wrong type or range.
+    """
+    found = {}
+    models = _models(cls)
+    for key in values:
+        if key not in models:
+            where = shown(f"{path}.{key}")
+            raise _unknown(where, str(key), list(models), values[key] is not None and "[" not in where)
+    for key, (annotation, _) in signature(cls).items():
+        if key not in values:
+            raise ConfigError(f"{shown(f'{path}.{key}')} is missing: Field required. Give it a value.")
+        value = values[key]
+        if nullable and value is None:
+            found[key] = None
+            continue
+        try:
+            # without `extra` a misspelt key of an inner model would be left out in silence
+            read: Any = models[key].model_validate({key: value}, extra="forbid")
+            # pydantic reads what is annotated as an Iterable lazily, and once
+            found[key] = list(read.value) if isinstance(read.value, Iterator) else read.value
+        except ValidationError as error:
+            raise _refusal(error, path, _inner_keys(annotation)) from None
+    return found
 
 
-def _positional(cls: type) -> list[inspect.Parameter]:
-    parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
-    return [parameter for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
+def _inner_keys(annotation: Any) -> list[str]:
+    """Fields of the models and dataclasses that stand in an annotation."""
+    named = getattr(annotation, "model_fields", None) or getattr(annotation, "__dataclass_fields__", ())
+    return [*named, *(name for inner in get_args(annotation) for name in _inner_keys(inner))]
 
 
-def _is_union(annotation: object) -> bool:
-    return typing.get_origin(annotation) in (typing.Union, types.UnionType)
+def _kept(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """The values as a checkpoint keeps them.
+
+    Raises:
+        ConfigError: one is not made of plain values.
+    """
+    found = {}
+    for key, value in values.items():
+        try:
+            found[key] = _plain(value)
+        except TypeError as error:
+            raise ConfigError(
+                f"{shown(f'{path}.{key}')} = {quoted(value)}: {error}, which no checkpoint keeps. Annotate the "
+                f"parameter of {cls.__name__} with numbers, text, paths, enums, or lists, mappings, dataclasses or "
+                "pydantic models of these, and make what it needs of them in its constructor."
+            ) from None
+    return found
+
+
+@cache
+def _models(cls: type) -> dict[str, type[BaseModel]]:
+    """For each key a model whose `value` it is, whatever the key is called.
+
+    Raises:
+        ConfigError: an annotation is no type that pydantic knows how to check.
+    """
+    found = {}
+    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
+    for key, (annotation, _) in signature(cls).items():
+        kind = Any if key in parts(cls) else annotation
+        try:
+            found[key] = create_model(cls.__name__, __config__=config, value=(kind, Field(alias=key)))
+        except Exception as error:  # pydantic raises a dozen kinds
+            raise ConfigError(
+                f"{cls.__name__}: the annotation of `{key}`, {shown(annotation)}, cannot be checked: "
+                f"{shown(str(error))} Annotate it with a type: numbers, text, lists, dataclasses, ..."
+            ) from error
+    return found
+
+
+_SEVERAL: tuple[Any, ...] = (list, tuple, set)
+_SINGLE: tuple[Any, ...] = (bool, int, float, complex, str, bytes)
+
+
+def _plain(value: Any) -> Any:
+    """A copy made of None, numbers, text, lists, tuples, sets and dicts.
+
+    Raises:
+        TypeError: something in it is none of these, nor made of them; says what.
+    """
+    if isinstance(value, Enum):
+        return _plain(value.value)
+    if isinstance(value, BaseModel):
+        return _plain(value.model_dump(by_alias=True))
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, date | time | timedelta | Decimal | UUID):
+        return to_jsonable_python(value)
+    if isinstance(value, Mapping):
+        return {_plain(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, frozenset):
+        return tuple(map(_plain, value))  # torch reads no frozenset, and a list could be no item of a set
+    for kind in _SEVERAL:
+        if isinstance(value, kind):
+            return kind(map(_plain, value))
+    for kind in _SINGLE:
+        if isinstance(value, kind):
+            return kind(value)
+    if value is None:
+        return None
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value) if field.init}
+    raise TypeError(f"it holds a {type(value).__name__}")

@@ -351,8 +351,11 @@ def _folded(found: Tensor | None, shape: torch.Size) -> Tensor | None:
 @pick.register
 def _(density: Reshaped, index: Tensor) -> Distribution:
     """The same items of the inner density, whose batch is one line of them then: nothing is drawn and thrown away."""
+    from framework.distributions.density import Mixture  # which stands above
+
     inner = density.density
-    if len(inner.batch_shape) != 1:
+    # a mixture draws of all its items to pick from each, which here would be those of the whole batch every time
+    if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
         return pick.dispatch(Distribution)(density, index)
     # items in the order of (*batch, K): the item of batch place b and component k is b·K + k
     lead = index.shape[: index.dim() - len(density.batch_shape) + 1]

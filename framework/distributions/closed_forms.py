@@ -1,6 +1,8 @@
 """What torch's own densities answer in closed form, and the normal quantile."""
 
-from collections.abc import Collection
+import inspect
+from collections.abc import Callable, Collection
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,6 +15,7 @@ from framework.distributions.protocol import (
     Normals,
     Slope,
     about,
+    cdf,
     each_cdf,
     estimate,
     exactly,
@@ -27,7 +30,6 @@ from framework.distributions.protocol import (
     take,
     tempered,
 )
-from framework.errors import UserError
 
 for _kind in (
     *(torchs.ExponentialFamily, torchs.Categorical, torchs.OneHotCategorical, torchs.MultivariateNormal),
@@ -51,23 +53,58 @@ def _(density: Independent, value: Tensor) -> Estimate:
     return Estimate(log_mean, debiased, error, factors.samples.sum(-1), factors.unresolved.any(-1))
 
 
+_ON_THE_LINE = (Normal, torchs.Laplace, torchs.Cauchy, torchs.Gumbel)
+"""Densities of all reals whose distribution function torch knows; that of others is wrong outside of the support."""
+
+
 @marginal.register
 def _(density: Independent, index: int) -> Distribution:
+    """Of a product the factor itself."""
     if density.event_shape == (1,) and index == 0:
         return density
-    if not isinstance(density.base_dist, Normal):
-        raise UserError(f"No marginal is known for Independent({type(density.base_dist).__name__}).")
-    here = slice(index, index + 1)
-    base = Normal(density.base_dist.loc[..., here], density.base_dist.scale[..., here], validate_args=False)
+    if density.reinterpreted_batch_ndims == 0:
+        return marginal(density.base_dist, index)
+    base = _of_each(density.base_dist, lambda parameter: parameter[..., index : index + 1])
+    if base is None or density.reinterpreted_batch_ndims != 1:
+        return marginal.dispatch(Distribution)(density, index)
     return Independent(base, 1, validate_args=False)
+
+
+def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
+    """One of torch's densities over a number, with `change` of each of its parameters; None where that is not known.
+
+    It is where every parameter of its constructor is a tensor with one number for each item of the batch; a mixture or
+    a density that was transformed by hand is made of other things.
+    """
+    kind: Any = next(one for one in type(density).__mro__ if getattr(torchs, one.__name__, None) is one)
+    names = {*inspect.signature(kind.__init__).parameters} - {"self", "validate_args"}
+    if {"probs", "logits"} <= names:  # one is given; the other is computed, to rounding, when it is asked
+        names -= {"probs"} if "logits" in vars(density) else {"logits"}
+    shape = None if density.event_shape else density.batch_shape
+    changed: dict[str, Tensor] = {}
+    for name in names:
+        parameter = getattr(density, name, None)
+        if not isinstance(parameter, Tensor) or parameter.shape != shape:
+            return None
+        changed[name] = change(parameter)
+    return kind(**changed, validate_args=False)
 
 
 @each_cdf.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
-    base = density.base_dist
-    if not isinstance(base, Normal | torchs.Laplace):
-        return None if len(density.event_shape) == 3 else each_cdf.dispatch(Distribution)(density, value)
-    return type(base)(base.loc.double(), base.scale.double(), validate_args=False).cdf(value.double())
+    if isinstance(density.base_dist, _ON_THE_LINE):
+        base = _of_each(density.base_dist, Tensor.double)
+        if base is not None:
+            return base.cdf(value.double())
+    return None if len(density.event_shape) == 3 else each_cdf.dispatch(Distribution)(density, value)
+
+
+@cdf.register
+def _(density: Independent, value: Tensor) -> Tensor | None:
+    known = isinstance(density.base_dist, _ON_THE_LINE) and density.event_shape == (1,)
+    # a normal may have no width, of which `normals` knows what to do
+    found = each_cdf(density, value) if known and normals(density) is None else None
+    return cdf.dispatch(Distribution)(density, value) if found is None else found.squeeze(-1)
 
 
 @marginal.register
@@ -92,11 +129,10 @@ def _(density: Categorical, index: Tensor) -> Distribution:
 
 @pick.register
 def _(density: Independent, index: Tensor) -> Distribution:
-    base = density.base_dist
-    if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
+    base = _of_each(density.base_dist, lambda parameter: take(parameter, index))
+    if base is None or density.reinterpreted_batch_ndims != 1:
         return pick.dispatch(Distribution)(density, index)
-    loc, scale = (take(parameter, index) for parameter in (base.loc, base.scale))
-    return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+    return Independent(base, 1, validate_args=False)
 
 
 @slope.register

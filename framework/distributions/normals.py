@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from framework.distributions.protocol import median
+from framework.distributions.protocol import marginal, median, tempered
 
 
 class IndependentNormals(Independent):
@@ -32,6 +32,18 @@ def _(density: IndependentNormals, samples: int) -> Tensor:
     return density.mean
 
 
+@marginal.register
+def _(density: IndependentNormals, index: int) -> IndependentNormals:
+    here = slice(index, index + 1)
+    return IndependentNormals(density.mean[..., here], density.stddev[..., here])
+
+
+@tempered.register
+def _(density: IndependentNormals, temperature: Tensor) -> IndependentNormals:
+    # exp(-d²/2σ²)^(1/T) = exp(-d²/2σ²T)
+    return IndependentNormals(density.mean, density.base_dist.scale * temperature.sqrt())
+
+
 class JointNormal(MultivariateNormal):
     """The normal density of a covariance R Rᵀ.
 
@@ -50,3 +62,15 @@ class JointNormal(MultivariateNormal):
         standard = torch.linalg.solve_triangular(root, residual, upper=False).squeeze(-1)
         scale = self.root.diagonal(dim1=-2, dim2=-1)
         return -(standard.square() / 2 + scale.log() + math.log(2 * math.pi) / 2).sum(-1)
+
+
+@marginal.register
+def _(density: JointNormal, index: int) -> JointNormal:
+    row = density.root[..., index, :]
+    deviation = torch.linalg.vector_norm(row, dim=-1)  # of R Rᵀ's diagonal, without squares that overflow
+    return JointNormal(density.loc[..., index : index + 1], deviation[..., None, None])
+
+
+@tempered.register
+def _(density: JointNormal, temperature: Tensor) -> JointNormal:
+    return JointNormal(density.loc, density.root * temperature.sqrt())

@@ -26,6 +26,8 @@ TOLERANCE = {torch.float64: 1e-9, torch.float32: 1e-6}
 """By which the two rules may differ on a panel, by the density's number type; that of the finer is far smaller."""
 MASS_GAP = 100
 """How far the mass on all panels may be from 1, in that tolerance."""
+LARGEST = 4096
+"""Peaks of one density, whose pairs are compared, and each of which is evaluated at the nodes of all."""
 DRAWS = 1024
 """Of each density that quadrature does not resolve."""
 _log = logging.getLogger(__name__)
@@ -76,13 +78,20 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
     Panels begin at the density's `peaks`, the first as wide as their `scales`, and are halved until two rules agree;
     their nodes are given relative to the peak, so that no rounding of the number itself limits how narrow one may be.
     What is seen is checked by its mass: where that is not 1 to 1e-7 (float32: 1e-4), some peak is none of `peaks`, or a
-    tail is too long, and the mean of -log_prob over DRAWS draws is given instead, which the log says. NaN stays NaN.
+    tail is too long, and the mean of -log_prob over DRAWS draws is given instead, which the log says; so it is of a
+    density of more than LARGEST peaks. NaN stays NaN.
     Differentiable like the density.
     """
     items = density.batch_shape.numel()
     if items == 0:
         return density.log_prob(density.sample())
     flat = Reshaped(density, (items,))
+    if len(peaks(flat)) > LARGEST:
+        _log.warning(
+            "%d densities (%s) have more than %d peaks; their entropies are means over %d draws.",
+            items, type(density).__name__, LARGEST, DRAWS,
+        )  # fmt: skip
+        return drawn_entropy(flat).reshape(density.batch_shape)
     with torch.no_grad():
         dtype = density.sample(torch.Size((0,))).dtype
         panels, components = first_panels(flat)
@@ -102,9 +111,13 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
             "%d of %d densities (%s) have their mass where quadrature does not find it; their entropies are means over "
             "%d draws.", int(missed.sum()), items, type(density).__name__, DRAWS,
         )  # fmt: skip
-        drawn = flat.sample(torch.Size((DRAWS,)))
-        found = torch.where(missed, -flat.log_prob(drawn).mean(0).to(found), found)
+        found = torch.where(missed, drawn_entropy(flat).to(found), found)
     return found.reshape(density.batch_shape).to(dtype)
+
+
+def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
+    """The mean of -log_prob over DRAWS draws, nats."""
+    return -density.log_prob(density.sample(torch.Size((DRAWS,)))).mean(0)
 
 
 def split(panels: Panels, step: int) -> list[Panels]:
@@ -158,7 +171,10 @@ def first_panels(density: Distribution) -> tuple[Panels, int]:
     scale = torch.where((scale > 0) & scale.isfinite(), scale, 1.0)
     rows = max(1, AT_ONCE // len(place) ** 2)
     nearest = [
-        _scale_there(*part, closed) for part in zip(place.split(rows, 1), scale.split(rows, 1), strict=True)
+        torch.cat(
+            [_scale_there(some, *part, closed) for some in part[0].split(max(1, AT_ONCE // len(place)))]
+        )
+        for part in zip(place.split(rows, 1), scale.split(rows, 1), strict=True)
     ]
     reach = REACH * scale.amax(0, keepdim=True)
     order = place.sort(0)
@@ -186,9 +202,9 @@ def first_panels(density: Distribution) -> tuple[Panels, int]:
     return Panels(*map(torch.cat, zip(*sides, strict=True))), len(order.values)
 
 
-def _scale_there(place: Tensor, scale: Tensor, closed: bool) -> Tensor:
-    """At each peak the least scale of all whose peak it is on, (peak, item)."""
-    apart = place.unsqueeze(1) - place  # (peak, other, item)
+def _scale_there(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Tensor:
+    """At each of some peaks the least scale of all whose peak it is on, (some, item)."""
+    apart = some.unsqueeze(1) - place  # (some, other, item)
     apart = (wrap(apart) if closed else apart).abs()
     return scale.expand_as(apart).where(apart <= 10 * scale, math.inf).amin(1)
 

@@ -1,14 +1,16 @@
 """Runs a predictor over a split: metrics, per group and in all, and what the prediction costs."""
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 
 from framework.data import Batch
 from framework.density_head import Fitted
 from framework.distributions.noise import Draw
+from framework.errors import ConfigError
 from framework.evaluation.cost import Cost, measure
 from framework.metric import Metric
 from framework.model import Predictor
@@ -69,7 +71,7 @@ def evaluate(
     everyone = [metric for group in (together, *apart.values()) for metric in group]
     for number, batch in enumerate(on_device(outliers, device)):
         _update(everyone, predictor, batch, samples, Draw(seed, number), "outliers")
-    return Evaluation(_numbers(together), {name: _numbers(group) for name, group in apart.items()}, together)
+    return Evaluation(numbers(together), {name: numbers(group) for name, group in apart.items()}, together)
 
 
 def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
@@ -106,11 +108,43 @@ def _update(
             metric.update(prediction)
 
 
-def _numbers(metrics: Sequence[Metric]) -> dict[str, float]:
+def numbers(metrics: Sequence[Metric]) -> dict[str, float]:
+    """What all of them compute.
+
+    Raises:
+        ConfigError: something is not one number, or two metrics call theirs the same.
+    """
     found: dict[str, float] = {}
+    owners: dict[str, Metric] = {}
     for metric in metrics:
-        found |= {name: float(value) for name, value in metric.compute().items()}
+        computed: dict[str, Any] = metric.compute()
+        for name, value in computed.items():
+            require_own(owners, name, metric)
+            shape = tuple(getattr(value, "shape", ()))
+            if math.prod(shape) != 1:
+                raise ConfigError(
+                    f"{type(metric).__name__}.compute gives {name!r} of shape {shape}: wanted one number. Give each "
+                    "a name of its own."
+                )
+            found[name] = float(value)
     return found
+
+
+def require_own(owners: dict[str, Metric], name: str, metric: Metric) -> None:
+    """Refuse a name that another metric has already, whose number one of the two would hide.
+
+    Args:
+        owners: the metric of each name so far; `name` is added.
+
+    Raises:
+        ConfigError: says which two.
+    """
+    other = owners.setdefault(name, metric)
+    if other is not metric:
+        raise ConfigError(
+            f"Two metrics call a number {name!r}: {type(other).__name__} and {type(metric).__name__}. Leave one out; "
+            "mode=test with the other gives its number of the same model."
+        )
 
 
 @torch.no_grad()

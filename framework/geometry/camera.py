@@ -3,11 +3,17 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 from framework.geometry.rotation import viewpoint_rotation
+
+SHAPES = {"rotation": (3, 3), "translation": (3,), "focal": (2,), "principal": (2,)}
+"""Of what a camera is made of."""
+SAID = {"focal": ", (fx, fy), pixels", "principal": ", (cx, cy), pixels"}
+"""What the numbers of a lens are."""
 
 
 @dataclass(frozen=True)
@@ -33,21 +39,42 @@ class Camera:
     width: int
     near: float = 1e-3
 
+    def check_shapes(self) -> None:
+        """Nothing else does: a single focal length would pass for two, and kernels would read what is not there.
+
+        Raises:
+            ValueError: rotation, translation, focal or principal has another shape; says what came and what was wanted.
+        """
+        for name, wanted in SHAPES.items():
+            came = _shape(getattr(self, name))
+            if came != wanted:
+                numbers = " a single number" if came == () else f" the shape {came}"
+                raise ValueError(
+                    f"camera.{name} came with{numbers}; wanted the shape {wanted}{SAID.get(name, '')}."
+                )
+
     def projected(
-        self, points: Float[Tensor, "*points 3"]
+        self, points: Real[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points 2"], Float[Tensor, "*points"]]:
         """Pixels (column, row) at which world points are seen, and their depths along the optical axis, metres. Of a
-        depth that is not above 0 the pixel means nothing."""
+        depth that is not above 0 the pixel means nothing. Whole numbers are taken as torch's default float type.
+
+        Raises:
+            ValueError: as `check_shapes`.
+        """
         seen, focal, principal = self._seen(points)
         return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
 
-    def canonical(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    def canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Where world points lie before the `canonical_camera` of the same image size, metres: it sees them at the same
         pixels and depths. So a cloud alone says what this camera sees, and no camera has to come with it.
 
         Of (x, y, z) = rotation @ X + translation and the canonical focal length f and principal point (c, d) they are
         ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z), since then f x'/z + c = fx x/z + cx. Differentiable in
-        points and lens.
+        points and lens. Whole numbers are taken as torch's default float type.
+
+        Raises:
+            ValueError: as `check_shapes`.
         """
         seen, focal, principal = self._seen(points)
         plain = canonical_camera(self.height, self.width)
@@ -57,12 +84,37 @@ class Camera:
 
     def _seen(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Camera coordinates of world points, and focal lengths and principal point as tensors like them."""
+        self.check_shapes()
+        if not points.is_floating_point():  # in whole numbers a rotation would be 0 and 1 alone
+            points = points.to(torch.get_default_dtype())
         seen = points @ self.rotation.to(points).T + self.translation.to(points)
         focal, principal = (
             torch.as_tensor(part, dtype=points.dtype, device=points.device)
             for part in (self.focal, self.principal)
         )
         return seen, focal, principal
+
+
+def _shape(numbers: object) -> tuple[int, ...]:
+    """Of a tensor, an array, or a sequence of numbers."""
+    if isinstance(numbers, Tensor | np.ndarray):
+        return tuple(numbers.shape)
+    if not isinstance(numbers, tuple | list):
+        return ()
+    return (len(numbers), *_shape(numbers[0])) if numbers else (0,)
+
+
+def focal_length(height: int, field_of_view: float) -> float:
+    """Pixels; of an image of so many rows that shows `field_of_view`, radians, from its upper edge to its lower.
+
+    Raises:
+        ValueError: the angle is not between 0 and π: degrees, perhaps.
+    """
+    if not 0 < field_of_view < math.pi:
+        raise ValueError(
+            f"field_of_view came as {field_of_view:g}; wanted radians, above 0 and below π. Give math.radians(degrees)."
+        )
+    return 0.5 * height / math.tan(0.5 * field_of_view)
 
 
 def canonical_camera(height: int, width: int) -> Camera:
@@ -91,12 +143,15 @@ def look_from(
     Azimuth turns about the vertical (0 looks at the object's front, from -y), elevation lifts the camera, tilt
     rolls it in the plane: the convention of PASCAL3D+ annotations. `field_of_view` is vertical; `size` is
     (height, width).
+
+    Raises:
+        ValueError: as `focal_length`.
     """
     height, width = size
     rotation = viewpoint_rotation(torch.tensor([azimuth, elevation, tilt], dtype=torch.float64))
     # PASCAL3D+ camera frames have y up and look along -z; images have y down and look along +z.
     flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64).diag()
-    focal = 0.5 * height / math.tan(0.5 * field_of_view)
+    focal = focal_length(height, field_of_view)
     return Camera(
         rotation=(flip @ rotation).float(),
         translation=torch.tensor([0.0, 0.0, distance]),

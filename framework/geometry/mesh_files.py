@@ -42,11 +42,19 @@ def column_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(OTHER_NAMES.get(name, name) for name in small)
 
 
-def text_lines(content: bytes, comment: bytes = b"#") -> list[bytes]:
-    """The lines that are neither blank nor a comment, without their comments."""
+def text_lines(content: bytes, comment: bytes = b"#", names: Sequence[bytes] = ()) -> list[bytes]:
+    """The lines that are neither blank nor a comment, without their comments.
+
+    Args:
+        comment: what begins a comment, anywhere in a line.
+        names: first words of lines whose rest is a name, which may hold what begins a comment elsewhere.
+    """
     plain = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if comment in plain:
-        plain = re.sub(re.escape(comment) + rb"[^\n]*", b"", plain)
+        cut = re.escape(comment) + rb"[^\n]*"
+        if names:  # a whole line with a name is found first, and stays
+            cut = rb"^([ \t]*(?:" + b"|".join(map(re.escape, names)) + rb")[ \t][^\n]*)|" + cut
+        plain = re.sub(cut, rb"\1" if names else b"", plain, flags=re.MULTILINE)
     return [line for line in plain.split(b"\n") if line and not line.isspace()]
 
 
@@ -211,7 +219,8 @@ def xyz(content: bytes) -> Parsed:
     A first line of as many names (`x y z red …`, also as a comment) names the columns; else they are column_4 and on.
     """
     plain = re.sub(rb"[,;\t]", b" ", content)
-    first = plain.lstrip().split(b"\n", 1)[0].decode("latin-1").lstrip("#/ ").split()
+    head = re.split(rb"[\r\n]", plain.lstrip(), maxsplit=1)[0].lstrip(b"#/ ")
+    first = [word.decode("utf-8", "replace") for word in head.split()]  # text has blanks that bytes have not
     named = bool(first) and column_names(first)[:3] == XYZ
     lines = text_lines(re.sub(rb"//[^\n]*", b"", plain))
     if named and lines and lines[0].split()[0].lower() == b"x":

@@ -58,10 +58,12 @@ def ply(content: bytes) -> Parsed:
     Raises:
         ValueError: no PLY, a type nobody knows, fewer or more data than the header announces, faces as strips.
     """
-    end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", content)
+    # as its first line ends, so does the last of the header: behind \r alone, \n may be the first byte of the data
+    last = rb"\r" if re.match(rb"ply[ \t]*\r(?!\n)", content) else rb"\r?\n"
+    end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)
     if not content.startswith(b"ply") or end is None:
         raise ValueError("wanted ply in its first line and a line end_header")
-    order, elements = _header(content[: end.start()].decode("latin-1"))
+    order, elements = _header(content[: end.start()])
     names = {element.name for element in elements}
     if "tristrips" in names:
         raise ValueError("its faces are strips of triangles; save it with single faces")
@@ -72,13 +74,15 @@ def ply(content: bytes) -> Parsed:
     return _parsed(next(element for element in elements if element.name == "vertex"), vertices, faces)
 
 
-def _header(text: str) -> tuple[str, list[Element]]:
+def _header(content: bytes) -> tuple[str, list[Element]]:
     order: str | None = None
     elements: list[Element] = []
-    for line in text.splitlines()[1:]:
+    for line in content.splitlines()[
+        1:
+    ]:  # of bytes, since lines of text end at more: at the last byte of Å, say
         if max(len(elements), len(elements[-1].properties) if elements else 0) > MOST_COLUMNS:
             raise ValueError(f"its header has more than {MOST_COLUMNS} elements, or properties of one")
-        words = line.split()
+        words = [word.decode("utf-8", "replace") for word in line.split()]
         if not words or words[0] in ("comment", "obj_info"):
             continue
         try:
@@ -100,7 +104,8 @@ def _header(text: str) -> tuple[str, list[Element]]:
             else:
                 raise ValueError
         except (KeyError, IndexError, ValueError):
-            raise ValueError(f"its header has the line {quoted(line.strip())}, which is not PLY's") from None
+            told = quoted(line.decode("utf-8", "replace").strip())
+            raise ValueError(f"its header has the line {told}, which is not PLY's") from None
     if order is None:
         raise ValueError("its header has no line format")
     return order, elements

@@ -92,6 +92,7 @@ def _stored(
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
     store = (given["logger"] or {}).get("uri") if "logger.uri" in keys.values() else None
     require_own_store(str((values.get("logger") or {}).get("uri") or ""), store, folder / "config.yaml")
+    values["resume"] = "auto"  # also where it was begun with resume=never
     for key in HOW:
         if key in keys.values():
             group, _, name = key.rpartition(".")

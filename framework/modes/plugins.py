@@ -3,7 +3,6 @@
 import ast
 import re
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from rich.console import Console
@@ -11,7 +10,8 @@ from rich.padding import Padding
 from rich.text import Text
 
 from framework.configuration.config import Config
-from framework.configuration.registry import GROUPS, Entry, installed, origin
+from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, refused
+from framework.errors import shown
 
 
 def run(config: Config) -> None:
@@ -29,7 +29,9 @@ def show() -> None:
             console.print(Padding(Text.assemble((told.name, "cyan"), "  ", told.summary), (0, 0, 0, 2)))
             source = " · ".join(filter(None, (paper(told.bibtex), told.origin)))
             console.print(Padding(Text(source, style="dim"), (0, 0, 0, 6)))
-        if not installed(group):
+        for name, reason in refused(group).items():
+            console.print(Padding(Text.assemble((name, "cyan"), f"  (refused) {reason}"), (0, 0, 0, 2)))
+        if not (installed(group) or refused(group)):
             console.print("  (none installed)")
 
 
@@ -64,9 +66,7 @@ def describe(group: str, entry: Entry) -> Description:
     summary, bibtex = "(source not found)", ""
     module, _, attribute = entry.value.partition(":")
     package, *rest = module.split(".")
-    spec = find_spec(package)
-    roots = list(spec.submodule_search_locations or []) if spec else []
-    for path in (candidate for root in roots for candidate in _candidates(Path(root), rest)):
+    for path in (candidate for root in package_folders(package) for candidate in _candidates(root, rest)):
         if path.is_file():
             summary, bibtex = _docstring_and_bibtex(path, attribute)
             break
@@ -80,9 +80,17 @@ def _candidates(root: Path, rest: list[str]) -> tuple[Path, Path]:
 
 def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = ast.parse(path.read_bytes())  # bytes, since the file may say that it is in another encoding
     except SyntaxError as error:
-        return f"(broken: {path.name} line {error.lineno} does not parse)", ""
+        place = f" line {error.lineno}" if error.lineno else ""
+        return f"(broken: {path.name}{place} does not parse)", ""
+    except (
+        OSError,
+        ValueError,
+        RecursionError,
+        MemoryError,
+    ) as error:  # unreadable, a null byte, or far too deep
+        return f"(broken: {path.name} cannot be read: {shown(error)})", ""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and node.name == attribute:
             summary = (ast.get_docstring(node) or "(no description)").partition("\n")[0]

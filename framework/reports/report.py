@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from framework.errors import UserError
 from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
 from framework.metric import Pictured
@@ -54,14 +55,6 @@ def report_test(run: Run, session: Session) -> None:
     for part, values in {"test": found.total, **groups, "cost": numbers}.items():
         run.tracker.log_metrics({f"{part}/{key}": value for key, value in values.items()}, 0, 0)
     run.tracker.log_artifact(path)
-    if settings.pictures:
-        from framework.reports.prediction_pictures import prediction_pictures
-
-        for name, figure in prediction_pictures(session):
-            picture(run, figure, name)
-        for metric in found.metrics:
-            if isinstance(metric, Pictured):
-                picture(run, metric.figure(session.title, synthetic=synthetic), metric.picture)
     rows = [
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
@@ -70,7 +63,24 @@ def report_test(run: Run, session: Session) -> None:
     session.console.print(
         results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
     )
+    if settings.pictures:
+        _pictures(run, session, found, synthetic)
     _next_steps(run, spent, session.console)
+
+
+def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) -> None:
+    """Those of predictions and of metrics. What a density does not know for the first costs that picture alone: nobody
+    asked for it, and the numbers are there."""
+    from framework.reports.prediction_pictures import prediction_pictures
+
+    try:
+        for name, figure in prediction_pictures(session):
+            picture(run, figure, name)
+    except UserError as error:
+        session.console.print(f"no picture of predictions: {error}", soft_wrap=True, highlight=False)
+    for metric in found.metrics:
+        if isinstance(metric, Pictured):
+            picture(run, metric.figure(session.title, synthetic=synthetic), metric.picture)
 
 
 def _results(

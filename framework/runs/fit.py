@@ -4,7 +4,6 @@ import time
 from pathlib import Path
 
 import pytorch_lightning as pl
-from pytorch_lightning.callbacks import EarlyStopping
 from rich.console import Console
 from torch import distributed as dist
 
@@ -19,7 +18,7 @@ from framework.storage.first_rank import first_rank
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import WholeCheckpoints
 from framework.training.fitting import fit_at_once, mean_loss
-from framework.training.module import KeepCheckpoints, Report, StopAtBatch, Training
+from framework.training.module import KeepCheckpoints, Report, StopAtBatch, StopEarly, Training
 from framework.training.progress import Progress
 from framework.uncertainty import outermost
 
@@ -78,7 +77,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     resume = _resumed_from(session, run)
     trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
     _part()
-    early = any(isinstance(one, EarlyStopping) and one.stopped_epoch for one in trainer.callbacks)  # type: ignore[attr-defined]
+    early = any(isinstance(one, StopEarly) and one.stopped for one in trainer.callbacks)  # type: ignore[attr-defined]
     session.console.print(
         f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
     )
@@ -148,7 +147,7 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         StopAtBatch(run.stopper, keep),
     ]
     if patience:
-        callbacks.append(EarlyStopping("validation/loss", patience=patience, check_finite=True))
+        callbacks.append(StopEarly(patience))
     if chosen.get("enable_progress_bar", True):
         terminal = Console(stderr=True, quiet=console.quiet)
         callbacks.append(Progress(terminal if terminal.is_terminal else console))

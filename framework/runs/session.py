@@ -4,13 +4,15 @@ import ctypes
 import logging
 import platform
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rich.console import Console
+from torch.utils.data import Dataset
 
 from framework.configuration.assembly import (
     Resolved,
@@ -35,11 +37,11 @@ from framework.configuration.loading import (
 )
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings
-from framework.data import Data
+from framework.data import Batch, Data
 from framework.datasets.fields import fetched
 from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError
-from framework.evaluation.splits import BLOCK, on_device
+from framework.evaluation.splits import BLOCK, numbers, on_device, require_own
 from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
@@ -50,11 +52,11 @@ from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
-from framework.training.batches import Batches, told
+from framework.training.batches import Batches, require_targets, told
 from framework.training.checkpoint import WholeCheckpoints
 
 FEW = 8
-"""Up to so many validation samples calibration is tried before training: some wrappers want more than one."""
+"""With so many validation samples wrappers are tried before training: some want more than one."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 
 
@@ -216,28 +218,35 @@ def tested(session: Session) -> Session:
         ConfigError: a metric does not fit the target, or wants outliers and there are none.
         DataError: as `Data.prepare`.
     """
-    require_outliers(session.parts)
-    outliers = build_outliers(session.parts, session.data)
-    return replace(session, metrics=build_metrics(session.parts, session.target), outliers=outliers)
+    parts = session.parts
+    # those of a checkpoint are checked where they are used: a model predicts without them
+    parts = {**parts, "metric": [resolve("metric", part) for part in parts["metric"]]}
+    require_outliers(parts)
+    metrics = build_metrics(parts, session.target)
+    owners: dict[str, Metric] = {}
+    for metric in metrics:
+        for name in metric.columns:
+            require_own(owners, name, metric)
+    return replace(session, parts=parts, metrics=metrics, outliers=build_outliers(parts, session.data))
 
 
 @torch.no_grad()
 def rehearse(session: Session) -> None:
-    """Give every metric two predictions of the untrained model, so that one which cannot read them says so now, and the
-    wrappers a validation split that may be too small for them; of a model that predicts nothing before it is fitted,
+    """Whatever can go wrong without training goes wrong now: look at a few targets, give every metric predictions of
+    two samples by the untrained model, calibrate a copy of it. Of a model that predicts nothing before it is fitted,
     look whether the true images are there.
 
     Raises:
-        UserError: what the metric or the wrapper says.
+        UserError: what the data, the metric or the wrapper says.
     """
     fitted, reads = (
         bool(fitted_models(session.predictor)),
         {name for each in session.metrics for name in each.reads},
     )
-    if fitted and not reads:
-        return
-    validation = session.data.splits().validation
-    some = fetched(validation, range(min(2, len(validation))))  # type: ignore[arg-type]
+    validation, *others = (session.data.splits()[split] for split in (1, 0, 2))
+    some = _few(validation, 2)
+    for batch in (some, *(_few(split, 2) for split in others)):
+        require_targets(batch, session.target)
     if fitted:
         for channel in sorted(reads):
             true_image(some, channel)
@@ -246,13 +255,39 @@ def rehearse(session: Session) -> None:
     training = session.predictor.training
     density = session.predictor.eval()(some["input"])
     session.predictor.train(training)
-    prediction = Prediction(density, some, session.settings.samples)
-    for metric in session.metrics:
-        metric.clone().update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
-    if len(validation) <= FEW:  # type: ignore[arg-type]
-        whole = fetched(validation, range(len(validation)))  # type: ignore[arg-type]
+    samples = session.settings.samples
+    predictions = [Prediction(density, some, samples)]
+    if session.outliers is not None:  # as outliers some test samples do
+        predictions.append(Prediction(density, some, samples, "outliers"))
+    # what is said of so few samples means nothing
+    with _silence():
+        for metric in session.metrics:
+            trial = metric.clone()
+            for prediction in predictions:
+                if prediction.split in metric.splits:
+                    trial.update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
+            numbers([cast(Metric, trial)])
+        few = some if not session.parts["uncertainty"] else _few(validation, FEW)
         with torch.enable_grad():
-            deepcopy(session.predictor).eval().calibrate([whole])
+            deepcopy(session.predictor).eval().calibrate([few])
+
+
+def _few(dataset: Dataset[Batch], most: int) -> Batch:
+    """The first samples."""
+    return fetched(dataset, range(min(most, len(dataset))))  # type: ignore[arg-type]
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Neither warnings nor what is logged below an error."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
 
 
 def for_trained(config: Config, *, prepare: bool = True) -> Session:

@@ -24,7 +24,7 @@ from framework.runs.job import PARENT, RECORD, VALUE
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.storage.reading import guarded, read_bytes
-from framework.tracking.signals import Stopped
+from framework.tracking.signals import SIGNALS, Stopped, handled
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """What runs one job; its overrides follow. No config can set it, since it would then run code."""
@@ -120,7 +120,7 @@ def run(
 ) -> None:
     """Run every job that has not completed; returns when all have ended, however they ended.
 
-    SIGINT and SIGTERM are passed on to the jobs, which close their runs; a second signal makes them hurry, a
+    SIGINT, SIGTERM and SIGHUP are passed on to the jobs, which close their runs; a second signal makes them hurry, a
     third kills them.
 
     Args:
@@ -284,7 +284,7 @@ def _end(one: _Running, seconds: float) -> None:
         status, error = "died", f"killed by {signal.Signals(-code).name}"
         if code == -signal.SIGKILL:
             error += ", as the system does when memory runs out"
-    elif code - 128 in (signal.SIGINT, signal.SIGTERM):
+    elif code - 128 in SIGNALS:
         status, error = "died", f"stopped by {signal.Signals(code - 128).name}"
     else:
         status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
@@ -316,9 +316,9 @@ def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """The SIGINTs and SIGTERMs that came inside the block."""
+    """The numbers of those that came inside the block."""
     received: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = handled()
     before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
     try:
         yield received

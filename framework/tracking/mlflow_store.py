@@ -13,10 +13,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import final
 
-from framework.errors import CheckpointError
+from framework.errors import CheckpointError, DataError
 from framework.storage.cache import folder as cache_folder
 from framework.storage.files import alone, remove_leftovers, replacing
-from framework.tracking.run_info import MODEL, RunInfo, default_uri, sqlite_path, store_uri, without_password
+from framework.tracking.run_info import (
+    MODEL,
+    RunInfo,
+    default_uri,
+    read_run_info,
+    sqlite_path,
+    store_uri,
+    without_password,
+)
 from framework.tracking.sender import Record, Store, reason
 
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
@@ -249,7 +257,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
     try:
         run = client.get_run(run_id)
         made = Path(run.data.tags.get(_FOLDER, ""))
-        if _FOLDER in run.data.tags and made.is_dir():
+        if _FOLDER in run.data.tags and _holds(made, run_id):
             return made
         models = _models(run)
         if not models and not client.list_artifacts(run_id, "checkpoints"):
@@ -265,6 +273,15 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
     except MlflowException as error:
         raise CheckpointError(f"Run {run_id} cannot be had from {shown}: {reason(error)}.") from error
     return copy
+
+
+def _holds(folder: Path, run_id: str) -> bool:
+    """Whether the run in this folder is that one still: another may have been made there since."""
+    try:
+        info = read_run_info(folder)
+    except DataError:
+        return False
+    return info is not None and info.run_id == run_id
 
 
 def _opened(info: RunInfo) -> tuple[MlflowClient, str]:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: stop where it is safe, and say so in the exit code."""
+"""Ctrl-C, SIGTERM and a terminal that is closed: stop where it is safe, and say so in the exit code."""
 
 import signal
 from collections.abc import Iterator
@@ -6,7 +6,13 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+
+
+def handled() -> tuple[signal.Signals, ...]:
+    """All of them, but for the closing of a terminal where that is ignored, as under nohup."""
+    ignored = {number for number in SIGNALS if signal.getsignal(number) is signal.SIG_IGN}
+    return tuple(number for number in SIGNALS if number not in ignored - {signal.SIGINT, signal.SIGTERM})
 
 
 class Stopped(SystemExit):
@@ -18,7 +24,7 @@ class Stopped(SystemExit):
 
 
 class Stopper:
-    """Turns SIGINT and SIGTERM into `Stopped`: at once, or, while `wait` is set, where the code calls `stop`.
+    """Turns SIGINT, SIGTERM and SIGHUP into `Stopped`: at once, or, while `wait` is set, where the code calls `stop`.
 
     A second signal never waits.
     """
@@ -29,7 +35,7 @@ class Stopper:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Handle both signals inside the block; the handlers before are restored after it."""
+        """Handle the signals inside the block; the handlers before are restored after it."""
         before = {number: signal.getsignal(number) for number in SIGNALS}
         self.install()
         try:
@@ -39,8 +45,8 @@ class Stopper:
                 signal.signal(number, handler)
 
     def install(self) -> None:
-        """Handle both signals, whoever has handled them since."""
-        for number in SIGNALS:
+        """Handle the signals, whoever has handled them since."""
+        for number in handled():
             signal.signal(number, self._handle)
 
     def stop(self) -> NoReturn:

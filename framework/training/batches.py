@@ -1,18 +1,22 @@
 """The order of batches, a function of (seed, epoch)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
 import pytorch_lightning as pl
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
+from framework.distributions.class_probabilities import require_labels
 from framework.distributions.noise import hashed
 from framework.errors import ConfigError, DataError
 from framework.storage.progress import tracked
+from framework.target import Target
 
 Position = tuple[int, int]
 """(epoch, first batch within it), both from 0."""
@@ -151,8 +155,8 @@ class Batches(pl.LightningDataModule):
         return self._loader(self.data.splits().test, seed=None, drop_last=False)
 
     def of(self, dataset: Dataset[Batch]) -> DataLoader[Batch]:
-        """Batches of a dataset that is none of the four stages', in its own order."""
-        return self._loader(dataset, seed=None, drop_last=False)
+        """Batches of a dataset that is none of the four stages', in its own order; its targets may be any."""
+        return self._loader(dataset, as_batch, seed=None, drop_last=False)
 
     def predict_dataloader(self) -> DataLoader[Batch]:
         # Plain, since Lightning rebuilds a loader of predict to keep track of indices, and cannot ours.
@@ -164,7 +168,9 @@ class Batches(pl.LightningDataModule):
             generator=self._generator(),
         )
 
-    def _loader(self, dataset: Dataset[Batch], **order: Any) -> DataLoader[Batch]:
+    def _loader(
+        self, dataset: Dataset[Batch], collate: Callable[..., Batch] | None = None, **order: Any
+    ) -> DataLoader[Batch]:
         trainer = self.trainer
         length: int = len(dataset)  # pyright: ignore[reportArgumentType]
         return DataLoader(
@@ -178,7 +184,7 @@ class Batches(pl.LightningDataModule):
             ),
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
-            collate_fn=as_batch,
+            collate_fn=collate or partial(with_targets, self.data.target),
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
             generator=self._generator(),
         )
@@ -207,6 +213,26 @@ class Batches(pl.LightningDataModule):
             epoch, first = epoch.started - 1, processed
         # Overfitting wants the same few batches every time.
         return (0 if trainer.overfit_batches else epoch), first
+
+
+def with_targets(target: Target, items: Mapping[str, Tensor] | list[Batch]) -> Batch:
+    """As `as_batch`; of targets that `require_targets` refuses a DataError."""
+    return require_targets(as_batch(items), target)
+
+
+def require_targets(batch: Batch, target: Target) -> Batch:
+    """The batch itself, if its targets are laid out as `target` says: others would broadcast, and be trained on.
+
+    Raises:
+        DataError: they are of another shape, or a label is that of no class.
+    """
+    found, wanted = batch["target"], (len(batch["input"]), *target.event_shape)
+    if tuple(found.shape) != wanted:
+        raise DataError(
+            f'The data set gives {wanted[0]} samples a "target" of shape {tuple(found.shape)}: wanted {wanted}, for '
+            f"targets of kind {target.kind!r} ({target.told}). Mend the data set, or its `target`."
+        )
+    return batch if target.kind != "class" else {**batch, "target": require_labels(found, len(target.names))}
 
 
 def told(loader: DataLoader[Batch], what: str) -> Iterator[Batch]:

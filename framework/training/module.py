@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.callbacks.early_stopping import EarlyStopping, EarlyStoppingReason
 from torch import Tensor, nn
 
 from framework.configuration.settings import OptimizerSettings
@@ -278,6 +279,28 @@ class KeepCheckpoints(pl.Callback):
         if last.exists() and trainer.is_global_zero:
             last.replace(self.folder / "previous.ckpt")
         trainer.save_checkpoint(last)
+
+
+class StopEarly(EarlyStopping):
+    """Stops when the validation loss was not lower than ever for `patience` validations, or is not finite.
+
+    It looks when a validation ends, since last.ckpt is written after that and must hold what was found. Lightning
+    restores what was found, but not that the trainer was told to stop: a run that was killed in its test would train
+    on where it is resumed.
+    """
+
+    def __init__(self, patience: int) -> None:
+        super().__init__(
+            "validation/loss", patience=patience, check_finite=True, check_on_train_epoch_end=False
+        )
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the trainer was told to stop; it goes on until its `min_epochs` and `min_steps` all the same."""
+        return self.stopping_reason is not EarlyStoppingReason.NOT_STOPPED
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        trainer.should_stop = trainer.should_stop or self.stopped
 
 
 class Report(pl.Callback):

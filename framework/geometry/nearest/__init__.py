@@ -231,17 +231,60 @@ def chamfer(
     """Mean squared distance to the nearest point of the other cloud, both ways added (eq. 6.6); differentiable.
 
     Raises:
-        DataError: as `nearest`.
+        DataError: as `nearest`; or the dtype cannot hold the squares' mean, which is too large, or too small and not 0.
     """
-    return one_way(a, b, sizes_a, sizes_b) + one_way(b, a, sizes_b, sizes_a)
+    there, back = offsets(a, b, sizes_a, sizes_b), offsets(b, a, sizes_b, sizes_a)
+    found = mean_square(there, sizes_a) + mean_square(back, sizes_b)
+    apart = there.detach().any(2).any(1) | back.detach().any(2).any(1)
+    lost = ~found.detach().isfinite() | ((found.detach() == 0) & apart)
+    if lost.any():
+        cloud = int(lost.nonzero()[0])
+        lies, unit = (
+            ("near each other", "smaller") if found[cloud] == 0 else ("far from each other", "larger")
+        )
+        raise DataError(
+            f"Clouds {cloud} of the batch lie so {lies} that {a.dtype} cannot hold their mean squared distance. Use "
+            f"float64 or a {unit} unit."
+        )
+    return found
 
 
-def one_way(queries: Tensor, clouds: Tensor, query_sizes: Tensor | None, sizes: Tensor | None) -> Tensor:
+def offsets(
+    queries: Tensor, clouds: Tensor, query_sizes: Tensor | None, sizes: Tensor | None
+) -> Float[Tensor, "batch query 3"]:
+    """From the nearest point of the cloud to each query; 0 for queries beyond `query_sizes`."""
     index = nearest(clouds, queries, sizes, query_sizes).index
-    if query_sizes is not None:
-        real = filled(queries, query_sizes)
-        queries = queries.where(real[..., None], 0)  # before anything is multiplied: NaN × 0 is no gradient
-    square = (queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))).square().sum(-1)
-    if query_sizes is None:
-        return square.mean(1)
-    return square.where(real, 0).sum(1) / query_sizes.to(square.device)
+    real = None if query_sizes is None else filled(queries, query_sizes)[..., None]
+    if real is not None:
+        queries = queries.where(real, 0)  # before anything is subtracted: NaN × 0 is no gradient
+    found = queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))
+    return found if real is None else found.where(real, 0)
+
+
+def mean_square(offsets: Float[Tensor, "batch query 3"], sizes: Tensor | None) -> Float[Tensor, "batch"]:
+    """Mean of the squared lengths of so many offsets of each cloud; the others are 0."""
+    sizes = offsets.new_full((len(offsets),), offsets.shape[1]) if sizes is None else sizes.to(offsets)
+    return MeanSquare.apply(offsets, sizes)  # type: ignore[return-value]
+
+
+class MeanSquare(torch.autograd.Function):
+    """Squares of offsets in units of the largest, so that only a mean that the dtype cannot hold is lost.
+
+    A unit is a power of two, by which multiplying is exact. The derivative is that of the formula, since a chain of the
+    single steps would multiply by the square of the unit, which the dtype may not hold.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, offsets: Tensor, sizes: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(offsets, sizes)
+        exponent = torch.frexp(offsets.abs().amax((1, 2))).exponent.clamp(
+            -MOST[offsets.dtype], MOST[offsets.dtype]
+        )
+        unit = torch.ldexp(torch.ones_like(sizes), exponent)
+        square = (offsets / unit[:, None, None]).square().sum(-1)
+        return square.sum(1) / sizes * unit * unit
+
+    @staticmethod
+    def backward(ctx: Any, along: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        offsets, sizes = ctx.saved_tensors
+        return 2 * offsets * (along / sizes)[:, None, None], None

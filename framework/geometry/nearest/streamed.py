@@ -37,7 +37,8 @@ class Stream:
     """The nearest points among all chunks so far: on one device to the bit what `nearest` finds in all at once."""
 
     def __init__(self, queries: Float[Tensor, "query 3"] | Queries) -> None:
-        self.queries = queries if isinstance(queries, Queries) else prepare(queries)
+        # copies, here and below: whoever reads a large cloud fills one buffer again and again
+        self.queries = queries if isinstance(queries, Queries) else prepare(queries.clone())
         self.count = 0
         self.best: Streamed | None = None
 
@@ -94,7 +95,7 @@ class Middle:
         if len(points) == 0:
             return
         if self.count == 0:
-            self.first = points[0]
+            self.first = points[0].clone()
             self.sum = torch.zeros_like(self.first)
         self.sum = self.sum + (points - self.first).sum(
             0
@@ -110,7 +111,7 @@ class Reach:
     """The largest distance from a centre of all points so far, in float64; 1 where all points are at the centre."""
 
     def __init__(self, centre: Float[Tensor, "3"]) -> None:
-        self.centre = centre.double()
+        self.centre = centre.detach().double().clone()
         self.largest = 0.0
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:

@@ -102,7 +102,8 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
     for split in Splits._fields:
         file = root / f"{split}.txt"
         with guarded(file, "names of subjects, a line each"):
-            names = [line.strip() for line in read_bytes(file).decode("utf-8").splitlines() if line.strip()]
+            lines = [line.decode("utf-8").strip() for line in read_bytes(file).splitlines()]
+            names = [line for line in lines if line]
             if not names:
                 raise ValueError("it names nobody")
             for name in names:

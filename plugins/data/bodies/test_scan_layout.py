@@ -124,6 +124,7 @@ WRONG = {
     "a subject twice": (listed("test.txt", "eve\neve\n"), "eve is in test.txt already"),
     "nobody": (listed("validation.txt", "\n"), "names nobody"),
     "a path": (listed("test.txt", "../eve\n"), "no name of a folder"),
+    "two in a line": (listed("test.txt", "eve\x0bzoe\n"), "no name of a folder"),
     "a stranger": (listed("test.txt", "zoe\n"), "no such folder; wanted the subject zoe"),
     "another mesh": (larger_mesh, "has 41 vertices, that of"),
     "no colours": (without("colours"), "have no colours"),

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import posixpath
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -51,12 +52,13 @@ def read_table(
     first_line: dict[str, int] = {}
     rows = []
     for index, (number, cells) in enumerate(lines.items()):
-        name = cells[FILE].strip()
+        written = cells[FILE].strip()
+        name = posixpath.normpath(written) if written else ""  # `./a.png` is `a.png`: one image in one split
         if not name:
             raise DataError(f"{file} line {number}: no `{FILE}`; wanted the name of an image.")
         if name in first_line:
             raise DataError(
-                f"{file} line {number}: {quoted(name)} stands already in line {first_line[name]}; wanted each "
+                f"{file} line {number}: {quoted(written)} stands already in line {first_line[name]}; wanted each "
                 "image once. Take one of the lines out."
             )
         first_line[name] = number

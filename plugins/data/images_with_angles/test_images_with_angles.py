@@ -107,6 +107,8 @@ def table_with(line: str, header: str = "file,pan,tilt", place: int = 3) -> str:
         (table_with("777.png,3,4,5"), r"line 5: 4 cells; wanted 3"),
         (table_with("  ,3,4"), r"line 5: no `file`; wanted the name of an image"),
         (table_with("001.png,3,4"), r"line 5: '001\.png' stands already in line 3"),
+        (table_with("./001.png,3,4"), r"line 5: '\./001\.png' stands already in line 3"),
+        (table_with("a/..//001.png,3,4"), r"line 5: 'a/\.\.//001\.png' stands already in line 3"),
         ('file,pan\n"000.png,3', r"cannot be read .* wanted UTF-8 text, separated by commas"),
         ("file,pan,split\n000.png,3,trian", r"line 2, column `split`: 'trian'; .* Did you mean 'train'\?"),
         (

@@ -95,7 +95,7 @@ def read_list(file: Path) -> list[str]:
     """
     names = []
     with guarded(file, "a list of image names", "Restore it from the release."):
-        lines = read_bytes(file).decode("utf-8").splitlines()
+        lines = [line.decode("utf-8") for line in read_bytes(file).splitlines()]
     for number, line in enumerate(lines, start=1):
         match line.split():
             case []:

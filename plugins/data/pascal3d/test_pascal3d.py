@@ -245,6 +245,10 @@ def test_lists(tmp_path: Path) -> None:
     file.write_text("2008_000001 1\n2008_000002 7\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"car_train\.txt line 2: '2008_000002 7'; wanted"):
         layout.read_list(file)
+    for end in "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029":  # of lines of Python's text, not of files
+        file.write_bytes(f"2008_000001{end}n01_2\n".encode())
+        with pytest.raises(DataError, match=r"car_train\.txt line 1: .* wanted an image name"):
+            layout.read_list(file)
     file.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(DataError, match=r"car_train\.txt: cannot be read"):
         layout.read_list(file)

@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.protocol import Estimate, estimate, marginal, median, tempered
+from framework.distributions.protocol import Estimate, estimate, marginal, median, peaks, scales, tempered
+from framework.distributions.tempering import tempered_classes
 from framework.distributions.uniform import uniform
 from plugins.density_head.latent.monte_carlo import (
     Effort,
@@ -178,10 +179,23 @@ def _(density: LatentDensity, samples: int) -> Tensor:
     return median(density.mixture, samples)
 
 
+@peaks.register
+def _(density: LatentDensity) -> Tensor:
+    return peaks(density.mixture)
+
+
+@scales.register
+def _(density: LatentDensity) -> Tensor:
+    return scales(density.mixture)
+
+
 @tempered.register
-def _(density: LatentDensity, temperature: Tensor) -> LatentDensity:
-    """Component by component, at the same points."""
+def _(density: LatentDensity, temperature: Tensor) -> Distribution:
+    """Component by component, at the same points; of classes the whole, as of any mixture."""
     changed = copy.copy(density)
+    if density.has_enumerate_support:
+        changed.effort = density._fixed if temperature.requires_grad else density.effort
+        return tempered_classes(changed, temperature)
     changed.__dict__.pop("mixture", None)  # that of the untempered components, where it was asked for
     changed.latent = density.latent.tempered(temperature)
     changed._example = tempered(density._example, temperature)

@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 from framework.distributions.closed_forms import normal_quantile
 from framework.distributions.density import Mixture, joined
 from framework.distributions.protocol import Estimate, estimate, marginal, tempered
+from framework.distributions.tempering import tempered_classes
 from framework.errors import ConfigError
 
 REPLICATES = 8
@@ -100,7 +101,9 @@ def _(density: SampledMixture, index: int) -> Distribution:
 
 @tempered.register
 def _(density: SampledMixture, temperature: Tensor) -> Distribution:
-    """Component by component, also of classes, so that its log-density stays an estimate with its error."""
+    """Component by component; of classes the whole, as of any mixture, so that no temperature changes the likeliest."""
+    if density.has_enumerate_support:
+        return tempered_classes(density, temperature)
     components = tempered(density.components, temperature)
     return SampledMixture(density.log_weights, components, density.replicates)
 

@@ -8,7 +8,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.errors import ConfigError, UserError, did_you_mean
-from framework.geometry.clouds import Normalisation, denormalised, normalised, pad, require_normalised, sizes
+from framework.geometry.clouds import (
+    LOOSE,
+    Normalisation,
+    denormalised,
+    normalised,
+    pad,
+    require_normalised,
+    sizes,
+)
 from framework.geometry.nearest import Queries, nearest, prepare
 from plugins.encoder.bps.frame import frame
 
@@ -103,10 +111,12 @@ def encode(
     wanted = {feature: columns_of(feature, columns) for feature in features}
     counts = sizes(clouds)
     local, centre, scale = normalised(clouds, normalise, counts)
+    within = 1.0
     if normalise == "none":
         reach = max(1.0, float(basis.points.abs().max()))
         require_normalised(local[..., :3], reach, counts, by="encoder bps")
-    axes = frame(local[..., :3]) if rotation_invariant else None
+        within = LOOSE * reach  # beyond which that takes a point for an outlier, of half the points at most
+    axes = frame(local[..., :3], within) if rotation_invariant else None
     if axes is not None:
         local = _turned(local, axes, columns, {place for places in wanted.values() for place in places})
     coordinates = local[..., :3].to(basis.points.dtype)

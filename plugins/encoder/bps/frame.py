@@ -1,29 +1,34 @@
 """A frame of a cloud's own, which turns with it: principal axes, their directions by third moments."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 WITHIN = 1 + 1e-6
-"""Norm up to which a point of a normalised cloud counts: not those that a robust normalisation left outside."""
+"""Norm up to which a point of a normalised cloud counts, to rounding: not what a robust normalisation left outside."""
 APART = 1e-9
-"""Eigenvalues that differ by less, in units of the largest, are equal: their axes have no derivative."""
+"""Eigenvalues that differ by less, in units of the largest, are equal: their axes have no derivative. One that is less
+is 0: what is thinner than 3e-5 of its length is flat."""
 
 
-def frame(coordinates: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch 3 3"]:
+def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> Float[Tensor, "batch 3 3"]:
     """Rotations whose columns are each cloud's axes, float64; `coordinates @ frame` does not turn with the cloud.
 
     Axes are the eigenvectors of the second moments about the origin, the longest first. An axis points to where the
     third moment along it is positive; the axis of least skewness, which a mirror plane makes 0, is the one that
     completes a right-handed frame, so that a cloud with mirror planes has its frame up to its own symmetries. Not
-    determined where two moments are (nearly) equal, as of a cylinder or a cube. Differentiable in the clouds,
-    equal eigenvalues apart.
+    determined where two moments are (nearly) equal, as of a cylinder or a cube. Differentiable in the clouds to any
+    order, equal eigenvalues apart.
 
     Args:
         coordinates: about the origin; rows of NaN are padding.
+        reach: norm beyond which points are outliers, which do not count.
     """
     points = coordinates.double()
-    inside = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True) <= WITHIN  # not where NaN
+    norm = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True)
+    inside = norm <= WITHIN * reach  # not where NaN
     points = points.where(inside, 0)
     # sums, since a factor changes no eigenvector, and the skewness below is divided by them
     second = points.mT @ points
@@ -32,6 +37,8 @@ def frame(coordinates: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch 
     along = points.detach() @ axes
     third = along.pow(3).mean(1)
     skewness = third / along.square().mean(1).clamp(min=torch.finfo(torch.float64).tiny).pow(1.5)
+    # what is flat is its own mirror image: along its normal there is rounding alone, whose skewness may be the largest
+    skewness = skewness.where(values > APART * values[:, :1], 0)
     direction = torch.ones_like(third).where(third >= 0, -1)
     axes = axes * direction[:, None]
     weakest = skewness.abs().argmin(-1, keepdim=True)
@@ -39,9 +46,32 @@ def frame(coordinates: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch 
     axes = axes * torch.ones_like(direction).scatter(-1, weakest, handedness)[:, None]
     if not second.requires_grad:
         return axes
-    # first order of perturbation: d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)
-    change = axes.mT @ second @ axes
-    gap = values[:, None] - values[..., None]
-    known = gap.abs() > APART * values[:, :1, None]
-    turn = (change - change.detach()).where(known, 0) / gap.where(known, 1)
-    return axes @ (torch.eye(3, dtype=torch.float64, device=axes.device) + turn)
+    return Axes.apply(second, values, axes)[1]  # type: ignore[index]
+
+
+class Axes(torch.autograd.Function):
+    """Eigenvalues and eigenvectors that are known already, with derivatives in the matrix that they are of.
+
+    The backward is made of what the forward gives, so that it has derivatives in turn. torch.linalg.eigh's own are not
+    finite where two eigenvalues are equal.
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, second: Tensor, values: Tensor, axes: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        values, axes = values.clone(), axes.clone()
+        ctx.save_for_backward(values, axes)
+        return values, axes
+
+    @staticmethod
+    def backward(  # type: ignore[override]
+        ctx: Any, of_values: Tensor, of_axes: Tensor
+    ) -> tuple[Tensor, None, None]:
+        values, axes = ctx.saved_tensors
+        # first order of perturbation: d value_j = axis_jᵀ d(second) axis_j, and
+        # d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)
+        gap = values[:, None] - values[..., None]
+        known = gap.abs() > APART * values[:, :1, None]
+        turn = (axes.mT @ of_axes).where(known, 0) / gap.where(known, 1)
+        return axes @ (turn + of_values.diag_embed()) @ axes.mT, None, None

@@ -15,6 +15,7 @@ from framework.geometry.clouds import normalised, pad, sizes
 from plugins.encoder.bps import encoding
 from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepared
+from plugins.encoder.bps.frame import frame
 from plugins.encoder.bps.rows import COLUMNS
 
 STRATEGIES = ("ball_uniform", "grid", "ball_grid", "hexagonal")
@@ -337,6 +338,117 @@ def test_a_mirrored_cloud_is_another():
     made = prepared(basis("ball_uniform", 64, 1.0, 13))
     mirrored = cloud * torch.tensor([-1.0, *[1] * 9], dtype=torch.float64)
     assert (invariant(mirrored, made) - invariant(cloud, made))[:, 0].abs().max() > 0.05
+
+
+def shape(name, seed=0):
+    """300 points of which no axis has a mirror plane but where the name says so."""
+    cloud = (numbers(300, 3, seed=seed).abs() - 0.3) * torch.tensor([3.0, 2, 1], dtype=torch.float64)
+    kind, _, thickness = name.partition(" ")
+    if kind in ("bar", "even bar"):
+        cloud[:, 1:] = 0
+    if kind == "sheet":
+        cloud[:, 2] *= float(thickness or 0)
+    if kind == "tilted":  # in a plane that is not one of the axes', as rounding then tells
+        cloud[:, 2] = 0.3 * cloud[:, 0] - 0.7 * cloud[:, 1]
+    for axis in (0,) if kind.startswith("even") else (0, 1) if kind == "twice-even" else ():
+        cloud = torch.cat([cloud, cloud * (1 - 2.0 * torch.eye(3, dtype=torch.float64)[axis])])
+    if kind in ("even-sheet", "twice-even"):
+        cloud[:, 2] *= float(thickness or 0)
+    return cloud
+
+
+# what is flat ends at a thickness of 3e-5: below, an even sheet's upper side may be its lower
+FLAT = ["sheet", "sheet 1e-9", "sheet 1e-7", "sheet 1e-6", "tilted", "bar"]
+EVEN = [
+    "even-bar",
+    "even-sheet",
+    "even-sheet 1e-6",
+    "twice-even",
+    "twice-even 1e-6",
+    "even-solid",
+    "twice-even 1",
+]
+THICK = ["sheet 2e-4", "sheet 1e-3", "sheet 1e-2", "solid", "even-sheet 1e-2"]
+
+
+def rotations(count, seed):
+    return torch.from_numpy(Rotation.random(count, rng=seed).as_matrix())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", FLAT + EVEN + THICK)
+def test_no_rotation_of_any_shape_changes_its_code(name, seed, dtype):
+    cloud = shape(name, seed)
+    turned = torch.cat([cloud[None], cloud @ rotations(100, seed)]).to(dtype)
+    made = prepared(basis("ball_uniform", 64, 1.0, 13).to(dtype))
+    found = encode(turned, made, rotation_invariant=True).features["distance"]
+    limit = 1e-5 if dtype == torch.float32 or name in ("even-sheet 1e-6", "twice-even 1e-6") else 1e-10
+    torch.testing.assert_close(found, found[:1].expand_as(found), rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("name", FLAT + EVEN + THICK)
+def test_a_mirror_image_is_another_shape_where_no_rotation_leads_to_it(name):
+    cloud = shape(name)
+    made = prepared(basis("ball_uniform", 64, 1.0, 13))
+    for axis in range(3):
+        mirrored = cloud * (1 - 2.0 * torch.eye(3, dtype=torch.float64)[axis])
+        both = torch.stack([cloud, mirrored @ rotations(1, axis)[0]])
+        one, other = encode(both, made, rotation_invariant=True).features["distance"]
+        if name in THICK and not name.startswith("even"):
+            thickness = float(name.partition(" ")[2] or 1)
+            assert (one - other).abs().max() > 0.05 * thickness
+        else:  # up to its thickness, which is at most 1e-6 of what is flat
+            torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", ["solid", "sheet", "bar", "even-solid"])
+@pytest.mark.parametrize("radius", [1.0, 5.0])
+@pytest.mark.parametrize("norm", [0.1, 0.99, 1.0, 1.01, 1.5, 1.8])
+@pytest.mark.parametrize("far", [0, 20])
+def test_a_cloud_that_was_normalised_before_has_a_frame_whatever_its_norms(far, norm, radius, name, dtype):
+    """From a shell, whose points are all beyond 1 or all within, to one with outliers that a robust one left there."""
+    cloud = shape(name)
+    cloud = cloud * norm * radius / cloud.norm(dim=1, keepdim=True)
+    outliers = torch.tensor([[1e3, -2e3, 5e3]], dtype=torch.float64).expand(far, 3)
+    whole = torch.cat([cloud, outliers])
+    clouds = torch.cat([whole[None], whole @ rotations(20, 1)]).to(dtype)
+    made = prepared(basis("ball_uniform", 64, radius, 13).to(dtype))
+    found = encode(clouds, made, normalise="none", rotation_invariant=True)
+    assert found.frame is not None
+    lengths = (clouds[:, :300].double() @ found.frame).square().sum(1)
+    assert (lengths.diff(dim=1) <= 1e-6 * lengths[:, :1]).all()  # the longest axis first, of the shell alone
+    distance = found.features["distance"]
+    limit = (1e-5 if dtype == torch.float32 else 1e-10) * radius
+    torch.testing.assert_close(distance, distance[:1].expand_as(distance), rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("name", ["solid", "even-solid", "sheet", "sheet 1e-6", "tilted", "even-sheet"])
+def test_frames_have_derivatives_of_second_order(name):
+    cloud = shape(name)[::40]
+    clouds = normalised(torch.stack([cloud, cloud @ rotations(1, 2)[0]]), "unit_ball").clouds
+    clouds = (0.99 * clouds).requires_grad_()
+    sign = frame(clouds.detach())
+
+    def axes(clouds):  # of a mirror plane the sign is noise's
+        found = frame(clouds)
+        return found * (found.detach() * sign).sum(1, keepdim=True).sign()
+
+    assert torch.autograd.gradcheck(axes, (clouds,), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradgradcheck(axes, (clouds,), eps=1e-7, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("normalise", ["unit_ball", "robust", "none"])
+def test_codes_have_derivatives_of_second_order(normalise):
+    made = prepared(basis("ball_uniform", 4, 1.0, 13))
+
+    def features(clouds):
+        found = encode(clouds, made, ["distance", "delta"], normalise, rotation_invariant=True)
+        return channels(found)
+
+    clouds = pad([0.3 * numbers(6, 3, seed=3), 0.3 * numbers(7, 3, seed=4)]).requires_grad_()
+    assert torch.autograd.gradgradcheck(features, (clouds,), eps=1e-7, atol=1e-4, rtol=1e-3)
 
 
 def test_outliers_turn_no_frame_of_a_robust_encoding():

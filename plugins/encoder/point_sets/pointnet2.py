@@ -57,8 +57,8 @@ class PointNet2(Encoder):
     (`framework.geometry.farthest`). A ball is described by where its points are relative to the centroid and what is
     known of them: they pass the same layers, each with batch norm and ReLU, then the largest number of each channel
     stands at the centroid. A ball with more points than are read is described by those that are far from each other.
-    Neither the order of the points nor padding changes the features; nor do, in evaluation, points that come twice, if
-    each does.
+    Padding changes no feature, and the order of the points none but where distances are equal, as in a lattice: of
+    equally far points the first is chosen. Nor do, in evaluation, points that come twice, if each does.
 
     Args:
         input_shape: (points, columns).

@@ -143,6 +143,17 @@ def test_order_place_size_and_company_of_a_cloud_change_nothing(grouping):
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
+def test_of_a_lattice_the_order_decides_and_padding_does_not(grouping):
+    made = encoder(grouping=grouping).double()
+    axis = torch.arange(5, dtype=torch.float64)
+    cloud = torch.cartesian_prod(axis, axis, axis)
+    wanted = made(cloud[None])
+    padded = torch.cat([cloud, cloud.new_full((9, 3), math.nan)])
+    torch.testing.assert_close(made(padded[None]), wanted, rtol=1e-9, atol=1e-9)
+    assert (made(cloud.flip(0)[None]) - wanted).abs().max() > 1e-6  # as the docstring says
+
+
+@pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
 @pytest.mark.parametrize("number", [5, 19, 150])
 def test_points_that_all_come_twice_change_nothing(grouping, number):
     """They come last, and only fill what would be filled anyway."""

@@ -14,6 +14,8 @@ from framework.distributions.circular_moments import circular_moments
 from framework.distributions.density import CHUNK
 from framework.distributions.protocol import Normals, normals
 
+MOST = 1024
+"""Components of a mixture of normals whose pairs are summed, a million; of more, draws cost less than their pairs."""
 REPLICATES = 8
 """Independent parts of the draws, from which the error of an estimate is taken."""
 
@@ -35,7 +37,7 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
     """E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21), at a target y: 0 is best, |X - y| that of a point.
 
     Of an angle the distance is the angular one (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). Exact for mixtures
-    of normals and for angles that a grid resolves (`circular_moments`). Otherwise the fair estimate
+    of up to MOST normals and for angles that a grid resolves (`circular_moments`). Otherwise the fair estimate
     (unbiased) from `samples` draws, in `REPLICATES` parts whose spread gives its error.
 
     Args:
@@ -52,7 +54,7 @@ def crps(density: Distribution, value: Tensor, samples: int) -> Score:
         drawn = fair(_draws(density, samples), at, circular=True)
         return Score(*(torch.where(seen.resolved, a, b) for a, b in zip((exact, 0.0), drawn, strict=True)))
     known = normals(density)
-    if known is not None:
+    if known is not None and known.mean.shape[-1] <= MOST:
         exact = of_normals(known, at)
         return Score(exact, torch.zeros_like(exact))
     return fair(_draws(density, samples), at, circular=False)

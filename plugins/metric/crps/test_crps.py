@@ -8,11 +8,13 @@ from torch.distributions import Independent, MultivariateNormal, Normal, Student
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.circular import angular_distance
+from framework.distributions.density import Mixture
 from framework.errors import ConfigError, UserError
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 from plugins.metric.crps.metric import CRPS
+from plugins.metric.crps.score import MOST, crps
 
 THREE = Target("angle", ("azimuth", "elevation", "tilt"))
 REALS = Target("real", ("x", "y"))
@@ -96,3 +98,21 @@ def test_nan_is_named_and_classes_are_refused():
         CRPS(Target("class", ("off", "on")))
     with pytest.raises(ConfigError, match=r"samples = 3"):
         resolve("metric", {"name": "crps", "samples": 3})
+
+
+@pytest.mark.parametrize("count", [2, MOST, MOST + 1, 20000])
+def test_many_normals_cost_no_memory_of_their_pairs(count):
+    """Two of them, each many times: beyond MOST it is an estimate with its error."""
+    place = torch.tensor([-1.0, 2.0], dtype=torch.float64).repeat(1, count // 2 + 1)[:, :count]
+    weights = torch.zeros(1, count, dtype=torch.float64)
+    density = Mixture(
+        weights, Independent(Normal(place[..., None], torch.full((1, count, 1), 0.5).double()), 1)
+    )
+    torch.manual_seed(0)
+    found = crps(density, torch.tensor([[0.3]], dtype=torch.float64), 4000)
+    share = (place[0] == -1).double().mean()
+    few = torch.stack([share, 1 - share]).log()[None]
+    pair = Mixture(few, Independent(Normal(place[:, :2, None], torch.full((1, 2, 1), 0.5).double()), 1))
+    wanted = crps(pair, torch.tensor([[0.3]], dtype=torch.float64), 4000)
+    assert (found.error == 0) == (count <= MOST)
+    assert (found.mean - wanted.mean).abs() <= 5 * found.error + 1e-12

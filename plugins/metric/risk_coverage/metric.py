@@ -9,6 +9,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import angular_distance
+from framework.errors import ConfigError
 from framework.metric import Metric, Pictured
 from framework.prediction import Prediction
 from framework.target import Target
@@ -41,6 +42,7 @@ class RiskCoverage(Metric, Pictured):
         confidence: "entropy": minus the predictive entropy; "mode": the (log-)probability of the mode.
 
     Raises:
+        ConfigError: targets are images.
         UserError: confidences or errors that are NaN; says how many.
     """
 
@@ -67,6 +69,11 @@ class RiskCoverage(Metric, Pictured):
         super().__init__()
         self.kind = target.kind
         self.confidence = confidence
+        if target.kind not in RISKS:
+            raise ConfigError(
+                f"metric risk_coverage knows no error of targets of kind {target.kind!r} ({target.told}): wanted "
+                f"{', '.join(RISKS)}. Leave it out."
+            )
         self.unit, self.risk_name = RISKS[target.kind]
         if target.kind == "angle":
             self.columns = {  # pyright: ignore[reportAttributeAccessIssue]

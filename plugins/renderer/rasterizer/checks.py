@@ -20,6 +20,8 @@ from plugins.renderer.rasterizer.textures import FARTHEST_UV, WRAPS, Laid
 CHANNELS = ("color", "depth", "face", "mask", "normal", "barycentric", "uv")
 PAINTED = ("color", "uv")
 """Channels that read a texture."""
+WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+"""Types that indices may have."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,9 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
         ValueError: says what came and what was wanted.
     """
     check_channels(channels)
-    vertices = numbers("vertices", scene.vertices)
+    check_device("vertices", scene.vertices)
+    check_device("faces", scene.faces)
+    vertices = numbers("vertices", scene.vertices, 3)
     faces = indices("faces", scene.faces, len(vertices), "vertices", shelf)
     check_device("camera.rotation", scene.camera.rotation)
     check_device("camera.translation", scene.camera.translation)
@@ -114,9 +118,8 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
     check_paint(scene, channels)
     if "color" in channels:
         if scene.colors is not None:
-            colors = numbers("colors", scene.colors)
-            if len(colors) != len(vertices):
-                raise ValueError(f"{len(colors)} colors came for {len(vertices)} vertices; wanted one each.")
+            check_device("colors", scene.colors)
+            colors = checked_colors(scene.colors, len(vertices))
         learned.append(colors)
     if scene.texture is not None and not set(PAINTED).isdisjoint(channels):
         if gradient == "soft" and "color" in channels:
@@ -124,9 +127,12 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
                 "gradient=soft blends colours per vertex, and the scene has a texture; choose gradient=boundary, or "
                 "give colors alone."
             )
-        texture, corners = check_texture(
-            scene.texture, faces, None if colors is None else colors.shape[1], shelf
+        for name, part in laid_parts(scene.texture).items():
+            check_device(name, part)
+        texture = checked_texture(
+            scene.texture, len(faces.array), None if colors is None else colors.shape[1]
         )
+        corners = indices("texture.faces", texture.faces, len(texture.uv), "places", shelf)
         learned += [texture.uv, *texture.images]
     learning = torch.is_grad_enabled() and any(
         isinstance(part, Tensor) and part.requires_grad for part in learned
@@ -151,19 +157,23 @@ def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient)
         "camera.translation": camera.translation,
     }
     if texture is not None:
-        parts |= {"uv": texture.uv, "texture.faces": texture.faces, "texture.shown": texture.shown}
-        parts |= {f"image {number} of a texture": image for number, image in enumerate(texture.images)}
+        parts |= laid_parts(texture)
     device = scene.vertices.device
     for name, part in parts.items():
         if part is not None and part.device != device:
             raise ValueError(
                 f"{name} came on {part.device} and vertices on {device}; wanted one device for both."
             )
+    numbers("vertices", scene.vertices, 3)
+    check_indices("faces", scene.faces, len(scene.vertices), "vertices")
     check_camera(camera)
-    count = len(scene.vertices)
-    if scene.faces.numel() and not (int(scene.faces.min()) >= 0 and int(scene.faces.max()) < count):
-        raise ValueError(out_of_range("faces", scene.faces, count, "vertices"))
     check_paint(scene, channels)
+    colors = None
+    if "color" in channels and scene.colors is not None:
+        colors = checked_colors(scene.colors, len(scene.vertices))
+    if texture is not None and not set(PAINTED).isdisjoint(channels):
+        checked_texture(texture, len(scene.faces), None if colors is None else colors.shape[1])
+        check_indices("texture.faces", texture.faces, len(texture.uv), "places")
     lens = [
         torch.as_tensor(part, dtype=torch.float64, device=device) for part in (camera.focal, camera.principal)
     ]
@@ -207,18 +217,46 @@ def check_device(name: str, tensor: Tensor) -> None:
         )
 
 
-def check_shape(name: str, tensor: Tensor, columns: int | None) -> None:
-    check_device(name, tensor)
+def numbers(name: str, tensor: Tensor, columns: int | None) -> Tensor:
+    """Rows of so many coordinates, or of any number of colours, in a type that kernels take."""
     if tensor.ndim != 2 or tensor.shape[1] < 1 or (columns is not None and tensor.shape[1] != columns):
         wanted = "channels, 1 or more" if columns is None else columns
         raise ValueError(f"{name} came with the shape {tuple(tensor.shape)}; wanted ({name}, {wanted}).")
+    return floating(name, tensor)
+
+
+def floating(name: str, tensor: Tensor) -> Tensor:
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name} came as {tensor.dtype}; wanted floating point, e.g. torch.float32.")
+    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
+
+
+def checked_colors(colors: Tensor, count: int) -> Tensor:
+    """Colours of so many vertices, in a type that kernels take."""
+    found = numbers("colors", colors, None)
+    if len(found) != count:
+        raise ValueError(f"{len(found)} colors came for {count} vertices; wanted one each.")
+    return found
+
+
+def check_corners(name: str, given: Tensor) -> None:
+    """Rows of three whole numbers."""
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise ValueError(f"{name} came with the shape {tuple(given.shape)}; wanted ({name}, 3).")
+    if given.dtype not in WHOLE:
+        raise ValueError(f"{name} came as {given.dtype}; wanted whole numbers, e.g. torch.int64.")
+
+
+def check_indices(name: str, given: Tensor, count: int, of: str) -> None:
+    """Rows of three indices, all below `count`, on any device."""
+    check_corners(name, given)
+    if given.numel() and not (int(given.min()) >= 0 and int(given.max()) < count):
+        raise ValueError(out_of_range(name, given, count, of))
 
 
 def indices(name: str, given: Tensor, count: int, of: str, shelf: Shelf) -> Corners:
-    """Rows of three indices, all below `count`."""
-    check_shape(name, given, 3)
-    if given.dtype not in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64):
-        raise ValueError(f"{name} came as {given.dtype}; wanted whole numbers, e.g. torch.int64.")
+    """The same on the CPU, as kernels read them."""
+    check_corners(name, given)
     kept = given.dtype in (torch.int32, torch.int64)
     found = shelf.find(array(given if kept else given.long()))
     if given.numel() and found.largest >= count:
@@ -233,30 +271,27 @@ def out_of_range(name: str, given: Tensor, count: int, of: str) -> str:
     )
 
 
-def numbers(name: str, tensor: Tensor, columns: int | None = 3) -> Tensor:
-    """Coordinates or colours in a type that kernels take."""
-    check_shape(name, tensor, None if name == "colors" else columns)
-    return floating(name, tensor)
+def laid_parts(texture: Texture) -> dict[str, Tensor]:
+    """What a texture is made of, by names for messages."""
+    parts = {"uv": texture.uv, "texture.faces": texture.faces}
+    if texture.shown is not None:
+        parts["texture.shown"] = texture.shown
+    return parts | {f"image {number} of a texture": image for number, image in enumerate(texture.images)}
 
 
-def floating(name: str, tensor: Tensor) -> Tensor:
-    if not tensor.is_floating_point():
-        raise ValueError(f"{name} came as {tensor.dtype}; wanted floating point, e.g. torch.float32.")
-    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
+def checked_texture(texture: Texture, count: int, channels: int | None) -> Texture:
+    """A texture of so many faces, in types that kernels take, on any device; which places they name is left to check.
 
-
-def check_texture(
-    texture: Texture, faces: Corners, channels: int | None, shelf: Shelf
-) -> tuple[Texture, Corners]:
-    """A texture in types that kernels take, and its corners."""
+    Args:
+        channels: of the colours that the scene has beside it.
+    """
     if not texture.images:
         raise ValueError("a texture came without images; wanted one or more.")
     if texture.wrap not in WRAPS:
         raise ValueError(f"wrap came as {texture.wrap!r}; wanted one of {', '.join(WRAPS)}.")
     images = []
-    wanted = channels if channels is not None else texture.images[0].shape[-1]
+    wanted = channels if channels is not None else (3, *texture.images[0].shape)[-1]
     for image in texture.images:
-        check_device("an image of a texture", image)
         if image.ndim != 3 or 0 in image.shape or image.shape[2] != wanted:
             raise ValueError(
                 f"an image of a texture came with the shape {tuple(image.shape)}; wanted (height, width, {wanted}), as "
@@ -270,20 +305,21 @@ def check_texture(
         raise ValueError(
             f"uv holds a number that is not finite, or beyond {FARTHEST_UV:g}; wanted places near 0 to 1."
         )
-    corners = indices("texture.faces", texture.faces, len(uv), "places", shelf)
-    count = len(faces.array)
+    check_corners("texture.faces", texture.faces)
     shown = texture.shown
-    if len(corners.array) != count or (shown is not None and shown.shape != (count,)):
+    if len(texture.faces) != count or (shown is not None and shown.shape != (count,)):
         raise ValueError(
-            f"texture.faces came for {len(corners.array)} faces"
+            f"texture.faces came for {len(texture.faces)} faces"
             + ("" if shown is None else f" and texture.shown with the shape {tuple(shown.shape)}")
             + f"; wanted {count}, since the scene has {count} faces."
         )
+    if shown is not None and shown.dtype not in WHOLE:
+        raise ValueError(f"texture.shown came as {shown.dtype}; wanted whole numbers, e.g. torch.int64.")
     if shown is not None and count and not (int(shown.min()) >= -1 and int(shown.max()) < len(images)):
         raise ValueError(
             f"texture.shown names the images {int(shown.min())} to {int(shown.max())}; wanted -1 to {len(images) - 1}."
         )
-    return Texture(tuple(images), uv, texture.faces, shown, texture.wrap, texture.smooth), corners
+    return Texture(tuple(images), uv, texture.faces, shown, texture.wrap, texture.smooth)
 
 
 def check_camera(camera: Camera) -> np.ndarray:
@@ -291,15 +327,11 @@ def check_camera(camera: Camera) -> np.ndarray:
     for name, side in (("height", camera.height), ("width", camera.width)):
         if not 1 <= side <= 2**16:
             raise ValueError(f"camera.{name} = {side}; wanted 1 to {2**16} pixels.")
-    for name, part in (("rotation", camera.rotation), ("translation", camera.translation)):
-        if part.device.type == "meta":
+    camera.check_shapes()
+    for name in ("rotation", "translation", "focal", "principal"):
+        part = getattr(camera, name)
+        if isinstance(part, Tensor) and part.device.type == "meta":
             check_device(f"camera.{name}", part)
-    rotation, translation = camera.rotation.shape, camera.translation.shape
-    if rotation != (3, 3) or translation != (3,):
-        raise ValueError(
-            f"camera.rotation and camera.translation came with the shapes {tuple(rotation)} and "
-            f"{tuple(translation)}; wanted (3, 3) and (3,)."
-        )
     lens = [
         float(number)
         for part in (camera.focal, camera.principal)

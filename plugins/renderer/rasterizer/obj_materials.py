@@ -17,6 +17,8 @@ from plugins.renderer.rasterizer.parts import Part, Pictures, beside
 MOST_MATERIALS = 10_000
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
 """Options of a texture that do not change where it lies or what it repeats, and how many words follow each."""
+NAMES = (b"usemtl", b"mtllib", b"newmtl", b"map_Kd")
+"""Statements that end in a name, to the end of the line: in `wall #1` or `#ff0000` the # begins no comment."""
 
 
 @dataclass
@@ -112,8 +114,9 @@ def _part(
 def _corners(content: bytes) -> Corners:
     points, words, counts, before, materials, libraries = [], [], [], [], [], []
     material = ""
-    for line in text_lines(re.sub(rb"\\[ \t]*\r?\n", b" ", content)):
-        key, *rest = line.split()
+    for line in text_lines(re.sub(rb"\\[ \t]*\r?\n", b" ", content), names=NAMES):
+        key, said = _statement(line)
+        rest = said.split()
         if key == b"vt":
             points.append(b" ".join([*rest, b"0"][:2]))  # v is 0 where only u is said
         elif key == b"f":
@@ -122,9 +125,9 @@ def _corners(content: bytes) -> Corners:
             before.append(len(points))
             materials.append(material)
         elif key == b"usemtl":
-            material = b" ".join(rest).decode("utf-8", "replace")
+            material = said.decode("utf-8", "replace")
         elif key == b"mtllib":
-            libraries.append(b" ".join(rest).decode("utf-8", "replace"))
+            libraries.append(said.decode("utf-8", "replace"))
     uv = mesh_files.rows(points, "place in a texture", 2)
     places = mesh_files.numbers(words, np.int64)
     sizes = np.array(counts, np.int64)
@@ -140,14 +143,19 @@ def _corners(content: bytes) -> Corners:
     )
 
 
+def _statement(line: bytes) -> tuple[bytes, bytes]:
+    """The first word of a line, and what follows it: a name may hold blanks."""
+    key, *rest = line.split(None, 1)
+    return key, rest[0].strip() if rest else b""
+
+
 def _materials(library: Path) -> dict[str, Material]:
     """The colours (Kd) and textures (map_Kd) of an MTL file, by name."""
     found: dict[str, Material] = {}
     with guarded(library, "an MTL file"):
         current = Material()
-        for line in text_lines(read_bytes(library)):
-            key, *rest = line.split(None, 1)
-            said = rest[0].strip() if rest else b""
+        for line in text_lines(read_bytes(library), names=NAMES):
+            key, said = _statement(line)
             if key == b"newmtl":
                 current = found.setdefault(said.decode("utf-8", "replace"), Material())
             elif key == b"Kd":

@@ -12,7 +12,7 @@ from framework.renderer import Renderer, Report, Scene
 from framework.storage.threads import POOL
 from plugins.renderer.rasterizer import reference
 from plugins.renderer.rasterizer.canvas import Canvas, Shelf
-from plugins.renderer.rasterizer.checks import CHANNELS, Ready, check_on_device, ready
+from plugins.renderer.rasterizer.checks import CHANNELS, PAINTED, Ready, check_on_device, ready
 from plugins.renderer.rasterizer.drawing import Gradient, Picture, Saving, View, draw
 from plugins.renderer.rasterizer.raster import NEAREST
 
@@ -141,7 +141,9 @@ class Rasterizer(Renderer):
             pose = (camera.rotation, camera.translation, (lens + shift) * times - shift)
             size = (camera.height * times, camera.width * times)
             near = max(float(camera.near), NEAREST)
-            surface = (scene.vertices, scene.faces, scene.colors, scene.texture)
+            colors = scene.colors if "color" in names else None  # what nobody reads was not checked
+            texture = None if set(PAINTED).isdisjoint(names) else scene.texture
+            surface = (scene.vertices, scene.faces, colors, texture)
             drawn = reference.picture(*surface, pose, near, size, names, self.cull)
             found |= pooled(drawn, times)
         return {name: found[name] for name in channels}

@@ -64,7 +64,7 @@ def _colors(mesh: meshes.Mesh) -> Float[np.ndarray, "vertices 3"] | None:
 def _textured(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) -> Part:
     """The texture that a PLY file names in a comment, as Blender and MeshLab write it."""
     head = read_bytes(file).split(b"end_header", 1)[0]
-    named = re.search(rb"^comment TextureFile[ \t]+([^\r\n]+)", head, re.MULTILINE)
+    named = re.search(rb"[\r\n]comment TextureFile[ \t]+([^\r\n]+)", head)
     if named is None:
         return part
     name = named[1].decode("utf-8", "replace").strip()

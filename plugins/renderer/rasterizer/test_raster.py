@@ -534,42 +534,87 @@ def test_layouts_and_types_of_the_input_do_not_matter():
     assert Rasterizer()(learned)["color"].requires_grad
 
 
+ROADS = pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])
+"""On the CPU compiled, and in plain torch wherever tensors lie."""
+
+
+@ROADS
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ({"vertices": torch.zeros(5, 2)}, "vertices came with the shape (5, 2)"),
+        ({"vertices": torch.zeros(642, 4)}, "vertices came with the shape (642, 4)"),
+        ({"vertices": torch.zeros(642)}, "vertices came with the shape (642,)"),
+        ({"vertices": torch.tensor(0.0)}, "vertices came with the shape ()"),
         ({"vertices": torch.zeros(3, 5, 3)}, "vertices came with the shape (3, 5, 3)"),
         (
             {"vertices": torch.zeros(642, 3, dtype=torch.int64)},
             "vertices came as torch.int64; wanted floating",
         ),
-        (
-            {"vertices": torch.zeros(642, 3, device="meta")},
-            "vertices came on meta; rasterizer draws on the CPU",
-        ),
         ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "faces came with the shape (4, 4)"),
+        ({"faces": torch.zeros(12, dtype=torch.int64)}, "faces came with the shape (12,)"),
+        ({"faces": torch.tensor(1)}, "faces came with the shape ()"),
+        ({"faces": torch.zeros(2, 2, 3, dtype=torch.int64)}, "faces came with the shape (2, 2, 3)"),
         ({"faces": torch.zeros(4, 3)}, "faces came as torch.float32; wanted whole numbers"),
+        ({"faces": torch.zeros(4, 3, dtype=torch.bool)}, "faces came as torch.bool; wanted whole numbers"),
         ({"faces": torch.tensor([[0, 1, 642]])}, "0 to 642; wanted 0 to 641"),
         ({"faces": torch.tensor([[0, -1, 2]], dtype=torch.int32)}, "-1 to 2; wanted 0 to 641"),
         ({"colors": torch.zeros(5, 3)}, "5 colors came for 642 vertices"),
+        ({"colors": torch.zeros(700, 3)}, "700 colors came for 642 vertices"),
+        ({"colors": torch.zeros(642)}, "colors came with the shape (642,)"),
+        ({"colors": torch.zeros(642, 3, dtype=torch.uint8)}, "colors came as torch.uint8; wanted floating"),
         ({"colors": torch.zeros(642, 0)}, "colors came with the shape (642, 0)"),
         ({"colors": None}, '"color" was asked of a scene without colours'),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence):
+def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence, road):
     scene = portrait()
     for name, value in change.items():
         object.__setattr__(scene, name, value)  # past the type checks that only tests have
-    with pytest.raises(ValueError, match=re.escape(sentence)):
-        Rasterizer()(scene, ALL)
+    for channels in (ALL, ("color",), ("depth",), ("normal", "barycentric")):
+        if "colors" in change and "color" not in channels:  # which nobody reads then
+            assert set(road(Rasterizer(), scene, channels)) == set(channels)
+            continue
+        with pytest.raises(ValueError, match=re.escape(sentence)):
+            road(Rasterizer(), scene, channels)
 
 
-def test_wrong_indices_are_refused_out_of_view_too():
+def test_what_lies_elsewhere_is_refused():
+    with pytest.raises(ValueError, match="vertices came on meta; rasterizer draws on the CPU"):
+        Rasterizer()(replace(portrait(), vertices=torch.zeros(642, 3, device="meta")), ALL)
+
+
+@ROADS
+def test_wrong_indices_are_refused_out_of_view_too(road):
     scene = portrait(translation=torch.tensor([0.0, 0, -5]))
     with pytest.raises(ValueError, match="wanted 0 to 641"):
-        Rasterizer()(replace(scene, faces=scene.faces + 1), ("mask",))
+        road(Rasterizer(), replace(scene, faces=scene.faces + 1), ("mask",))
 
 
+LENSES = {
+    "a number": 8.0,
+    "one": (8.0,),
+    "three": (8.0, 8.0, 8.0),
+    "none": (),
+    "two pairs": ((8.0, 8.0),) * 2,
+}
+LENSES |= {f"a tensor of {shape}": torch.full(shape, 8.0) for shape in ((), (0,), (1,), (3,), (1, 2), (2, 1))}
+
+
+@ROADS
+@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize("name", ["focal", "principal"])
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, road):
+    scene = portrait()
+    if learned:
+        scene = replace(scene, vertices=scene.vertices.clone().requires_grad_())
+    object.__setattr__(scene.camera, name, LENSES[lens])  # past the type checks that only tests have
+    with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \(2,\)"):
+        road(Rasterizer(gradient="interior", supersampling=2), scene, ("color", "mask"))
+
+
+@ROADS
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -579,12 +624,20 @@ def test_wrong_indices_are_refused_out_of_view_too():
         ({"focal": (1.0, math.nan)}, "not finite"),
         ({"translation": torch.tensor([0.0, math.inf, 0.0])}, "not finite"),
         ({"rotation": torch.eye(3, device="meta")}, "camera.rotation came on meta"),
+        ({"focal": torch.ones(2, device="meta")}, "camera.focal came on meta"),
+        ({"rotation": torch.eye(4)}, "camera.rotation came with the shape (4, 4); wanted the shape (3, 3)"),
+        (
+            {"translation": torch.ones(1)},
+            "camera.translation came with the shape (1,); wanted the shape (3,)",
+        ),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(change, sentence):
+def test_a_camera_that_cannot_be_is_refused(change, sentence, road):
     scene = portrait()
+    for name, value in change.items():
+        object.__setattr__(scene.camera, name, value)  # past the type checks that only tests have
     with pytest.raises(ValueError, match=re.escape(sentence)):
-        Rasterizer()(replace(scene, camera=replace(scene.camera, **change)))
+        road(Rasterizer(), scene, ("color",))
 
 
 @pytest.mark.parametrize(

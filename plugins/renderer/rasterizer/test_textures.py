@@ -1,6 +1,7 @@
 """Textures against torch's own sampling, and what faces say of themselves against one another."""
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -114,6 +115,54 @@ def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None
         assert scene.texture.shown is not None and set(scene.texture.shown.tolist()) == {-1, 0}
 
 
+WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+@pytest.mark.parametrize("count", [100, 300, 40_000])
+@pytest.mark.parametrize("textured", list(itertools.product([False, True], repeat=2)), ids=str)
+@pytest.mark.parametrize(("kind", "other"), list(itertools.product(WHOLE, repeat=2)), ids=str)
+def test_joined_indices_are_those_of_int64_whatever_types_came(
+    kind: torch.dtype, other: torch.dtype, textured: tuple[bool, bool], count: int
+) -> None:
+    """Of many vertices, places and images before few: sums that none of the smaller types holds."""
+
+    def subject(count: int, kind: torch.dtype, cover: bool) -> Scene:
+        most = min(count, torch.iinfo(kind).max)
+        faces = torch.tensor([[0, 1, most - 1], [2, most - 2, 1]]).to(kind)
+        images = tuple(torch.full((1, 1, 3), 0.5) for _ in range(min(most, 130) - 1))
+        shown = torch.tensor([0, len(images) - 1]).to(kind)
+        texture = Texture(images, torch.zeros(count, 2), faces.long(), shown.long())
+        scene = Scene(
+            torch.zeros(count, 3), faces.long(), torch.zeros(count, 3), camera(), texture if cover else None
+        )
+        # past the type checks that only tests have, which know no uint8
+        for part, name, value in (
+            (scene, "faces", faces),
+            (texture, "faces", faces),
+            (texture, "shown", shown),
+        ):
+            object.__setattr__(part, name, value)
+        return scene
+
+    found = joined([subject(count, kind, textured[0]), subject(100, other, textured[1])])
+    # the same small numbers as int64, moved by hand
+    first, last = subject(count, kind, True), subject(100, other, True)
+    assert first.texture is not None and first.texture.shown is not None
+    assert last.texture is not None and last.texture.shown is not None
+    assert found.faces.tolist() == [*first.faces.tolist(), *(last.faces.long() + count).tolist()]
+    if found.texture is None:
+        assert not any(textured)
+        return
+    places, images = (count, len(first.texture.images)) if textured[0] else (0, 0)
+    nothing = torch.zeros(2, 3, dtype=torch.int64)
+    parts = [first.texture.faces if textured[0] else nothing]
+    parts += [last.texture.faces.long() + places if textured[1] else nothing]
+    assert found.texture.faces.tolist() == torch.cat(parts).tolist()
+    shown = first.texture.shown.tolist() if textured[0] else [-1, -1]
+    shown += (last.texture.shown.long() + images).tolist() if textured[1] else [-1, -1]
+    assert found.texture.shown is not None and found.texture.shown.tolist() == shown
+
+
 def test_subjects_of_other_channels_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
     with pytest.raises(ValueError, match="1 and 3 channels; wanted as many"):
@@ -125,16 +174,26 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
         joined([covered(), other])
 
 
+@pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ({"images": ()}, "without images"),
+        ({"images": (torch.tensor(1.0),)}, "shape ()"),
+        ({"images": (torch.zeros(4, 3),)}, "shape (4, 3)"),
         ({"images": (torch.zeros(0, 4, 3),)}, "shape (0, 4, 3)"),
         ({"images": (torch.zeros(2, 2, 3), torch.zeros(2, 2, 1))}, "shape (2, 2, 1)"),
         ({"images": (torch.zeros(2, 2, 3, dtype=torch.uint8),)}, "torch.uint8; wanted floating point"),
         ({"uv": torch.full((30, 2), torch.nan)}, "not finite"),
         ({"uv": torch.full((30, 2), 1e9)}, "beyond 1e+06"),
         ({"uv": torch.zeros(30, 3)}, "shape (30, 3)"),
+        ({"uv": torch.zeros(30)}, "shape (30,)"),
+        ({"uv": torch.zeros(30, 2, dtype=torch.int64)}, "uv came as torch.int64"),
+        ({"faces": torch.zeros(4, 3)}, "texture.faces came as torch.float32; wanted whole numbers"),
+        ({"faces": torch.zeros(12, dtype=torch.int64)}, "texture.faces came with the shape (12,)"),
+        ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "texture.faces came with the shape (4, 4)"),
+        ({"faces": torch.full((4, 3), -1)}, "-1 to -1; wanted 0 to 29"),
+        ({"shown": torch.zeros(4)}, "texture.shown came as torch.float32; wanted whole numbers"),
         ({"faces": torch.full((4, 3), 99)}, "99 to 99; wanted 0 to 29"),
         ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, "came for 5 faces"),
         ({"shown": torch.zeros(3, dtype=torch.int64)}, "shown with the shape (3,)"),
@@ -143,16 +202,21 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
     ],
 )
 def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
-    change: dict[str, object], sentence: str
+    change: dict[str, object],
+    sentence: str,
+    road: Callable[[Rasterizer, Scene, Sequence[str]], dict[str, Tensor]],
 ) -> None:
     corners = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
     faces = torch.arange(12).reshape(4, 3)
     texture = Texture((torch.rand(2, 2, 3),), torch.rand(30, 2), faces)
     for name, value in change.items():
         object.__setattr__(texture, name, value)  # past the type checks that only tests have
-    with pytest.raises(ValueError) as caught:
-        Rasterizer()(Scene(corners, faces, None, camera(), texture))
-    assert sentence in str(caught.value)
+    scene = Scene(corners, faces, None, camera(), texture)
+    for channels in (("color",), ("uv",), ("mask", "color")):
+        with pytest.raises(ValueError) as caught:
+            road(Rasterizer(), scene, channels)
+        assert sentence in str(caught.value)
+    assert set(road(Rasterizer(), scene, ("mask", "depth"))) == {"mask", "depth"}  # which read none of it
 
 
 def test_the_blended_picture_refuses_textures() -> None:

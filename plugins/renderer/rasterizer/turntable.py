@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from framework.errors import DataError, did_you_mean, quoted
-from framework.geometry.camera import Camera
+from framework.geometry.camera import Camera, focal_length
 from framework.geometry.rotation import about_z, viewpoint_rotation
 from framework.renderer import Scene
 from framework.storage.plain_values import LARGEST_YAML, read_yaml
@@ -72,7 +72,7 @@ def looking_at(
         size: (height, width), pixels.
     """
     height, width = size
-    focal = 0.5 * height / math.tan(0.5 * field_of_view)
+    focal = focal_length(height, field_of_view)
     if distance is None:
         distance = MARGIN * around.radius / math.sin(math.atan(0.5 * min(size) / focal))
     rotation = IMAGE @ viewpoint_rotation(torch.tensor(angles, dtype=torch.float64)) @ UPRIGHT[up]

@@ -140,6 +140,7 @@ def _check(scene: Scene, channels: Collection[str]) -> None:
         raise ValueError(f"channels {', '.join(sorted(unknown))} were asked for; SMPLpix draws color alone.")
     if not channels:
         return
+    scene.camera.check_shapes()
     count = len(scene.vertices)
     if scene.vertices.shape != (count, 3) or scene.faces.dim() != 2 or scene.faces.shape[1] != 3:
         raise ValueError(

@@ -138,6 +138,12 @@ def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
     assert scene.colors is not None
     with pytest.raises(ValueError, match="red, green and blue"):
         drawn(replace(scene, colors=scene.colors[:, :1]))
+    for name in ("focal", "principal"):
+        for lens in (8.0, (8.0,), (8.0, 8.0, 8.0), torch.tensor([8.0]), torch.tensor(8.0), torch.ones(2, 1)):
+            camera = seen_from(SIZE)
+            object.__setattr__(camera, name, lens)  # past the type checks that only tests have
+            with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \(2,\)"):
+                drawn(replace(scene, camera=camera))
     if encoders[0]["name"] == "rasterised":
         with pytest.raises(ValueError, match="topology"):
             drawn(replace(scene, vertices=MESH.vertices[:9], colors=scene.colors[:9], faces=MESH.faces[:0]))

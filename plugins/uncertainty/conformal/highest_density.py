@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, grid, wrap
-from framework.distributions.protocol import peaks
+from framework.distributions.protocol import peaks, scales
 
 FOLD = 12
 """Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
@@ -20,6 +20,8 @@ TURN = 720
 """Further nodes all around a circle, for broad humps that are no peak's."""
 PEAKS, CANDIDATES = 8, 64
 """Peaks that get nodes of their own, and among how many they are chosen."""
+PARTED = 0.1
+"""Nats by which a valley lies below both humps at least."""
 BISECTIONS = 52
 """Halvings of a cell: its ends are as exact as the number type."""
 
@@ -184,12 +186,14 @@ class Line:
 
     def _peaks(self) -> Float[Tensor, "peak item"]:
         """The highest humps, at most PEAKS; a candidate without a valley on the way to a chosen one is its hump's."""
-        places = peaks(self.density).squeeze(-1).double()  # (candidate, item)
+        places = self._candidates()  # (candidate, item), ascending; the last ones may repeat
         heights = self.at(places).nan_to_num(nan=-math.inf)
-        keep = heights.topk(min(CANDIDATES, len(heights)), dim=0)
+        tops = self._tops(places, heights)
+        keep = heights.where(tops, -math.inf).topk(min(CANDIDATES, len(heights)), dim=0)
         places, heights = places.gather(0, keep.indices), keep.values
         chosen: list[Tensor] = []
-        left = torch.ones_like(heights, dtype=torch.bool)
+        left = heights > -math.inf
+        left[:1] = True
         while len(chosen) < PEAKS and bool(left.any()):
             best = heights.where(left, -math.inf).argmax(0, keepdim=True)
             place = places.gather(0, best)
@@ -197,9 +201,42 @@ class Line:
             away = places - place
             away = wrap(away) if self.closed else away
             valley = self.at(place + away / 2)
-            left &= ~(valley >= heights - 0.1)
+            left &= ~(valley >= heights - PARTED)
             left.scatter_(0, best, False)
         return torch.cat(chosen)
+
+    def _candidates(self) -> Float[Tensor, "candidate item"]:
+        """Of the density's `peaks` one in each quarter of their scale: hundreds may lie on one hump."""
+        places = peaks(self.density).squeeze(-1).double()
+        if self.closed:
+            places = wrap(places)
+        order = places.sort(0)
+        places, scale = order.values, scales(self.density).double().gather(0, order.indices)
+        cell = torch.where((scale > 0) & scale.isfinite(), scale, 1.0).log2().floor().exp2() / 4
+        key = (places / cell).floor()
+        new = torch.ones_like(places, dtype=torch.bool)
+        new[1:] = (key[1:] != key[:-1]) | (cell[1:] != cell[:-1])
+        most = int(new.sum(0).amax())
+        first = new.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
+        # an item that has fewer repeats its last
+        last = first.gather(0, new.sum(0, keepdim=True) - 1)
+        first = torch.where(new.gather(0, first), first, last)
+        return places.gather(0, first)
+
+    def _tops(
+        self, places: Float[Tensor, "candidate item"], heights: Float[Tensor, "candidate item"]
+    ) -> Bool[Tensor, "candidate item"]:
+        """Which ascending candidates are higher than both neighbours, or parted from a higher one by a valley."""
+        ahead = places.roll(-1, 0) - places
+        ahead = wrap(ahead) if self.closed else ahead
+        valley = self.at(places + ahead / 2)
+        after, before = heights.roll(-1, 0), heights.roll(1, 0)
+        parted = valley < torch.minimum(heights, after) - PARTED
+        tops = ((heights > before) | parted.roll(1, 0)) & ((heights >= after) | parted)
+        if not self.closed:
+            tops[:1] = (heights[:1] >= after[:1]) | parted[:1]
+            tops[-1:] = (heights[-1:] > before[-1:]) | parted.roll(1, 0)[-1:]
+        return tops.scatter(0, heights.argmax(0, keepdim=True), True)
 
     def _cells(self) -> tuple[Tensor, Tensor, Tensor]:
         """The lower and the higher log p at each cell's ends, and the log of its width."""

@@ -11,7 +11,7 @@ from torch.distributions import Categorical, Independent, MultivariateNormal, No
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.density import Mixture, circular_grid
-from framework.distributions.protocol import estimate, marginal, median
+from framework.distributions.protocol import estimate, marginal, median, peaks, scales
 from framework.distributions.tempering import temper
 from framework.errors import UserError
 from framework.target import Target
@@ -21,6 +21,7 @@ from plugins.uncertainty.conformal.prediction_set import PredictionSet
 
 EVERYTHING = torch.tensor(math.inf, dtype=torch.float64)
 TURN = 2 * math.pi
+ITEMS = 4
 
 
 def hot(value):
@@ -375,3 +376,40 @@ def test_levels_and_scores_are_inverse():
     for score in (1e-6, 0.1, 2.3, 50.0, 5000.0):
         level = line.level_of(hot(score))
         assert line.score_of(level).item() == pytest.approx(score, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["real", "angle"])
+@pytest.mark.parametrize("humps", [2, 5])
+@pytest.mark.parametrize("count", [7, 65, 500])
+def test_no_hump_is_lost_among_many_components(closed, humps, count):
+    """Whatever the others' number and order: humps of 60 % and of shares of the rest, each made of many components."""
+    torch.manual_seed(count)
+    hump = torch.where(torch.rand(ITEMS, count) < 0.6, 0, torch.randint(1, humps, (ITEMS, count)))
+    hump[:, :humps] = torch.arange(humps)  # each has one at least
+    place = (hump * 1.2 - 3 + 0.006 * torch.randn(ITEMS, count)).double().unsqueeze(-1)
+    if closed:
+        component = type(build_head("von_mises")(torch.zeros(1, 3)))(place, torch.full_like(place, 2500.0))
+    else:
+        component = Independent(Normal(place, torch.full_like(place, 0.02), validate_args=False), 1)
+    density = Mixture(torch.zeros(ITEMS, count, dtype=torch.float64), component)
+    level = -math.log(1e-4)
+    found = PredictionSet(density, hot(level), "density")
+    assert [len(parts) for parts in found.intervals()] == [humps] * ITEMS
+    grid = torch.linspace(-3.1, 2.2, 5001, dtype=torch.float64)
+    inside = density.log_prob(grid.reshape(-1, 1, 1).expand(-1, ITEMS, 1)) >= -level
+    wanted = inside.double().mean(0) * (grid[-1] - grid[0])
+    torch.testing.assert_close(found.size(), wanted, rtol=0, atol=1e-2 * humps)
+
+
+@pytest.mark.parametrize("name", ["scvae", "cvae"])
+def test_a_latent_density_shows_its_components_humps(name):
+    head = build(
+        "density_head",
+        resolve("density_head", {"name": name, "samples": 200}),
+        target=Target("angle", ("pan",)),
+    ).eval()
+    torch.manual_seed(3)
+    density = head(3 * torch.randn(6, head.size))
+    mixture = density if isinstance(density, Mixture) else density.mixture
+    torch.testing.assert_close(peaks(density), peaks(mixture))
+    torch.testing.assert_close(scales(density), scales(mixture))

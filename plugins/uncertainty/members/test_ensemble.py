@@ -13,6 +13,7 @@ from framework.model import Model, Predictor
 from framework.target import Target
 from framework.uncertainty import own_batches
 from plugins.uncertainty.members.ensemble import Ensemble, network
+from plugins.uncertainty.members.equal_mixture import equal_mixture
 from plugins.uncertainty.members.side_by_side import SideBySide
 
 CLASSES = Target("class", ("a", "b", "c"))
@@ -347,3 +348,13 @@ def test_an_ensemble_of_one_is_trained_like_the_model():
         train(predictor, torch.optim.Adam(predictor.parameters(), lr=1e-2), inputs, target)
     assert torch.equal(whole(inputs).log_prob(target), model(inputs).log_prob(target))
     assert not isinstance(whole(inputs), Mixture)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("members", [1, 3, 50])
+def test_equal_weights_sum_to_one_in_any_precision(dtype, members):
+    components = Categorical(logits=torch.zeros(2, members, 3), validate_args=False)
+    mixed = equal_mixture(components, nn.Linear(1, 1).to(dtype), torch.device("cpu"))
+    assert mixed.log_weights.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
+    found = mixed.log_prob(torch.zeros(2, dtype=torch.int64))
+    torch.testing.assert_close(found.float(), torch.full((2,), -1.0986123), rtol=0, atol=1e-6)

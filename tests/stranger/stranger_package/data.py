@@ -18,7 +18,8 @@ from framework.target import Target
 
 
 class Signal:
-    """Sends this process a signal at one of its training batches, unless a file says that it was sent already."""
+    """Sends this process a signal at one of its training batches, the first of which is 1, or at the first picture of
+    what was tested, which is 0; not where a file says that it was sent already."""
 
     def __init__(self, at: int | None, number: int, marker: str) -> None:
         self.at, self.number, self.marker = at, number, Path(marker)
@@ -26,7 +27,10 @@ class Signal:
 
     def count(self) -> None:
         self.batches += 1
-        if self.batches == self.at and not self.marker.exists():
+        self.reached(self.batches)
+
+    def reached(self, place: int) -> None:
+        if place == self.at and not self.marker.exists():
             self.marker.touch()
             os.kill(os.getpid(), self.number)
 
@@ -100,6 +104,7 @@ class Dial(Data):
         return {"name": "dial", "samples": str(self.samples)}
 
     def picture(self, inputs: Tensor) -> np.ndarray:
+        self.signal.reached(0)
         canvas = np.full((24, 24, 3), 255, dtype=np.uint8)
         column, row = (12 + 9 * inputs.clamp(-1.2, 1.2).numpy() * (1, -1)).astype(int)
         canvas[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2] = 0

@@ -1,0 +1,130 @@
+"""Reads a plugin's constructor: its keys in the config, their annotations and defaults, and which are plugins."""
+
+import inspect
+import sys
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
+from typing import Any
+
+from framework.configuration.registry import group_of
+from framework.errors import ConfigError, shown
+
+
+class Part(typing.NamedTuple):
+    """A constructor parameter that is itself a plugin (`many`: a list or a tuple of them)."""
+
+    group: str
+    many: type[list[Any]] | type[tuple[Any, ...]] | None
+
+
+@cache
+def parts(cls: type) -> dict[str, Part]:
+    """The keyword-only parameters of `cls` that are annotated with an abstract base."""
+    found = {}
+    for name, (annotation, _) in signature(cls).items():
+        for candidate in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
+            if typing.get_origin(candidate) is typing.Annotated:
+                candidate = typing.get_args(candidate)[0]
+            many = {list: list, tuple: tuple, Sequence: list}.get(typing.get_origin(candidate))
+            # a bare `List` has no arguments
+            group = group_of(next(iter(typing.get_args(candidate)), None) if many else candidate)
+            if group is not None:
+                found[name] = Part(group, many)
+    return found
+
+
+@cache
+def signature(cls: type) -> dict[str, tuple[Any, Any]]:
+    """Annotation and default of every key that `cls` has in the config.
+
+    Raises:
+        ConfigError: a key stands there twice, or is the one that names the plugin.
+    """
+    found: dict[str, tuple[Any, Any]] = {}
+    owner: dict[str, str] = {"name": "the name of the plugin"}
+    for name, key, annotation, default in _keys(cls):
+        here = f"the parameter `{name}`" if name == key else f"a field of `{name}`"
+        if key in owner:
+            raise ConfigError(
+                f"{cls.__name__} has the key {key!r} twice, as {owner[key]} and as {here}, and a config has one "
+                "place for both. Rename one of them."
+            )
+        owner[key] = here
+        found[key] = annotation, default
+    return found
+
+
+def _keys(cls: type, made: Any = None) -> Iterator[tuple[str, str, Any, Any]]:
+    """Each parameter's keys, their annotations and their defaults, which are those of the value `made` where given."""
+    for name, (annotation, default) in _keywords(cls).items():
+        default = getattr(made, name, default)
+        if _is_value(annotation):
+            for _, key, kind, own in _keys(annotation, default):
+                yield name, key, kind, own
+        else:
+            yield name, name, annotation, default
+
+
+def arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The keyword arguments of `cls` out of the values of its keys."""
+    return {
+        name: kind(**arguments(kind, values)) if _is_value(kind) else values[name]
+        for name, (kind, _) in _keywords(cls).items()
+    }
+
+
+def _is_value(kind: Any) -> bool:
+    """Whether it is a dataclass of keyword-only fields."""
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        return False
+    return all(field.kw_only for field in fields(kind) if field.init)
+
+
+@cache
+def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
+    """Annotation and default of every keyword-only parameter.
+
+    Raises:
+        ConfigError: an annotation cannot be evaluated.
+    """
+    factories = {
+        field.name: field.default_factory
+        for field in (fields(cls) if is_dataclass(cls) else ())
+        if field.default_factory is not MISSING
+    }
+    return {
+        name: (_annotation(cls, name), factories[name]() if name in factories else parameter.default)
+        for name, parameter in inspect.signature(cls.__init__).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    }
+
+
+def _annotation(cls: type, name: str) -> Any:
+    """What a parameter is annotated with, evaluated by itself: those of others may be for a type checker alone."""
+    written = getattr(cls.__init__, "__annotations__", {}).get(name, Any)
+    names = getattr(inspect.unwrap(cls.__init__), "__globals__", {})
+    if is_dataclass(cls):  # its constructor belongs to the class's module, a field maybe to that of a base
+        owner = next((base for base in cls.__mro__ if name in inspect.get_annotations(base)), cls)
+        names = vars(sys.modules[owner.__module__])
+    one = types.SimpleNamespace(__annotations__={name: written})
+    try:
+        return typing.get_type_hints(one, globalns=names, include_extras=True)[name]
+    except Exception as error:
+        raise ConfigError(
+            f"{cls.__name__}: the annotation of `{name}`, {shown(written)}, cannot be evaluated: "
+            f"{type(error).__name__}: {shown(error)}. A keyword-only parameter is a key of the config, its annotation "
+            "the key's type: import it where the program runs too, not under `if TYPE_CHECKING`, or mend its name."
+        ) from error
+
+
+def positional(cls: type) -> list[inspect.Parameter]:
+    """The parameters that the framework fills."""
+    parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
+    return [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
+
+
+def _is_union(annotation: object) -> bool:
+    return typing.get_origin(annotation) in (typing.Union, types.UnionType)

@@ -1,0 +1,122 @@
+"""What an error says stays what it says, wherever it is raised."""
+
+import pickle
+import re
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from framework import errors
+from framework.errors import CheckpointError, ConfigError, DataError, NonFiniteLoss, UserError
+
+
+class OfAPlugin(DataError):
+    """One that somebody else derived."""
+
+
+KINDS = [UserError, ConfigError, DataError, CheckpointError, NonFiniteLoss, OfAPlugin]
+QUOTED = """The job ended with
+Traceback (most recent call last):
+  File "job.py", line 1, in <module>
+framework.errors.DataError: another one
+Mend it."""
+SENTENCES = {
+    "one line": "a.csv: the column 'x' is missing. Wanted x, y.",
+    "several lines": "a.csv is damaged:\n  line 3: no number\n\n  line 4: nothing\nWrite it again.",
+    "an end of line": "Two lines,\nthe second ended.\n",
+    "a trace": QUOTED,
+    "a colon": "framework.errors.DataError: said twice",
+    "nothing": "",
+}
+RAISED: dict[str, Callable[[UserError], None]] = {}
+
+
+def raised(way: Callable[[UserError], None]) -> Callable[[UserError], None]:
+    RAISED[way.__name__] = way
+    return way
+
+
+@raised
+def alone(error: UserError) -> None:
+    raise error
+
+
+@raised
+def of_another(error: UserError) -> None:
+    try:
+        raise ValueError("beneath\nit")
+    except ValueError as cause:
+        raise error from cause
+
+
+@raised
+def of_its_own_kind(error: UserError) -> None:
+    try:
+        raise type(error)("of the inner one")
+    except UserError as cause:
+        raise error from cause
+
+
+@raised
+def while_another_was_handled(error: UserError) -> None:
+    try:
+        raise KeyError("beneath")
+    except KeyError:
+        raise error  # noqa: B904
+
+
+@raised
+def instead_of_another(error: UserError) -> None:
+    try:
+        raise KeyError("beneath")
+    except KeyError:
+        raise error from None
+
+
+class Failing(Dataset):
+    """Fails at every item, in another way each."""
+
+    def __init__(self, cases: list[tuple[type[UserError], str, str]]) -> None:
+        self.cases = cases
+
+    def __len__(self) -> int:
+        return len(self.cases)
+
+    def __getitem__(self, index: int) -> torch.Tensor:
+        kind, said, way = self.cases[index]
+        RAISED[way](kind(said))
+        return torch.zeros(1)
+
+
+CASES = [(kind, said, way) for kind in KINDS for said in SENTENCES.values() for way in RAISED]
+
+
+def test_every_subclass_is_among_them() -> None:
+    own = {one for one in vars(errors).values() if isinstance(one, type) and issubclass(one, UserError)}
+    assert own <= {*KINDS}
+
+
+def test_what_a_worker_says_is_what_arrives() -> None:
+    batches = iter(DataLoader(Failing(CASES), batch_size=1, num_workers=1))
+    for kind, said, way in CASES:
+        with pytest.raises(UserError) as caught:
+            next(batches)
+        assert type(caught.value) is kind
+        assert str(caught.value) == said, (kind, way)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        *SENTENCES.values(),
+        "Caught ConfigError in DataLoader worker process 0.",
+        "Caught ConfigError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n  cut off",
+    ],
+)
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_other_text_is_kept(kind: type[UserError], said: str) -> None:
+    assert str(kind(said)) == str(pickle.loads(pickle.dumps(kind(said)))) == said
+    assert kind(said, 3).args == (said, 3)
+    assert not re.search(".", str(kind()))
