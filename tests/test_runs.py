@@ -119,7 +119,9 @@ STOPS = ["trainer.patience=1", "trainer.max_epochs=30", "optimizer.learning_rate
 
 
 @pytest.mark.parametrize("every", [1, 2])
-@pytest.mark.parametrize("further", [[], ["+trainer.min_epochs=16", "trainer.keep=last"]], ids=["stops", "goes on"])
+@pytest.mark.parametrize(
+    "further", [[], ["+trainer.min_epochs=16", "trainer.keep=last"]], ids=["stops", "goes on"]
+)
 def test_a_run_killed_after_it_stopped_early_trains_no_further(
     framework: Framework, tmp_path: Path, every: int, further: list[str]
 ) -> None:
@@ -144,9 +146,14 @@ def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, t
     whole = framework(*patient, folder="whole")
     assert whole.code == 0, whole.out
     validated = list(whole.values("validation/loss").items())
-    worse = next(step for (step, loss), (_, before) in zip(validated[1:], validated, strict=False) if loss >= before)
+    worse = next(
+        step for (step, loss), (_, before) in zip(validated[1:], validated, strict=False) if loss >= before
+    )
     killed = framework(
-        *patient, f"+data.signal_at={worse + 3}", f"+data.signal_marker={tmp_path / 'marker'}", folder="killed"
+        *patient,
+        f"+data.signal_at={worse + 3}",
+        f"+data.signal_marker={tmp_path / 'marker'}",
+        folder="killed",
     )
     assert killed.code == -signal.SIGKILL
     resumed = framework(f"resume={killed.folder}")
