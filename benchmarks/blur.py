@@ -211,7 +211,7 @@ def main(sweeps: list[Path], root: str | None) -> None:
     text = (
         f"# Log-likelihood of the pan under Gaussian blur: {label}\n\n"
         f"Nats, {len(fields['target'])} test images of {fields['input'].shape[-1]} pixels, models trained "
-        f"without blur, whose deviations are in pixels of {SIDE}; ± is the standard "
+        f"without blur; σ is the Gaussian's in pixels of an image of {SIDE}; ± is the standard "
         f"deviation over seeds. The uniform density has {UNIFORM:.2f}. Commands in `blur.py`, pictures "
         f"`blur.png` (Figure 3.7) and `blur_strip.png` (Figure 3.8).\n\n{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
