@@ -12,6 +12,11 @@ from framework.errors import ConfigError, UserError
 def main() -> None:
     """Entry of `python -m framework`; exits 0, 1 (failed), 2 (refused), 130 (interrupted),
     143 (terminated) or 129 (its terminal was closed)."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError):  # another's stream
+            stream.reconfigure(
+                errors="backslashreplace"
+            )  # a table must not fail for an ± that a terminal has not
     # Hydra prints its own errors and exits unless told to raise them.
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"

@@ -392,7 +392,13 @@ def test_a_metric_of_the_results_ranks_its_own_way(
 def compared(folder: Path, *jobs: tuple[str, list[str]]) -> list[dict[str, str]]:
     """The lines of comparison.csv of completed jobs, whose data and overrides are given; the first took 1 ms."""
     for number, (data, overrides) in enumerate(jobs):
-        results = {"method": "m", "data": data, "seed": 0, "milliseconds_per_sample": number + 1.0}
+        results = {
+            "method": "m",
+            "data": data,
+            "seed": 0,
+            "milliseconds_per_sample": number + 1.0,
+            "batch_size": 15,
+        }
         home = folder / str(number)
         home.mkdir()
         (home / "results.json").write_text(json.dumps({**results, "columns": {}, "better": {}}))
@@ -413,6 +419,11 @@ def test_what_the_data_column_says_already_is_left_out(tmp_path: Path) -> None:
     rows = compared(tmp_path, *jobs)
     assert [(row["data"], row["size"]) for row in rows] == [("a", "8"), ("a", "16"), ("b", "8"), ("b", "16")]
     assert "kind" not in rows[0]
+
+
+def test_a_swept_batch_size_is_not_that_at_which_the_cost_was_measured(tmp_path: Path) -> None:
+    rows = compared(tmp_path, ("d", ["batch_size=16"]), ("d", ["batch_size=32"]))
+    assert [row["batch_size"] for row in rows] == ["16", "32"]
 
 
 def test_a_key_that_varies_within_the_data_is_shown(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """What a command does not need, it does not import; seen in fresh processes."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -49,3 +52,18 @@ def test_a_mistake_is_found_before_what_trains_is_imported(
     done = listed(f"experiment={experiment}", mistake, folder=tmp_path)
     assert done.code == 2, done.out
     assert not {"pytorch_lightning", "torchmetrics", "matplotlib", "mlflow"} & done.modules
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_a_terminal_without_our_letters_is_told_all_the_same(encoding: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "from framework.app import main; main()", "mode=plugins"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"},
+        capture_output=True,
+        timeout=300,
+    )
+    said = done.stdout.decode(encoding)
+    assert done.returncode == 0, done.stderr
+    assert "von_mises" in said
+    assert ("·" in said) == (encoding != "ascii")

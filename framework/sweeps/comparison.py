@@ -229,7 +229,9 @@ def _row(path: Path) -> dict[str, Any] | None:
     results = read_json(path, "the results of a job")
     record = read_json(path.parent / RECORD, "the record of a job")
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
-    return {**swept, **results, "overrides": record["overrides"]}
+    # under its name results tell of how many the cost was measured, a small test split's for any
+    chosen = {key: swept[key] for key in ("batch_size",) if key in swept}
+    return {**swept, **results, **chosen, "overrides": record["overrides"]}
 
 
 def _varied(overrides: Sequence[Sequence[str]]) -> list[str]:
