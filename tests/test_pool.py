@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -22,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # The sweep: a Hydra app as small as can be. Its jobs are another script, its hooks write down their calls.
 APP = """
-import json, os, sys, types
+import json, os, sys, time, types
 from pathlib import Path
 import hydra
 from framework.runs.job import leave_value
@@ -40,6 +41,14 @@ def summarise(folder, overrides):
 
 sys.modules["framework.sweeps.comparison"] = types.SimpleNamespace(begin=begin, summarise=summarise)
 sweep.COMMAND = json.loads(os.environ["JOB"])
+
+def meet(jobs):
+    (HERE / f"rehearsed {os.getpid()}").touch()
+    while len(list(HERE.glob("rehearsed *"))) < int(os.environ["MEET"]):
+        time.sleep(0.005)
+
+if "MEET" in os.environ:
+    sys.modules["framework.sweeps.rehearsal"] = types.SimpleNamespace(refuse_mistakes=meet)
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def run(config):
@@ -380,6 +389,41 @@ def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:
         ["p", "quoted, text", 0, {"depth": 3}],
         ["q", "quoted, text", 1, {"depth": 3}],
     ]
+
+
+@pytest.mark.parametrize(
+    "sweeps", [["x=0", "x=1"], ["x=0,1", "x=1,2", "x=3"], ["x=0,1", "x=0,1"], ["x=5,5", "x=5", "x=6,5"]]
+)
+def test_sweeps_that_begin_at_once_in_one_folder_keep_their_jobs_apart(app: App, sweeps: list[str]) -> None:
+    app.environment["MEET"] = str(len(sweeps))
+    begun = [app.start("-m", "hydra/launcher=pool", one, "hydra.launcher.jobs=2") for one in sweeps]
+    assert [process.wait(timeout=60) for process in begun] == [0] * len(sweeps), app.said()
+    records = [json.loads(path.read_text()) for path in app.sweep.glob("*/job.json")]
+    most: Counter[str] = Counter()
+    for one in sweeps:
+        most |= Counter(f"x={value}" for value in one.partition("=")[2].split(","))
+    assert Counter(one for record in records for one in record["overrides"]) == most, "a job of both is run once"
+    assert sorted(record["number"] for record in records) == list(range(len(records)))
+    for record in records:
+        assert record["status"] == "completed"
+        assert record["overrides"][0] in record["command"]
+        assert app.tries(record["number"]) == 1
+    assert app(*sweeps[:1])[0] == 0
+    assert len(list(app.sweep.glob("*/job.json"))) == len(records)
+
+
+def test_a_folder_that_another_job_has_taken_is_left_to_it(app: App) -> None:
+    """As a sweep of an earlier version could take it, or a folder copied over another."""
+    process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=1")
+    app.until_ready(0)
+    record = app.record(1) | {"key": "another", "overrides": ["y=3"]}
+    (app.sweep / "1" / "job.json").write_text(json.dumps(record))
+    (app.folder / "release").touch()
+    assert process.wait(timeout=60) == 1
+    assert "#1 failed: its folder now is that of the job 'y=3'" in app.said()
+    assert app.record(1) == record
+    assert app("what=hold", "x=0,1")[0] == 0
+    assert app.record(2)["overrides"] == ["what=hold", "x=1"]
 
 
 def test_two_jobs_in_one_folder_are_refused(app: App) -> None:

@@ -64,6 +64,22 @@ class Job:
         """With the config it would have now."""
         return self.record.get("status") == "completed" and self.record.get("config") == self.config
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What its record says of it whatever happens to it."""
+        return {"key": self.key, "number": self.number, "overrides": self.overrides}
+
+    def reread(self) -> bool:
+        """Take the record from the disk, where another sweep may have changed it; False where it is another job's."""
+        found = read_json(self.folder / RECORD, "the record of a job")
+        if found.get("key") == self.key:
+            self.record = found
+            return True
+        told = " ".join(map(str, found.get("overrides", ())))
+        error = f"its folder now is that of the job {told!r}; the same sweep again gives it one of its own"
+        self.record = {**self.identity, "status": "failed", "error": error}
+        return False
+
     def update(self, **values: Any) -> None:
         """Change the record, in memory and on the disk."""
         self.record |= values
@@ -105,6 +121,15 @@ def free_number(subfolder: Callable[[int], Path], number: int, taken: set[Path])
     )
 
 
+def reserve(jobs: Sequence[Job]) -> None:
+    """Leave a record of each job that has none, so that no other sweep in this folder takes its place; hold a lock of
+    the sweep's folder from before the numbers were chosen."""
+    for job in jobs:
+        if not job.record:
+            job.folder.mkdir(parents=True, exist_ok=True)
+            job.update(**job.identity, status="queued", error=None)
+
+
 def cores() -> int:
     """The CPU cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -137,7 +162,8 @@ def run(
         job.folder.mkdir(parents=True, exist_ok=True)
         lock = _lock(job)
         if lock is not None:
-            job.update(key=job.key, number=job.number, overrides=job.overrides, status="queued", error=None)
+            if not (job.folder / RECORD).exists() or job.reread() and not job.completed:
+                job.update(**job.identity, status="queued", error=None)
             os.close(lock)
     log.info(
         f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them completed earlier; {at_once} at once with "
@@ -158,8 +184,7 @@ def run(
                 if lock is None:
                     queue.append(job)
                     continue
-                job.record = read_json(job.folder / RECORD, "the record of a job")
-                if job.completed:  # by another sweep, while this one waited for the folder
+                if not job.reread() or job.completed:  # by another sweep, while this one waited for the folder
                     os.close(lock)
                 else:
                     slot = min(set(range(at_once)) - {one.slot for one in running})
@@ -242,6 +267,7 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str]) -> _R
     job.attempts += 1
     (job.folder / VALUE).unlink(missing_ok=True)
     job.update(
+        **job.identity,
         status="running",
         tries=job.record.get("tries", 0) + 1,
         processor_seconds=_spent(job.record, job.config),

@@ -1,6 +1,7 @@
 """Hydra's way to `framework.sweeps.jobs`. Hydra imports this at every start: nothing heavy here."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from framework.errors import ConfigError
+from framework.storage.files import alone
 from framework.sweeps import jobs as sweep
 
 _OF_THE_SWEEP = (
@@ -22,6 +24,7 @@ _OF_THE_SWEEP = (
     "hydra.sweep.",
     "hydra.mode=",
 )
+_LOCK = ".numbers.lock"
 
 
 class PoolLauncher(Launcher):
@@ -55,16 +58,20 @@ class PoolLauncher(Launcher):
         configure_log(hydra.hydra_logging, hydra.verbose)
         folder = Path(str(hydra.sweep.dir)).absolute()
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
-        jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
-        values = [_plain(config, folder) for config in configs]
+        for index, config in enumerate(configs, initial_job_idx):
+            _place(folder, config, index)  # for the rehearsal, which takes longer than other sweeps should wait
         try:
+            values = [_plain(config, folder) for config in configs]
             rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))
+            folder.mkdir(parents=True, exist_ok=True)
+            with alone(folder / _LOCK):  # another sweep may begin in this folder
+                jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
+                sweep.reserve(jobs)
         except ConfigError:
             _leave_nothing(folder)
             raise
-        folder.mkdir(parents=True, exist_ok=True)
         if not self.launched:
-            self.parent = comparison.begin(folder, values[0])
+            self.parent = comparison.begin(folder, _plain(configs[0], folder))
         self.launched += [job.overrides for job in jobs]
         try:
             sweep.run(
@@ -127,9 +134,12 @@ class PoolLauncher(Launcher):
 
 def _leave_nothing(folder: Path) -> None:
     """Remove the folder of a sweep that never began, where it holds but the command that Hydra wrote into it."""
-    if [file.name for file in folder.glob("*")] == ["multirun.yaml"]:
-        (folder / "multirun.yaml").unlink()
-        folder.rmdir()
+    left = list(folder.glob("*"))
+    if {file.name for file in left} <= {"multirun.yaml", _LOCK}:
+        for file in left:
+            file.unlink()
+        with suppress(OSError):  # another sweep may begin in it
+            folder.rmdir()
 
 
 def _returned(job: sweep.Job, failure: Exception | None) -> JobReturn:
@@ -140,7 +150,7 @@ def _returned(job: sweep.Job, failure: Exception | None) -> JobReturn:
 
 
 def _place(folder: Path, config: DictConfig, number: int) -> Path:
-    with read_write(config), open_dict(config):
+    with read_write(config), read_write(config.hydra), open_dict(config):  # `_plain` has closed the inner one
         config.hydra.job.num = number
         config.hydra.job.id = str(number)
     return folder / str(config.hydra.sweep.subdir)
@@ -152,7 +162,7 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 def _plain(config: DictConfig, folder: Path) -> dict[str, Any]:
     """A job's config as values, as the job itself will see it but for its folder."""
-    with read_write(config), open_dict(config):
+    with read_write(config), read_write(config.hydra), open_dict(config):
         config.hydra.runtime.output_dir = str(folder)
     before = HydraConfig.instance().cfg
     HydraConfig.instance().set_config(config)
