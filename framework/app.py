@@ -4,6 +4,7 @@ import os
 import sys
 from contextlib import suppress
 from importlib.util import find_spec
+from io import TextIOWrapper
 from pathlib import Path
 
 from framework.errors import ConfigError, UserError
@@ -13,10 +14,8 @@ def main() -> None:
     """Entry of `python -m framework`; exits 0, 1 (failed), 2 (refused), 130 (interrupted),
     143 (terminated) or 129 (its terminal was closed)."""
     for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError):  # another's stream
-            stream.reconfigure(
-                errors="backslashreplace"
-            )  # a table must not fail for an ± that a terminal has not
+        if isinstance(stream, TextIOWrapper):  # a table must not fail for an ± that a terminal has not
+            stream.reconfigure(errors="backslashreplace")
     # Hydra prints its own errors and exits unless told to raise them.
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"

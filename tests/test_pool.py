@@ -402,7 +402,9 @@ def test_sweeps_that_begin_at_once_in_one_folder_keep_their_jobs_apart(app: App,
     most: Counter[str] = Counter()
     for one in sweeps:
         most |= Counter(f"x={value}" for value in one.partition("=")[2].split(","))
-    assert Counter(one for record in records for one in record["overrides"]) == most, "a job of both is run once"
+    assert Counter(one for record in records for one in record["overrides"]) == most, (
+        "a job of both is run once"
+    )
     assert sorted(record["number"] for record in records) == list(range(len(records)))
     for record in records:
         assert record["status"] == "completed"

@@ -162,7 +162,7 @@ def run(
         job.folder.mkdir(parents=True, exist_ok=True)
         lock = _lock(job)
         if lock is not None:
-            if not (job.folder / RECORD).exists() or job.reread() and not job.completed:
+            if not (job.folder / RECORD).exists() or (job.reread() and not job.completed):
                 job.update(**job.identity, status="queued", error=None)
             os.close(lock)
     log.info(
@@ -184,7 +184,8 @@ def run(
                 if lock is None:
                     queue.append(job)
                     continue
-                if not job.reread() or job.completed:  # by another sweep, while this one waited for the folder
+                # by another sweep, while this one waited for the folder
+                if not job.reread() or job.completed:
                     os.close(lock)
                 else:
                     slot = min(set(range(at_once)) - {one.slot for one in running})
