@@ -30,8 +30,9 @@ class Reads(Metric):
         self.channels = channels
         self.reads = frozenset(channels) if told is None else told  # type: ignore[misc]
         self.splits = splits  # type: ignore[misc]
-        self.columns = {"off": "off"}  # type: ignore[misc]
-        self.better = {"off": "lower"}  # type: ignore[misc]
+        self.key = f"off_{'_'.join(channels)}"
+        self.columns = {self.key: "off"}  # type: ignore[misc]
+        self.better = {self.key: "lower"}  # type: ignore[misc]
         for name in ("total", "count"):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
@@ -43,7 +44,7 @@ class Reads(Metric):
         self.count += len(gap)
 
     def compute(self) -> dict[str, Tensor]:
-        return {"off": self.total / self.count}
+        return {self.key: self.total / self.count}
 
 
 def batches(count: int) -> list[dict[str, Tensor]]:
