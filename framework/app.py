@@ -11,8 +11,10 @@ from framework.errors import ConfigError, UserError
 
 
 def main() -> None:
-    """Entry of `python -m framework`; exits 0, 1 (failed), 2 (refused), 130 (interrupted),
-    143 (terminated) or 129 (its terminal was closed)."""
+    """Entry of `python -m framework`.
+
+    It exits with 0, 1 (failed), 2 (refused), 129 (its terminal was closed), 130 (interrupted) or 143 (terminated).
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a table must not fail for an ± that a terminal has not
             stream.reconfigure(errors="backslashreplace")

@@ -249,3 +249,19 @@ def test_of_more_peaks_than_can_be_compared_draws_tell_it(
         found = whole.entropy()
     assert "means over 1024 draws" in caplog.text
     torch.testing.assert_close(found, pair.entropy(), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", [VonMises, Normal], ids=["angle", "real"])
+def test_drawn_entropies_have_the_gradient_of_the_entropy(kind: type) -> None:
+    """Of two humps, each many times, whose scale is learned: that of -log_prob at fixed draws is 0 in the mean."""
+    gradients = []
+    for count in (2, 6000):
+        spread = torch.tensor(4.0 if kind is VonMises else 0.5, dtype=torch.float64, requires_grad=True)
+        mean = torch.tensor([-1.0, 1.5], dtype=torch.float64).repeat(count // 2)[None, :, None]
+        width = spread.expand(mean.shape)
+        parts = VonMises(mean, width) if kind is VonMises else Independent(Normal(mean, width), 1)
+        torch.manual_seed(0)
+        Mixture(torch.zeros(1, count, dtype=torch.float64), parts).entropy().sum().backward()
+        gradients.append(spread.grad.item())
+    exact, drawn = gradients
+    assert drawn == pytest.approx(exact, rel=0.15)

@@ -2,7 +2,7 @@
 
 import math
 
-from jaxtyping import Float64, Int
+from jaxtyping import Float64, Real
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -48,16 +48,17 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
     return log_prob.softmax(-1)
 
 
-def require_labels(target: Int[Tensor, "batch"], classes: int) -> Int[Tensor, "batch"]:
+def require_labels(target: Real[Tensor, "batch"], classes: int) -> Real[Tensor, "batch"]:
     """`target` itself, if every label is that of one of the classes.
 
     Raises:
-        DataError: a label below 0 or above `classes` - 1; says which.
+        DataError: a label below 0 or above `classes` - 1, or NaN; says which.
     """
-    wrong = (target < 0) | (target >= classes)
+    wrong = ~((target >= 0) & (target < classes))
     if wrong.any():
         raise DataError(
             f"{int(wrong.sum())} of {len(target)} targets of this batch are no class: that of row "
-            f"{int(wrong.nonzero()[0])} is {int(target[wrong][0])}, wanted 0 to {classes - 1}. Mend the data's labels."
+            f"{int(wrong.nonzero()[0])} is {target[wrong][0].item():g}, wanted 0 to {classes - 1}. Mend the data's "
+            "labels."
         )
     return target

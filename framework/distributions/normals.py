@@ -35,7 +35,7 @@ def _(density: IndependentNormals, samples: int) -> Tensor:
 @marginal.register
 def _(density: IndependentNormals, index: int) -> IndependentNormals:
     here = slice(index, index + 1)
-    return IndependentNormals(density.mean[..., here], density.stddev[..., here])
+    return IndependentNormals(density.mean[..., here], density.base_dist.scale[..., here])
 
 
 @tempered.register

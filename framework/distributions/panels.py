@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
@@ -86,7 +86,9 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
     if items == 0:
         return density.log_prob(density.sample())
     flat = Reshaped(density, (items,))
-    if len(peaks(flat)) > LARGEST:
+    with torch.no_grad():
+        places = peaks(flat).squeeze(-1).double()
+    if len(places) > LARGEST:
         _log.warning(
             "%d densities (%s) have more than %d peaks; their entropies are means over %d draws.",
             items, type(density).__name__, LARGEST, DRAWS,
@@ -94,8 +96,8 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
         return drawn_entropy(flat).reshape(density.batch_shape)
     with torch.no_grad():
         dtype = density.sample(torch.Size((0,))).dtype
-        panels, components = first_panels(flat)
-        step = max(1, AT_ONCE // (len(NODES) * components))
+        panels = first_panels(flat, places)
+        step = max(1, AT_ONCE // (len(NODES) * len(places)))
         tolerance = TOLERANCE.get(dtype, 1e-6)
         accepted, sums = resolved_panels(flat, panels, step, tolerance)
     if torch.is_grad_enabled():
@@ -116,8 +118,18 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
 
 
 def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
-    """The mean of -log_prob over DRAWS draws, nats."""
-    return -density.log_prob(density.sample(torch.Size((DRAWS,)))).mean(0)
+    """The mean of -log_prob over DRAWS draws, nats, and its gradient.
+
+    That of the mean alone has expectation 0, since the draws move with the density too: the gradient of -E log p is
+    -E (log p - b) ∇ log p, whatever b (the score function's, Mohamed et al. 2020, §4). Here b is the mean, whose own
+    estimation takes one draw from DRAWS.
+    """
+    log_prob = density.log_prob(density.sample(torch.Size((DRAWS,))))
+    mean = log_prob.mean(0)
+    if not log_prob.requires_grad:
+        return -mean
+    moves = ((log_prob - mean).detach() * log_prob).sum(0) / (DRAWS - 1)
+    return moves.detach() - moves - mean.detach()
 
 
 def split(panels: Panels, step: int) -> list[Panels]:
@@ -158,9 +170,13 @@ def resolved_panels(
     return Panels(*map(torch.cat, zip(*accepted, strict=True))), torch.cat(sums, -1)
 
 
-def first_panels(density: Distribution) -> tuple[Panels, int]:
-    """On both sides of every peak to the middle between two; and how many peaks an item has."""
-    place, scale = peaks(density).squeeze(-1).double(), scales(density).double()  # (peak, item)
+def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Panels:
+    """On both sides of every peak to the middle between two.
+
+    Args:
+        place: the density's `peaks`.
+    """
+    scale = known_scales(density)  # (peak, item)
     support = density.support
     low, high = -math.inf, math.inf
     if isinstance(support, Circular):
@@ -168,7 +184,6 @@ def first_panels(density: Distribution) -> tuple[Panels, int]:
         place = torch.where((place < low) | (place > high), wrap(place), place).clamp(low, high)
     closed = isinstance(support, Circular) and support.ranges is None
     place = place.nan_to_num(nan=0.0).clamp(-1e300, 1e300)
-    scale = torch.where((scale > 0) & scale.isfinite(), scale, 1.0)
     rows = max(1, AT_ONCE // len(place) ** 2)
     nearest = [
         torch.cat(
@@ -199,7 +214,13 @@ def first_panels(density: Distribution) -> tuple[Panels, int]:
         stop = torch.minimum(number + 1, each[3]) * WIDTH
         ends = (number * WIDTH, stop) if sign > 0 else (-stop, -number * WIDTH)
         sides.append((*each[:3], *ends))
-    return Panels(*map(torch.cat, zip(*sides, strict=True))), len(order.values)
+    return Panels(*map(torch.cat, zip(*sides, strict=True)))
+
+
+def known_scales(density: Distribution) -> Float[Tensor, "peak item"]:
+    """The density's `scales`, float64; 1 where one is no number above 0."""
+    scale = scales(density).double()
+    return torch.where((scale > 0) & scale.isfinite(), scale, 1.0)
 
 
 def _scale_there(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Tensor:
@@ -209,12 +230,20 @@ def _scale_there(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Te
     return scale.expand_as(apart).where(apart <= 10 * scale, math.inf).amin(1)
 
 
-def _representatives(place: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending peaks, of which those within four scales of another are read as that one."""
-    cell = 4 * 2.0 ** scale.log2().floor()
+def first_in_cell(
+    place: Float[Tensor, "peak item"], scale: Float[Tensor, "peak item"], width: float
+) -> Bool[Tensor, "peak item"]:
+    """Which ascending peaks are the first in their cell, which is `width` times their scale wide, or down to half."""
+    cell = width * scale.log2().floor().exp2()
     key = (place / cell).floor()
     new = torch.ones_like(place, dtype=torch.bool)
     new[1:] = (key[1:] != key[:-1]) | (cell[1:] != cell[:-1])
+    return new
+
+
+def _representatives(place: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Ascending peaks, of which those within four scales of another are read as that one."""
+    new = first_in_cell(place, scale, 4.0)
     number = torch.arange(len(place), device=place.device).unsqueeze(-1)
     chosen = torch.where(new, number, 0).cummax(0).values
     return place.gather(0, chosen), scale.gather(0, chosen)

@@ -77,9 +77,8 @@ def ply(content: bytes) -> Parsed:
 def _header(content: bytes) -> tuple[str, list[Element]]:
     order: str | None = None
     elements: list[Element] = []
-    for line in content.splitlines()[
-        1:
-    ]:  # of bytes, since lines of text end at more: at the last byte of Å, say
+    # of bytes, since lines of text end at more: at the last byte of Å, say
+    for line in content.splitlines()[1:]:
         if max(len(elements), len(elements[-1].properties) if elements else 0) > MOST_COLUMNS:
             raise ValueError(f"its header has more than {MOST_COLUMNS} elements, or properties of one")
         words = [word.decode("utf-8", "replace") for word in line.split()]

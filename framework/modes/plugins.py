@@ -84,12 +84,8 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
     except SyntaxError as error:
         place = f" line {error.lineno}" if error.lineno else ""
         return f"(broken: {path.name}{place} does not parse)", ""
-    except (
-        OSError,
-        ValueError,
-        RecursionError,
-        MemoryError,
-    ) as error:  # unreadable, a null byte, or far too deep
+    # unreadable, a null byte, or far too deep
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
         return f"(broken: {path.name} cannot be read: {shown(error)})", ""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and node.name == attribute:

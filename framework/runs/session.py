@@ -243,9 +243,9 @@ def rehearse(session: Session) -> None:
         bool(fitted_models(session.predictor)),
         {name for each in session.metrics for name in each.reads},
     )
-    validation, *others = (session.data.splits()[split] for split in (1, 0, 2))
-    some = _few(validation, 2)
-    for batch in (some, *(_few(split, 2) for split in others)):
+    splits = session.data.splits()
+    some = _few(splits.validation, 2)
+    for batch in (_few(splits.train, 2), some, _few(splits.test, 2)):
         require_targets(batch, session.target)
     if fitted:
         for channel in sorted(reads):
@@ -267,7 +267,7 @@ def rehearse(session: Session) -> None:
                 if prediction.split in metric.splits:
                     trial.update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
             numbers([cast(Metric, trial)])
-        few = some if not session.parts["uncertainty"] else _few(validation, FEW)
+        few = some if not session.parts["uncertainty"] else _few(splits.validation, FEW)
         with torch.enable_grad():
             deepcopy(session.predictor).eval().calibrate([few])
 

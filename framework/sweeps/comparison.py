@@ -229,9 +229,12 @@ def _row(path: Path) -> dict[str, Any] | None:
     results = read_json(path, "the results of a job")
     record = read_json(path.parent / RECORD, "the record of a job")
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
-    # under its name results tell of how many the cost was measured, a small test split's for any
-    chosen = {key: swept[key] for key in ("batch_size",) if key in swept}
-    return {**swept, **results, **chosen, "overrides": record["overrides"]}
+    row = {**swept, **results, "overrides": record["overrides"]}
+    if (
+        "batch_size" in swept
+    ):  # in results it is that at which the cost was measured, which a small test split limits
+        row["batch_size"] = swept["batch_size"]
+    return row
 
 
 def _varied(overrides: Sequence[Sequence[str]]) -> list[str]:

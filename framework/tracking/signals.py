@@ -6,13 +6,14 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+CLOSED = getattr(signal, "SIGHUP", None)
+"""That the terminal was closed; None on a system that has none."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([CLOSED] if CLOSED else []))
 
 
 def handled() -> tuple[signal.Signals, ...]:
     """All of them, but for the closing of a terminal where that is ignored, as under nohup."""
-    ignored = {number for number in SIGNALS if signal.getsignal(number) is signal.SIG_IGN}
-    return tuple(number for number in SIGNALS if number not in ignored - {signal.SIGINT, signal.SIGTERM})
+    return tuple(one for one in SIGNALS if one != CLOSED or signal.getsignal(one) is not signal.SIG_IGN)
 
 
 class Stopped(SystemExit):

@@ -232,7 +232,9 @@ def require_targets(batch: Batch, target: Target) -> Batch:
             f'The data set gives {wanted[0]} samples a "target" of shape {tuple(found.shape)}: wanted {wanted}, for '
             f"targets of kind {target.kind!r} ({target.told}). Mend the data set, or its `target`."
         )
-    return batch if target.kind != "class" else {**batch, "target": require_labels(found, len(target.names))}
+    if target.kind == "class":
+        require_labels(found, len(target.names))
+    return batch
 
 
 def told(loader: DataLoader[Batch], what: str) -> Iterator[Batch]:

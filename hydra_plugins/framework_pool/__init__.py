@@ -58,10 +58,9 @@ class PoolLauncher(Launcher):
         configure_log(hydra.hydra_logging, hydra.verbose)
         folder = Path(str(hydra.sweep.dir)).absolute()
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
+        # for the rehearsal, which takes longer than other sweeps should wait
         for index, config in enumerate(configs, initial_job_idx):
-            _place(
-                folder, config, index
-            )  # for the rehearsal, which takes longer than other sweeps should wait
+            _place(folder, config, index)
         try:
             values = [_plain(config, folder) for config in configs]
             rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))

@@ -193,12 +193,11 @@ def _(density: LatentDensity) -> Tensor:
 def _(density: LatentDensity, temperature: Tensor) -> Distribution:
     """Component by component, at the same points; of classes the whole, as of any mixture."""
     changed = copy.copy(density)
+    if temperature.requires_grad:
+        changed.effort = density._fixed  # what a tolerance draws in rounds would all be held
     if density.has_enumerate_support:
-        changed.effort = density._fixed if temperature.requires_grad else density.effort
         return tempered_classes(changed, temperature)
     changed.__dict__.pop("mixture", None)  # that of the untempered components, where it was asked for
     changed.latent = density.latent.tempered(temperature)
     changed._example = tempered(density._example, temperature)
-    if temperature.requires_grad:
-        changed.effort = density._fixed  # what a tolerance draws in rounds would all be held
     return changed

@@ -10,7 +10,8 @@ from torch.distributions import Distribution
 
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, grid, wrap
-from framework.distributions.protocol import peaks, scales
+from framework.distributions.panels import first_in_cell, known_scales
+from framework.distributions.protocol import peaks
 
 FOLD = 12
 """Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
@@ -211,11 +212,8 @@ class Line:
         if self.closed:
             places = wrap(places)
         order = places.sort(0)
-        places, scale = order.values, scales(self.density).double().gather(0, order.indices)
-        cell = torch.where((scale > 0) & scale.isfinite(), scale, 1.0).log2().floor().exp2() / 4
-        key = (places / cell).floor()
-        new = torch.ones_like(places, dtype=torch.bool)
-        new[1:] = (key[1:] != key[:-1]) | (cell[1:] != cell[:-1])
+        places, scale = order.values, known_scales(self.density).gather(0, order.indices)
+        new = first_in_cell(places, scale, 0.25)
         most = int(new.sum(0).amax())
         first = new.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
         # an item that has fewer repeats its last
