@@ -317,6 +317,10 @@ def test_test_and_predict_repeat_what_training_reported(framework: Framework) ->
 
     def numbers(done: Done) -> dict[str, object]:
         assert done.code == 0, done.out
+        model = re.search(r"framework\.load\('(.+)'\)", done.out)
+        listed = re.search(r"run folder: .*\((.+)\)", done.out)
+        assert model and (Path(model[1]) / "checkpoints" / "model.ckpt").is_file()
+        assert listed and all((done.folder / name).exists() for name in listed[1].split(", "))
         found = json.loads((done.folder / "results.json").read_text())
         others = {"milliseconds", "memory", "folder", "columns", "better", "seconds"}
         return {key: value for key, value in found.items() if not any(word in key for word in others)}

@@ -145,12 +145,16 @@ def picture(run: Run, figure: "Figure", name: str) -> Path:
 
 
 def _next_steps(run: Run, spent: Cost, console: Console) -> None:
+    holds = ("figures", "results.json", "citations.bib", "checkpoints/model.ckpt")
+    there = [name for name in holds if (run.folder / name).exists()]
+    # a run that tested another's model has none of its own
+    model = run.folder if holds[-1] in there else run.settings.checkpoint
     lines = [
         f"measured on {machine(spent.device, spent.threads)}, batches of {spent.batch_size}; "
         f"one sample alone takes {spent.latency_milliseconds:.2f} ms",
-        f"run folder:    {run.folder}   (figures/, results.json, citations.bib, checkpoints/model.ckpt)",
+        f"run folder:    {run.folder}   ({', '.join(there)})",
         f"all runs:      {run.tracker.url}",
-        f"in a notebook: framework.load('{run.folder}')",
+        f"in a notebook: framework.load('{model}')",
         f"what to cite:  {run.folder / 'citations.bib'}",
     ]
-    console.print("\n".join(lines), soft_wrap=True, highlight=False)
+    console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
