@@ -3,17 +3,22 @@
 import inspect
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given as drawn
+from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.composition import (
     command_line,
     folder,
+    in_quotes,
     plain,
     register,
     sentence,
@@ -303,3 +308,19 @@ def test_the_last_epoch_of_an_experiment_is_validated(name: str) -> None:
     """Else the weights that are kept, of the lowest validation loss, are never the last ones."""
     trainer = plain(composed(f"experiment={name}"))["trainer"]
     assert trainer["keep"] == "last" or trainer["max_epochs"] % trainer["check_val_every_n_epoch"] == 0
+
+
+@drawn(
+    st.text(st.characters(exclude_categories=["Cc", "Cs"]) | st.sampled_from("'\\\"=,[]{}() "), min_size=1)
+)
+def test_any_text_in_quotes_is_read_as_it_stands(text: str) -> None:
+    read = OverridesParser.create().parse_override(f"x={in_quotes(text)}").value()
+    assert read == text
+
+
+def test_what_cannot_be_read_is_told_in_quotes(framework: Framework) -> None:
+    done = framework("mode=test", "checkpoint=runs/x=(1,é/model.ckpt")
+    assert done.code == 2
+    assert "If all of it is one text: \"checkpoint='runs" in done.out
+    told = shlex.split(done.out.partition("If all of it is one text: ")[2].strip().removesuffix("."))
+    assert "runs/x=(1,é/model.ckpt is neither a file" in framework("mode=test", *told).out

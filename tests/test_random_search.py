@@ -5,6 +5,7 @@ import json
 import math
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -20,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
+from framework.runs.job import recorded
 from framework.sweeps import comparison
 from hydra_plugins.framework_random_search import _best, _draws
 from tests.conftest import TINY, Framework
@@ -339,6 +341,8 @@ def trials(folder: Path, *values: float | None, **more: list[float]) -> list[com
         home.mkdir()
         results = {
             **{key: column[number] for key, column in more.items()},
+            "method": "m",
+            "data": "d",
             "columns": {"accuracy": "accuracy (share)"},
             "better": {"accuracy": "higher"},
         }
@@ -389,23 +393,34 @@ def test_a_metric_of_the_results_ranks_its_own_way(
         comparison.rank(tmp_path, given, [], "acuracy")
 
 
-def compared(folder: Path, *jobs: tuple[str, list[str]]) -> list[dict[str, str]]:
-    """The lines of comparison.csv of completed jobs, whose data and overrides are given; the first took 1 ms."""
-    for number, (data, overrides) in enumerate(jobs):
-        results = {
-            "method": "m",
-            "data": data,
-            "seed": 0,
-            "milliseconds_per_sample": number + 1.0,
-            "batch_size": 15,
-        }
-        home = folder / str(number)
-        home.mkdir()
-        (home / "results.json").write_text(json.dumps({**results, "columns": {}, "better": {}}))
-        (home / "job.json").write_text(json.dumps({"status": "completed", "overrides": overrides}))
-    comparison.summarise(folder, [jobs[1][1]])
+def completed(home: Path, overrides: list[str], data: str = "d", milliseconds: float = 1.0) -> None:
+    """Leave in `home` what a job leaves."""
+    results = {
+        "method": "m",
+        "data": data,
+        "seed": 0,
+        "milliseconds_per_sample": milliseconds,
+        "batch_size": 15,
+        "columns": {},
+        "better": {},
+    }
+    home.mkdir(parents=True)
+    (home / "results.json").write_text(json.dumps(results))
+    (home / "job.json").write_text(json.dumps({"status": "completed", "overrides": overrides}))
+
+
+def table(folder: Path, *given: list[str]) -> list[dict[str, str]]:
+    """The lines of comparison.csv."""
+    comparison.summarise(folder, given)
     with (folder / "comparison.csv").open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def compared(folder: Path, *jobs: tuple[str, list[str]]) -> list[dict[str, str]]:
+    """The lines of completed jobs, whose data and overrides are given; the first took 1 ms."""
+    for number, (data, overrides) in enumerate(jobs):
+        completed(folder / str(number), overrides, data, number + 1.0)
+    return table(folder, jobs[1][1])
 
 
 def test_jobs_of_two_commands_in_one_folder_are_told_apart(tmp_path: Path) -> None:
@@ -503,3 +518,38 @@ def test_the_sweeper_costs_other_commands_nothing() -> None:
     script = "import sys, hydra_plugins.framework_random_search; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not heavy & set(done.stdout.split())
+
+
+def test_jobs_are_found_however_deep_they_lie_and_those_of_a_sweep_below_are_not(tmp_path: Path) -> None:
+    for number, name in enumerate(["x=10", "x=9", "experiment=a/b,x=1"]):
+        completed(tmp_path / name, [name[-3:] if "/" in name else name], milliseconds=number + 1.0)
+    completed(tmp_path / "another" / "0", ["x=5"])
+    (tmp_path / "another" / "multirun.yaml").touch()
+    rows = table(tmp_path)
+    assert sorted(row["x"] for row in rows) == ["1", "10", "9"]
+    assert [path.name for path in recorded(tmp_path)[:2]] == ["x=9", "x=10"]
+    assert {path.relative_to(tmp_path).parts[0] for path in recorded(tmp_path)} == {
+        "x=9",
+        "x=10",
+        "experiment=a",
+    }
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[1]", "{}", '{"method": "m", "data": "d"}', None])
+def test_a_job_whose_results_cannot_be_read_is_left_out_of_the_table(
+    tmp_path: Path, damage: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    for x in (1, 2):
+        completed(tmp_path / str(x), [f"x={x}"])
+    completed(tmp_path / "3", ["x=3"])
+    (tmp_path / "a folder of something else").mkdir()
+    shutil.copy(tmp_path / "3" / "results.json", tmp_path / "a folder of something else")
+    if damage is None:
+        (tmp_path / "3" / "results.json").unlink()
+    else:
+        (tmp_path / "3" / "results.json").write_text(damage)
+    assert [row["x"] for row in table(tmp_path)] == ["1", "2"]
+    assert (str(tmp_path / "3" / "results.json") in caplog.text) == (damage is not None)
+    given = [comparison.Trial(tmp_path / str(x), [f"x={x}"], float(-x), completed=True) for x in (1, 2, 3)]
+    assert comparison.rank(tmp_path, given, ["x"], "milliseconds_per_sample").best == given[0]
+    assert ranked(tmp_path) == ["1", "2", "3"]

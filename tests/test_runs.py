@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import sqlite3
@@ -19,6 +20,7 @@ import pytest
 import torch
 import yaml
 
+from framework.configuration.composition import in_quotes
 from framework.configuration.settings import Settings, store_experiment
 from framework.runs.run import run_name
 from framework.training.checkpoint import WholeCheckpoints
@@ -229,20 +231,27 @@ def test_a_signal_saves_and_says_so(
     )
 
 
-def test_a_run_that_was_never_to_be_resumed_is_resumed_when_asked(
-    framework: Framework, whole: Done, tmp_path: Path
+@pytest.mark.parametrize("name", ["run", "lr=0.1,b=[2]", "it's é {x} \\", "50%25 'a'"])
+def test_a_run_is_resumed_where_it_stopped_whatever_its_folder_is_called(
+    framework: Framework, whole: Done, tmp_path: Path, name: str
 ) -> None:
+    """Also where it was begun with resume=never."""
     stop = [
         "+data.signal_at=14",
         f"+data.signal_number={int(signal.SIGTERM)}",
         f"+data.signal_marker={tmp_path / 'm'}",
     ]
-    stopped = framework(*QUIET, *stop, "resume=never", f"hydra.run.dir={tmp_path / 'run'}")
+    folder = in_quotes(str(tmp_path / name))
+    stopped = framework(*QUIET, *stop, "resume=never", f"hydra.run.dir={folder}", folder=name)
     assert stopped.code == 143, stopped.out
-    resumed = framework(f"resume={stopped.folder}")
+    (told,) = re.findall("python -m framework (resume=.*|'resume=.*)", stopped.out)
+    resumed = framework(*shlex.split(told), folder=name)
     assert resumed.code == 0, resumed.out
     assert "resuming from" in resumed.out
     assert stopped.losses() == whole.losses()
+    again = framework(f"resume={folder}", folder=name)
+    assert again.code == 2
+    assert "that run has finished" in again.out
 
 
 def test_a_nan_label_stops_before_the_weights_are_touched(framework: Framework) -> None:

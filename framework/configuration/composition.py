@@ -1,8 +1,9 @@
 """Composes a config with Hydra, and turns what Hydra says of a mistake into one sentence."""
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any
@@ -148,17 +149,27 @@ def _preset(name: str, options: list[str], arguments: list[str], experiment: str
 
 def _in_resumed_folder(arguments: list[str]) -> list[str]:
     """`resume=<run folder>` runs in that folder, so that Hydra makes no new one."""
-    for argument in arguments:
+    for index, argument in enumerate(arguments):
         key, _, value = argument.partition("=")
         if key == "resume" and value not in ("auto", "never", "null", ""):
             path = Path(value).expanduser()
+            if not path.exists() and value[0] in "'\"":
+                with suppress(HydraException):
+                    path = Path(str(OverridesParser.create().parse_override(argument).value())).expanduser()
             if not (path / "config.yaml").is_file():
                 raise ConfigError(
                     f"resume={value}: {path / 'config.yaml'} does not exist. Give the folder of a run, "
                     "as printed at its start (outputs/<experiment>/<time>)."
                 )
-            return [*arguments, f"hydra.run.dir={path}"]
+            here = in_quotes(str(path))
+            return [*arguments[:index], f"resume={here}", *arguments[index + 1 :], f"hydra.run.dir={here}"]
     return arguments
+
+
+def in_quotes(text: str) -> str:
+    """A text that Hydra's grammar reads as it stands, whatever it holds."""
+    ending = re.sub(r"(\\+)$", r"\1\1", text)
+    return "'" + re.sub(r"(\\*)'", r"\1\1\\'", ending) + "'"
 
 
 def _refuse_logging_overrides(arguments: list[str]) -> None:
@@ -290,12 +301,22 @@ def sentence(error: BaseException) -> str | None:
     if damaged is not None:
         return damaged
     if isinstance(error, OverrideParseException):
-        return (
-            f"{error.override!r} cannot be read; wanted key=value, quoted where it holds commas or brackets."
-        )
+        return _cannot_be_read(error.override)
     if isinstance(error, HydraException | OmegaConfBaseException):
         return _in_its_config(error)
     return None
+
+
+def _cannot_be_read(override: str) -> str:
+    key, equals, value = override.partition("=")
+    quoted = f"{key}={in_quotes(value)}"
+    try:
+        OverridesParser.create().parse_override(quoted)
+    except HydraException:
+        equals = ""
+    typed = shlex.quote(quoted) if set(quoted) & set('"$`\\!') else f'"{quoted}"'
+    meant = f" If all of it is one text: {typed}." if equals else ""
+    return f"{override!r} cannot be read; wanted key=value, quoted where it holds commas or brackets.{meant}"
 
 
 def _damaged(error: BaseException) -> str | None:

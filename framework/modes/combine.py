@@ -17,9 +17,12 @@ from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
+from framework.runs.job import recorded
 from framework.runs.run import opened
 from framework.runs.session import around, begin, calibrate, tested
 from framework.uncertainty import Joining
+
+_MODEL = "checkpoints/model.ckpt"
 
 
 class CombineOptions(Options):
@@ -65,8 +68,8 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
         listed: list[str | Path] = list(members)
     else:
         folder = Path(members).expanduser()
-        runs = sorted(folder.glob("*/checkpoints/model.ckpt"), key=_by_number)
-        listed = [path.parent.parent for path in runs]
+        runs = [path.parent.parent for path in sorted(folder.glob(f"*/{_MODEL}"), key=_by_number)]
+        listed = [*(runs or (job for job in recorded(folder) if (job / _MODEL).is_file()))]
     if len(listed) < 2:
         raise ConfigError(
             f"mode.members = {members!r} gives {len(listed)} trained models; wanted at least two: the folder of "

@@ -1,6 +1,7 @@
 """A run as one job of a sweep: what the sweep tells it, and what it leaves behind."""
 
 import json
+import os
 from pathlib import Path
 
 from framework.storage.files import write_whole
@@ -11,6 +12,20 @@ SYNCED_WITHIN = 60.0
 """Seconds: what a shorter job has to tell the tracking store, the sweep sends when it has ended."""
 RECORD = "job.json"
 VALUE = "value.json"
+_COMMAND = "multirun.yaml"
+"""What Hydra leaves in the folder of a sweep."""
+
+
+def recorded(folder: Path) -> list[Path]:
+    """The folders of a sweep's jobs by name, 2 before 10, however deep they lie; not those of a sweep below it."""
+    found = []
+    for name, below, files in os.walk(folder):
+        here = Path(name)
+        if RECORD in files:
+            found.append(here)
+        if RECORD in files or (here != folder and _COMMAND in files):
+            below.clear()
+    return sorted(found, key=lambda path: [(len(part), part) for part in path.relative_to(folder).parts])
 
 
 def leave_value(folder: Path, value: float) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -105,13 +106,16 @@ def opened(config: Config) -> Iterator[Run]:
             killed = isinstance(error, KeyboardInterrupt | Stopped)
             tracker.close("KILLED" if killed else "FAILED")
             if killed:
-                sys.stderr.write(f"stopped; go on with: python -m framework resume={run.folder}\n")
+                sys.stderr.write(f"stopped; go on with: python -m framework {_resume(run)}\n")
             if refused := unwritable(error):
-                raise DataError(
-                    f"{refused} What was written is whole: resume={run.folder} goes on."
-                ) from error
+                raise DataError(f"{refused} What was written is whole: {_resume(run)} goes on.") from error
             raise
         tracker.close("FINISHED")
+
+
+def _resume(run: Run) -> str:
+    """What goes on with it, as typed into a shell."""
+    return shlex.quote(f"resume={run.folder}")
 
 
 def _begin_folder(config: Config) -> None:

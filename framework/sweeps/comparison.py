@@ -1,14 +1,15 @@
 """A sweep as one thing: a parent run, and the table and picture that compare its jobs."""
 
 import json
+import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from framework.configuration.settings import store_experiment
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, DataError, did_you_mean
 from framework.reports.table import (
     COST_BETTER,
     COST_COLUMNS,
@@ -19,10 +20,11 @@ from framework.reports.table import (
     markdown,
     results_table,
 )
-from framework.runs.job import RECORD
+from framework.runs.job import RECORD, recorded
 from framework.runs.run import stored_config
 from framework.storage.plain_values import read_json
 from framework.storage.progress import output
+from framework.storage.reading import RESTORE
 from framework.tracking.ended import mark_dead
 from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.tracker import MlflowTracker, mlflow_store
@@ -33,6 +35,10 @@ DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
 """The tag that MLflow shows as a run's description, and the letters that fit into it."""
 RETURNED = "best validation loss (nats)"
 """What a training returns to its sweep."""
+_HEADER = ("method", "data", "columns", "better")
+"""What a table needs to know of each of its rows."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -73,10 +79,11 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     """Compare the finished jobs in `folder`: print the table, log it and a picture to the parent."""
     console = output()
-    for path in folder.glob("*/run.json"):
-        if _status(path.parent) == "died":
-            mark_dead(path.parent)  # a killed process could not close its run
-    rows = [row for row in (_row(path) for path in _in_order(folder.glob("*/results.json"))) if row]
+    jobs = recorded(folder)
+    for job in jobs:
+        if _status(job) == "died" and (job / "run.json").is_file():
+            mark_dead(job)  # a killed process could not close its run
+    rows = [row for row in map(_row, jobs) if row]
     files: list[Path] = []
     said = ""
     if rows:
@@ -118,7 +125,7 @@ def rank(
     Raises:
         ConfigError: no trial has the metric, or nothing says which way it is better.
     """
-    results = {trial.folder: _results(trial) for trial in trials}
+    results = {trial.folder: _results(trial.folder) if trial.completed else {} for trial in trials}
     known = [one for one in results.values() if one]
     heading, better = RETURNED, _DIRECTIONS[direction or "minimize"]
     if metric is not None:
@@ -170,9 +177,19 @@ def close_ranking(folder: Path, said: str) -> None:
     _close_parent(folder, [path for path in paths if path.is_file()], said)
 
 
-def _results(trial: Trial) -> dict[str, Any]:
-    path = trial.folder / "results.json"
-    return read_json(path, "the results of a job") if trial.completed and path.is_file() else {}
+def _results(job: Path) -> dict[str, Any]:
+    """Empty, with a warning, where they cannot be read: the other jobs are compared."""
+    path = job / "results.json"
+    if not path.is_file():
+        return {}
+    try:
+        results = read_json(path, "the results of a job")
+        if lacking := [key for key in _HEADER if key not in results]:
+            raise DataError(f"{path} lacks {', '.join(lacking)}. {RESTORE}")
+    except DataError as error:
+        _log.warning("The table lacks a job: %s", error)
+        return {}
+    return results
 
 
 def _trial_row(
@@ -214,25 +231,20 @@ def _better(
     return _DIRECTIONS[direction] if direction is not None else ways[metric]
 
 
-def _in_order(paths: Iterable[Path]) -> list[Path]:
-    """By job number: 2 before 10."""
-    return sorted(paths, key=lambda path: (len(path.parent.name), path.parent.name))
-
-
 def _status(folder: Path) -> str:
     return read_json(folder / RECORD, "the record of a job").get("status", "")
 
 
-def _row(path: Path) -> dict[str, Any] | None:
-    if _status(path.parent) != "completed":
+def _row(job: Path) -> dict[str, Any] | None:
+    """What a completed job found; None for another, and for one of which that cannot be read."""
+    record = read_json(job / RECORD, "the record of a job")
+    results = _results(job) if record.get("status") == "completed" else {}
+    if not results:
         return None
-    results = read_json(path, "the results of a job")
-    record = read_json(path.parent / RECORD, "the record of a job")
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
     row = {**swept, **results, "overrides": record["overrides"]}
-    if (
-        "batch_size" in swept
-    ):  # in results it is that at which the cost was measured, which a small test split limits
+    if "batch_size" in swept:
+        # in results it is that at which the cost was measured, which a small test split limits
         row["batch_size"] = swept["batch_size"]
     return row
 
@@ -308,5 +320,5 @@ def _close_parent(folder: Path, files: Sequence[Path], said: str) -> None:
         tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {said}"[:LONGEST_DESCRIPTION]})
     for file in files:
         tracker.log_artifact(file)
-    failed = [record for record in folder.glob(f"*/{RECORD}") if _status(record.parent) != "completed"]
+    failed = [job for job in recorded(folder) if _status(job) != "completed"]
     tracker.close("FAILED" if failed else "FINISHED")

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, UserError
-from framework.runs.job import PARENT, RECORD, VALUE
+from framework.runs.job import PARENT, RECORD, VALUE, recorded
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.storage.reading import guarded, read_bytes
@@ -100,9 +100,9 @@ def hashed(*parts: str) -> str:
 def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
     """Folder and record of every job an earlier sweep in `folder` knew, by key (overrides may repeat)."""
     found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
-    for path in sorted(folder.rglob(RECORD)):
-        record = read_json(path, "the record of a job", "Delete it, and the job runs anew.")
-        found.setdefault(str(record.get("key")), []).append((path.parent, record))
+    for path in recorded(folder):
+        record = read_json(path / RECORD, "the record of a job", "Delete it, and the job runs anew.")
+        found.setdefault(str(record.get("key")), []).append((path, record))
     return found
 
 

@@ -12,6 +12,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from framework.configuration.composition import in_quotes
 from framework.errors import ConfigError
 from framework.storage.files import alone
 from framework.sweeps import jobs as sweep
@@ -108,7 +109,7 @@ class PoolLauncher(Launcher):
                         *self._passed_on(),
                         *given,
                         f"hydra.job.num={number}",
-                        f"hydra.run.dir={_quoted(path)}",
+                        f"hydra.run.dir={in_quotes(str(path))}",
                     ],
                     folder=path,
                     key=key,
@@ -173,8 +174,3 @@ def _plain(config: DictConfig, folder: Path) -> dict[str, Any]:
         HydraConfig.instance().cfg = before
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
-
-
-def _quoted(path: Path) -> str:
-    """As a value in Hydra's grammar, whatever letters it holds."""
-    return "'" + str(path).replace("'", "\\'") + "'"
