@@ -19,6 +19,9 @@ from framework.errors import ConfigError
 from framework.runs.job import leave_value
 from framework.sweeps import jobs as sweep
 
+LINUX = pytest.mark.skipif(
+    sys.platform != "linux", reason="elsewhere a fork is not safe once torch is imported"
+)
 ROOT = Path(__file__).resolve().parent.parent
 
 # The sweep: a Hydra app as small as can be. Its jobs are another script, its hooks write down their calls.
@@ -46,6 +49,12 @@ def meet(jobs):
     (HERE / f"rehearsed {os.getpid()}").touch()
     while len(list(HERE.glob("rehearsed *"))) < int(os.environ["MEET"]):
         time.sleep(0.005)
+
+if "IMPORTS" in os.environ:
+    import functools
+    from framework.sweeps import processes
+    imports = os.environ["IMPORTS"].split(",")
+    processes.Forks = functools.partial(lambda kind, modules: kind(imports), processes.Forks)
 
 if "MEET" in os.environ:
     sys.modules["framework.sweeps.rehearsal"] = types.SimpleNamespace(refuse_mistakes=meet)
@@ -92,8 +101,14 @@ elif what == "work" or what == "work_once":
         pass
     if what == "work_once" and tries == 1:
         os.kill(os.getpid(), signal.SIGKILL)
+elif what == "random":
+    import random
+    given = [random.random(), *(sys.modules["numpy"].random.random(2) if "numpy" in sys.modules else ())]
+    (folder / "random.json").write_text(json.dumps(given))
 elif what == "environment":
     (folder / "environment.json").write_text(json.dumps(dict(os.environ)))
+    own = [os.getpgrp() == os.getpid(), sys.stdin.read(), os.getcwd(), sys.argv[1:], __name__]
+    (folder / "own.json").write_text(json.dumps(own))
 elif what == "meet":
     (here / f"met{given['x']}").touch()
     while len(list(here.glob("met*"))) < 2:
@@ -135,8 +150,9 @@ hydra:
 class App:
     """The app above in a folder, and its sweep's folder."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, fork: bool = False) -> None:
         self.folder = folder
+        self.fork = fork
         self.sweep = folder / "sweep"
         self.output = folder / "output.txt"
         self.processes: list[subprocess.Popen[bytes]] = []
@@ -151,14 +167,14 @@ class App:
         shutil.copytree(ROOT / "conf" / "hydra" / "launcher", folder / "conf" / "hydra" / "launcher")
         self.environment = {
             **{key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"},
-            "JOB": json.dumps([sys.executable, "-S", str(folder / "job.py")]),
+            "JOB": json.dumps([sys.executable, *([] if fork else ["-S"]), str(folder / "job.py")]),
             "HYDRA_FULL_ERROR": "1",
         }
 
     def start(self, *arguments: str) -> subprocess.Popen[bytes]:
         with self.output.open("wb") as output:
             process = subprocess.Popen(
-                [sys.executable, "app.py", *arguments],
+                [sys.executable, "app.py", *arguments, f"hydra.launcher.fork={str(self.fork).lower()}"],
                 cwd=self.folder,
                 env=self.environment,
                 stdout=output,
@@ -197,9 +213,9 @@ class App:
         self.until(lambda: all((self.sweep / str(number) / "ready").exists() for number in numbers))
 
 
-@pytest.fixture
-def app(tmp_path: Path) -> Iterator[App]:
-    app = App(tmp_path)
+@pytest.fixture(params=["processes", pytest.param("forks", marks=LINUX)])
+def app(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[App]:
+    app = App(tmp_path, request.param == "forks")
     yield app
     app.close()
 
@@ -288,7 +304,6 @@ def test_processor_time_is_not_known_where_the_sweep_was_killed_or_the_config_ch
 
 
 def test_as_many_at_once_as_asked_for(app: App) -> None:
-    app.environment["JOB"] = json.dumps([sys.executable, "-S", str(app.folder / "job.py")])
     assert app("what=meet", "x=1,2", "hydra.launcher.jobs=2")[0] == 0, "each waits for the other"
     first, second = (app.record(number) for number in range(2))
     assert first["started"] < second["ended"]
@@ -311,6 +326,8 @@ def test_what_a_job_is_told(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
     assert app("what=environment", "x=3", "hydra.launcher.jobs=1")[0] == 0
     told = json.loads((app.sweep / "3" / "environment.json").read_text())
     assert told["OMP_NUM_THREADS"] == "3", "what the user set stands"
+    own = json.loads((app.sweep / "3" / "own.json").read_text())
+    assert own == [True, "", str(app.folder), app.record(3)["command"][-len(own[3]) :], "__main__"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -334,6 +351,7 @@ def test_ctrl_c_at_the_terminal_reaches_each_job_once(app: App) -> None:
     # A terminal signals its whole foreground group; a job signalled twice would not wait for its batch's end.
     process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=2")
     app.until_ready(0, 1)
+    app.until(lambda: app.record(0)["pid"] is not None)
     assert os.getsid(app.record(0)["pid"]) == app.record(0)["pid"]
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130, app.said()
@@ -364,6 +382,80 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
     (app.folder / "release").touch()
     assert again.wait(timeout=60) == 0, app.said()
     assert [app.record(job)["tries"] for job in range(2)] == [2, 2]
+
+
+@LINUX
+def test_jobs_end_with_the_process_they_are_forks_of_and_the_next_ones_get_another(tmp_path: Path) -> None:
+    app = App(tmp_path, fork=True)
+    process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1,2", "hydra.launcher.jobs=2")
+    try:
+        app.until_ready(0, 1)
+        app.until(lambda: app.record(0)["pid"] is not None)
+        server = parent_of(app.record(0)["pid"])
+        assert server not in (1, process.pid)
+        os.kill(server, signal.SIGKILL)
+        app.until((app.sweep / "0" / "closed SIGTERM").exists)
+        app.until_ready(2)
+        assert app.record(2)["tries"] == 1
+        (app.folder / "release").touch()
+        assert process.wait(timeout=60) == 1
+    finally:
+        app.close()
+    records = [app.record(number) for number in range(3)]
+    assert [one["status"] for one in records] == ["died", "died", "completed"]
+    assert [one["processor_seconds"] is None for one in records] == [True, True, False]
+
+
+@LINUX
+def test_a_signal_that_comes_before_a_job_has_begun_reaches_it(tmp_path: Path) -> None:
+    """While the process it is to be a fork of still imports."""
+    app = App(tmp_path, fork=True)
+    (app.folder / "slow.py").write_text(
+        "from pathlib import Path\nimport time\n"
+        "here = Path(__file__).parent\n(here / 'importing').touch()\n"
+        "while not (here / 'signalled').exists():\n    time.sleep(0.005)\n"
+    )
+    app.environment["PYTHONPATH"] = os.pathsep.join([str(app.folder), os.environ.get("PYTHONPATH", "")])
+    app.environment["IMPORTS"] = "slow"
+    process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=2")
+    try:
+        app.until((app.folder / "importing").exists)
+        process.send_signal(signal.SIGTERM)
+        app.until(lambda: "told to stop" in app.said())
+        (app.folder / "signalled").touch()
+        assert process.wait(timeout=60) == 128 + signal.SIGTERM
+    finally:
+        app.close()
+    assert [app.record(number)["status"] for number in range(2)] == ["died", "died"]
+
+
+@LINUX
+def test_jobs_are_processes_of_their_own_where_none_can_be_forked(tmp_path: Path) -> None:
+    app = App(tmp_path, fork=True)
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\ncase "$*" in *fork_server*) exit 3;; esac\nexec "{sys.executable}" "$@"\n')
+    python.chmod(0o755)
+    app.environment["JOB"] = json.dumps([str(python), str(tmp_path / "job.py")])
+    assert app("x=0,1,2", "hydra.launcher.jobs=2")[0] == 0
+    (tmp_path / "deadly.py").write_text("import os\nos.kill(os.getpid(), 9)\n")
+    app.environment["JOB"] = json.dumps([sys.executable, str(tmp_path / "job.py")])
+    app.environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    app.environment["IMPORTS"] = "deadly"
+    assert app("x=3,4,5", "hydra.launcher.jobs=1", "hydra.launcher.retries=1")[0] == 0
+    assert [app.record(number)["tries"] for number in (3, 4, 5)] == [2, 1, 1]
+
+
+@LINUX
+def test_forks_draw_random_numbers_of_their_own(tmp_path: Path) -> None:
+    app = App(tmp_path, fork=True)
+    app.environment["IMPORTS"] = "numpy,no_such_module"
+    assert app("what=random", "x=0,1,2,3", "hydra.launcher.jobs=2")[0] == 0
+    drawn = [json.loads((app.sweep / str(number) / "random.json").read_text()) for number in range(4)]
+    assert len({value for one in drawn for value in one}) == 12
+
+
+def parent_of(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 def test_a_job_composes_the_config_the_sweep_composed(app: App) -> None:

@@ -584,3 +584,18 @@ def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> Non
     assert "the network's raw numbers are not finite in batch row" in done.out
     assert "trainer.precision=32-true" in done.out
     assert "Traceback" not in done.out
+
+
+@pytest.mark.parametrize("fork", ["true", "false"])
+def test_a_job_of_a_sweep_gives_the_bits_of_a_run_by_itself(
+    framework: Framework, whole: Done, tmp_path: Path, fork: str
+) -> None:
+    sweep = ["seed=0,1", f"hydra.launcher.fork={fork}", "hydra.sweep.dir=sweep"]
+    swept = framework("-m", *QUIET, *sweep, folder="sweep/0")
+    assert swept.code == 0, swept.out
+    assert swept.losses() == whole.losses()
+    said = (swept.folder / "console.log").read_text(encoding="utf-8")
+    assert "Traceback" not in said
+    assert re.sub(
+        ".*(run folder|ms / sample|measured on|one sample|in a notebook|all runs|cite):?.*", "", said
+    )

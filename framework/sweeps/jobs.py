@@ -1,20 +1,17 @@
 """A sweep on one machine: a process for each job, so many at once, a record of each; it can be resumed."""
 
-import ctypes
 import fcntl
 import hashlib
 import json
 import logging
 import os
-import resource
 import signal
-import subprocess
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +21,7 @@ from framework.runs.job import PARENT, RECORD, VALUE, recorded
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.storage.reading import guarded, read_bytes
+from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import SIGNALS, Stopped, handled
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
@@ -142,6 +140,7 @@ def run(
     retries: int = 0,
     devices: Sequence[str] = (),
     parent: str | None = None,
+    starter: Starter = Fresh,
 ) -> None:
     """Run every job that has not completed; returns when all have ended, however they ended.
 
@@ -153,6 +152,7 @@ def run(
         retries: how often a job that died is started again.
         devices: CUDA devices to hand out, one to each running job; none leaves all visible to all.
         parent: tracking run the jobs are recorded under.
+        starter: of their processes.
 
     Raises:
         Stopped: a signal came.
@@ -189,13 +189,17 @@ def run(
                     os.close(lock)
                 else:
                     slot = min(set(range(at_once)) - {one.slot for one in running})
-                    running.append(_start(job, slot, lock, _environment(at_once, slot, devices, parent)))
+                    running.append(
+                        _start(job, slot, lock, _environment(at_once, slot, devices, parent), starter)
+                    )
             for one in list(running):
-                spent = _processor_seconds()
-                if one.process.poll() is None:
+                code = one.process.poll()
+                if one.job.record["pid"] != one.process.pid:
+                    one.job.update(pid=one.process.pid)
+                if code is None:
                     continue
                 running.remove(one)
-                _end(one, _processor_seconds() - spent)
+                _end(one, code)
                 if parent is not None:
                     sending.submit(_sync, one.job.folder)
                 if one.job.record["status"] == "died" and one.job.attempts <= retries and not received:
@@ -233,7 +237,7 @@ def failure(jobs: Sequence[Job]) -> UserError | None:
 @dataclass
 class _Running:
     job: Job
-    process: subprocess.Popen[bytes]
+    process: Process
     slot: int
     lock: int
 
@@ -251,12 +255,6 @@ def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | 
     return environment
 
 
-def _processor_seconds() -> float:
-    """Of the children that were waited for, and theirs."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
-
-
 def _spent(record: Mapping[str, Any], config: str) -> float | None:
     """Processor seconds of the tries that this one continues; None where nobody saw one of them end."""
     if record.get("config") != config:
@@ -264,7 +262,7 @@ def _spent(record: Mapping[str, Any], config: str) -> float | None:
     return None if record.get("ended") is None else record.get("processor_seconds")
 
 
-def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str]) -> _Running:
+def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], starter: Starter) -> _Running:
     job.attempts += 1
     (job.folder / VALUE).unlink(missing_ok=True)
     job.update(
@@ -280,31 +278,15 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str]) -> _R
         pid=None,
     )
     with (job.folder / CONSOLE).open("ab") as console:
-        process = subprocess.Popen(
-            job.record["command"],
-            stdin=subprocess.DEVNULL,
-            stdout=console,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            pass_fds=(lock,),  # held until the last process of the job has ended, even if this one is killed
-            start_new_session=True,  # Ctrl-C comes here alone, and from here once to each job
-            preexec_fn=_end_with_parent,
-        )
-    job.update(pid=process.pid)
+        process = starter(job.record["command"], environment, console.fileno(), lock)
     log.info(f"#{job.number} started: {' '.join(job.overrides)}")
     return _Running(job, process, slot, lock)
 
 
-def _end(one: _Running, seconds: float) -> None:
-    """Record how a job ended.
-
-    Args:
-        seconds: processor time of this try.
-    """
-    code = one.process.returncode
+def _end(one: _Running, code: int) -> None:
+    """Record how a job ended."""
     job = one.job
-    with suppress(ProcessLookupError):  # what a killed job left behind: data loaders, the other ranks
-        os.killpg(one.process.pid, signal.SIGKILL)
+    one.process.kill()  # what a killed job left behind: data loaders, the other ranks
     if code == 0:
         status, error = "completed", None
     elif code < 0:
@@ -316,7 +298,8 @@ def _end(one: _Running, seconds: float) -> None:
     else:
         status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
     before = job.record["processor_seconds"]
-    spent = None if before is None else before + seconds
+    seconds = one.process.seconds
+    spent = None if before is None or seconds is None else before + seconds
     job.update(status=status, error=error, ended=time.time(), processor_seconds=spent)
     os.close(one.lock)
     log.info(
@@ -333,11 +316,10 @@ def _last_line(console: Path) -> str:
 
 def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
     for one in running:
-        with suppress(ProcessLookupError):
-            if before < 2:
-                one.process.send_signal(number if before == 0 else signal.SIGTERM)
-            else:
-                os.killpg(one.process.pid, signal.SIGKILL)
+        if before < 2:
+            one.process.send(number if before == 0 else signal.SIGTERM)
+        else:
+            one.process.kill()
     log.info(f"{signal.Signals(number).name}: {len(running)} running jobs are told to stop")
 
 
@@ -366,12 +348,3 @@ def _lock(job: Job) -> int | None:
         job.waits = True
         return None
     return descriptor
-
-
-_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
-
-
-def _end_with_parent() -> None:
-    """In the child, before the job: get SIGTERM when the sweep is killed (Linux; elsewhere it runs on)."""
-    if _LIBRARY is not None:
-        _LIBRARY.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG

@@ -1,7 +1,8 @@
 """Hydra's way to `framework.sweeps.jobs`. Hydra imports this at every start: nothing heavy here."""
 
-from collections.abc import Sequence
-from contextlib import suppress
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from framework.configuration.composition import in_quotes
 from framework.errors import ConfigError
 from framework.storage.files import alone
 from framework.sweeps import jobs as sweep
+from framework.sweeps.processes import Forks, Fresh, Starter
 
 _OF_THE_SWEEP = (
     "hydra/launcher",
@@ -35,14 +37,21 @@ class PoolLauncher(Launcher):
         jobs: how many at once; None is half the cores.
         retries: how often a job that was killed is started again (it resumes from its checkpoint).
         devices: CUDA devices to hand out, one to each running job, e.g. [0, 1]; None shows all to all.
+        fork: whether jobs are forks of one process that has imported what their modes need, which each would take
+            seconds for; None is on Linux, where there are several. A job is a process of its own either way.
     """
 
     def __init__(
-        self, jobs: int | None = None, retries: int = 0, devices: Sequence[int | str] | None = None
+        self,
+        jobs: int | None = None,
+        retries: int = 0,
+        devices: Sequence[int | str] | None = None,
+        fork: bool | None = None,
     ) -> None:
         self.at_once = jobs or max(1, sweep.cores() // 2)
         self.retries = retries
         self.devices = [str(device) for device in devices or ()]
+        self.fork = fork
         self.launched: list[list[str]] = []
         self.parent: str | None = None
 
@@ -76,13 +85,34 @@ class PoolLauncher(Launcher):
             self.parent = comparison.begin(folder, _plain(configs[0], folder))
         self.launched += [job.overrides for job in jobs]
         try:
-            sweep.run(
-                jobs, at_once=self.at_once, retries=self.retries, devices=self.devices, parent=self.parent
-            )
+            with self._starter(jobs, values) as starter:
+                sweep.run(
+                    jobs,
+                    at_once=self.at_once,
+                    retries=self.retries,
+                    devices=self.devices,
+                    parent=self.parent,
+                    starter=starter,
+                )
         finally:
             comparison.summarise(folder, self.launched)
         failure = sweep.failure(jobs)
         return [_returned(job, failure) for job in jobs]
+
+    @contextmanager
+    def _starter(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Iterator[Starter]:
+        from framework.modes import MODES  # Hydra imports this module at every start
+
+        several = sum(not job.completed for job in jobs) > 1
+        if not (several and sys.platform == "linux" if self.fork is None else self.fork):
+            yield Fresh
+            return
+        modes = {(one.get("mode") or {}).get("name") for one in values} & set(MODES)
+        forks = Forks(sorted(f"framework.modes.{name}" for name in modes))
+        try:
+            yield forks
+        finally:
+            forks.close()
 
     def _jobs(
         self, folder: Path, configs: Sequence[DictConfig], job_overrides: Sequence[Sequence[str]], first: int

@@ -1,0 +1,113 @@
+"""Runs the jobs of a sweep as forks of one process that has imported what they need: that takes seconds each time.
+
+Its arguments are a descriptor of a socket, modules to import, and what to run: `-m` and a module, or a file. A packet
+on the socket is a job as JSON, its arguments and the environment variables that are its own; with it come the
+descriptors of its console and of its lock. It says {"ready": pid} before it imports, for each job {"started": pid} and,
+in the end, {"ended": pid, "code": as of subprocess.Popen, "seconds": processor time of the job and all its processes}.
+Who closes the socket ends it.
+"""
+
+import gc
+import json
+import os
+import random
+import runpy
+import select
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from framework.sweeps.processes import LARGEST, end_with_parent
+
+PATIENCE = 0.02
+"""Seconds within which the end of a job is noticed."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """A job: what a fork is to become."""
+
+    arguments: list[str]
+    environment: dict[str, str]
+    console: int
+    lock: int
+
+
+def serve(channel: socket.socket) -> Given | None:
+    """Fork for each job that is asked for; in a fork the job, None once nobody asks any more."""
+    running = set[int]()
+    while True:
+        if select.select([channel], [], [], PATIENCE if running else None)[0]:
+            packet, descriptors, *_ = socket.recv_fds(channel, LARGEST, 2)
+            if not packet:
+                return None
+            asked: dict[str, Any] = json.loads(packet)
+            job = Given(asked["arguments"], asked["environment"], *descriptors)
+            server = os.getpid()
+            pid = os.fork()
+            if pid == 0:
+                channel.close()
+                _become(job, server)
+                return job
+            for descriptor in descriptors:
+                os.close(descriptor)
+            running.add(pid)
+            _tell(channel, {"started": pid})
+        for pid in sorted(running):
+            ended, status, usage = os.wait4(pid, os.WNOHANG)
+            if ended:
+                running.remove(pid)
+                seconds = usage.ru_utime + usage.ru_stime
+                _tell(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status), "seconds": seconds})
+
+
+def _become(job: Given, server: int) -> None:
+    """What a process of its own would have: its session, streams, environment, arguments and random numbers."""
+    os.setsid()
+    end_with_parent()
+    if os.getppid() != server:  # it ended before that could be told
+        os.kill(os.getpid(), signal.SIGTERM)
+    for number, descriptor in enumerate((os.open(os.devnull, os.O_RDONLY), job.console, job.console)):
+        os.dup2(descriptor, number)
+    os.close(job.console)
+    os.set_inheritable(job.lock, True)
+    os.environ.update(job.environment)
+    sys.argv[1:] = job.arguments
+    random.seed()
+    if "numpy" in sys.modules:
+        sys.modules["numpy"].random.seed()
+
+
+def _tell(channel: socket.socket, answer: dict[str, Any]) -> None:
+    with suppress(OSError):  # nobody asks any more: the next packet says so
+        channel.send(json.dumps(answer).encode())
+
+
+def main(descriptor: str, modules: str, *target: str) -> None:
+    """Import, serve, and in each fork run the target as Python would."""
+    channel = socket.socket(fileno=int(descriptor))
+    _tell(channel, {"ready": os.getpid()})
+    for name in modules.split(","):
+        with suppress(Exception):  # the job will say what is wrong with it
+            import_module(name)
+    gc.collect()
+    gc.freeze()  # so that collecting a fork's garbage copies none of these pages
+    if serve(channel) is not None:
+        _run(target)
+
+
+def _run(target: Sequence[str]) -> None:
+    if target[0] == "-m":
+        runpy.run_module(target[1], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv[0] = target[0]
+        runpy.run_path(target[0], run_name="__main__")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
