@@ -1,6 +1,9 @@
 """Compiled code on disk is that of the sources as they are."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,8 @@ from framework.geometry.nearest import compiled
 from framework.storage.kernels import kept_in
 from plugins.renderer.rasterizer import raster
 from plugins.renderer.smplpix import compiled as projecting
+
+TOP = Path(__file__).parent.parent
 
 
 def test_code_is_kept_anew_where_any_of_its_files_changed(tmp_path: Path) -> None:
@@ -34,17 +39,56 @@ def test_every_file_that_compiles_is_among_the_sources(names: tuple[str, ...], h
     assert all((folder / f"{name}.py").is_file() for name in names)
 
 
-@pytest.mark.parametrize("root", ["framework", "plugins"])
-def test_kernels_that_call_other_files_are_kept_by_their_sources(root: str) -> None:
-    """A file that lets numba keep its code beside it takes no compiled function from another."""
-    top = Path(__file__).parent.parent
-    alone = re.compile(r"njit\([^)]*cache=True", re.DOTALL)
-    for file in (top / root).rglob("*.py"):
+FILES = [file for root in ("framework", "plugins") for file in (TOP / root).rglob("*.py")]
+ALONE = re.compile(r"kept_in\([^,]+, \[Path\(__file__\)\]\)")
+
+
+def test_kernels_that_call_other_files_are_kept_by_their_sources() -> None:
+    """A file whose code is kept by itself alone takes no compiled function from another."""
+    alone = [file for file in FILES if ALONE.search(file.read_text(encoding="utf-8"))]
+    assert len(alone) > 5
+    for file in alone:
         text = file.read_text(encoding="utf-8")
-        if not alone.search(text) or file.name == "kernels.py":
-            continue
-        taken = re.findall(r"^from ((?:framework|plugins)[\w.]+) import", text, re.MULTILINE)
-        for module in taken:
-            other = top / (module.replace(".", "/") + ".py")
+        for module in re.findall(r"^from ((?:framework|plugins)[\w.]+) import", text, re.MULTILINE):
+            other = TOP / (module.replace(".", "/") + ".py")
             made = other.read_text(encoding="utf-8") if other.is_file() else ""
-            assert "njit" not in made and "compiler(" not in made, f"{file} calls kernels of {other}"
+            assert other.name == "kernels.py" or ("njit" not in made and "compiler(" not in made), (
+                f"{file} calls kernels of {other}"
+            )
+
+
+def test_numba_itself_keeps_no_code() -> None:
+    """It refuses to import a module whose code it can keep neither beside it nor in the home."""
+    own = [file for file in FILES if re.search(r"cache=True|cuda\.jit", file.read_text(encoding="utf-8"))]
+    assert own == []
+
+
+def test_kernels_work_where_no_folder_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    nowhere = str(tmp_path / "file" / "below")
+    modules = [
+        ".".join(file.relative_to(TOP).with_suffix("").parts)
+        for file in FILES
+        if "compiler(" in file.read_text(encoding="utf-8") and file.name != "kernels.py"
+    ]
+    assert len(modules) > 10
+    code = (
+        f"from importlib import import_module\nfor name in {modules}:\n    import_module(name)\n"
+        "import numpy as np\nfrom framework.geometry.farthest_compiled import farthest\n"
+        "found = farthest(np.eye(3)[None], np.array([3]), 3)\nassert sorted(found[0]) == [0, 1, 2], found\n"
+    )
+    places = {
+        "FRAMEWORK_CACHE": nowhere,
+        "NUMBA_CACHE_DIR": nowhere,
+        "HOME": nowhere,
+        "XDG_CACHE_HOME": nowhere,
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, **places},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -9,16 +9,17 @@ from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from io import StringIO
+from pathlib import Path
 from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor, nn
 from torch.fx import Node
 
 from framework.density_head import DensityHead, Fitted
 from framework.model import Model
+from framework.storage.kernels import compiler, kept_in
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
 """What a network may be made of to be worth reading; exporting another one takes long and leads nowhere."""
@@ -264,7 +265,7 @@ def affine_logits(head: DensityHead) -> tuple[np.ndarray, np.ndarray] | None:
     return (matrix, constant) if error <= 1e-11 * max(1.0, np.abs(odds).max()) else None
 
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+compiled = compiler(kept_in("frozen_network", [Path(__file__)]))
 
 
 @compiled

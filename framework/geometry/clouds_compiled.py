@@ -1,12 +1,16 @@
 """Normalises clouds in the usual way in one pass of compiled code, for small batches on the processor."""
 
+from pathlib import Path
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from framework.storage.kernels import compiler, kept_in
+
+compiled = compiler(kept_in("unit_ball", [Path(__file__)]))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 @no_type_check
 def unit_ball(clouds, counts, made, centre, scale):
     """Eq. 6.2 of each cloud; `framework.geometry.clouds.normalised` says the rest.

@@ -1,12 +1,17 @@
 """Farthest-point sampling, compiled at its first call; the compiled code is kept on disk."""
 
+from pathlib import Path
 from typing import no_type_check
 
 import numpy as np
 from numba import njit
 
+from framework.storage.kernels import compiler, kept_in
 
-@njit(cache=True, nogil=True, error_model="numpy")
+compiled = compiler(kept_in("farthest", [Path(__file__)]))
+
+
+@compiled
 @no_type_check
 def farthest(clouds, counts, count):
     """Indices (cloud, count); `framework.geometry.farthest.farthest` says which.

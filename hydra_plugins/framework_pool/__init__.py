@@ -28,6 +28,7 @@ _OF_THE_SWEEP = (
     "hydra.mode=",
 )
 _LOCK = ".numbers.lock"
+_COMPOSING = "framework.configuration.composition"
 
 
 class PoolLauncher(Launcher):
@@ -108,7 +109,7 @@ class PoolLauncher(Launcher):
             yield Fresh
             return
         modes = {(one.get("mode") or {}).get("name") for one in values} & set(MODES)
-        forks = Forks(sorted(f"framework.modes.{name}" for name in modes))
+        forks = Forks([_COMPOSING, *sorted(f"framework.modes.{name}" for name in modes)])
         try:
             yield forks
         finally:

@@ -9,14 +9,18 @@ half heights of a head.
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple, no_type_check
 
 import numpy as np
-from numba import njit
 from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
+
+from framework.storage.kernels import compiler, kept_in
+
+compiled = compiler(kept_in("synthetic_heads", [Path(__file__)]))
 
 VERSION = 1
 """The version of what is drawn; a change takes a new number, which the marks of generated data hold."""
@@ -213,7 +217,7 @@ def _ellipsoids(who: Person, head: Array, torso: Array) -> list[tuple[Array, Arr
     return parts
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 @no_type_check
 def _cast(
     centers, frames, reaches, colors, kinds, head, opening, look, lamp, strength, scale, column0, row0, image
@@ -278,7 +282,7 @@ def _cast(
         image[row, column, 3] += share
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 @no_type_check
 def _paint_face(point, look, color):
     """Change the skin's colour where a feature lies; `point` in the head's frame, features seen from its front."""

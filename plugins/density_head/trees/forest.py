@@ -9,12 +9,14 @@ Arrays:
 `no_type_check` keeps the type checks that tests switch on from wrapping a kernel before it is compiled.
 """
 
+from pathlib import Path
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+from framework.storage.kernels import compiler, kept_in
+
+compiled = compiler(kept_in("forest", [Path(__file__)]))
 
 
 def at_most(threshold: np.ndarray) -> np.ndarray:

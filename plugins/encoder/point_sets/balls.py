@@ -1,12 +1,16 @@
 """Points of clouds within balls about some of them, compiled at the first call; the compiled code is kept on disk."""
 
+from pathlib import Path
 from typing import no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit
 from torch import Tensor
+
+from framework.storage.kernels import compiler, kept_in
+
+compiled = compiler(kept_in("balls", [Path(__file__)]))
 
 
 @torch.no_grad()
@@ -34,7 +38,7 @@ def within(
     return torch.from_numpy(found).to(places.device)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 @no_type_check
 def _within(places, counts, centroids, square, most):
     found = np.empty((np.minimum(counts, centroids).sum(), most), dtype=np.int64)
