@@ -51,7 +51,8 @@ def _run() -> None:
 
         show()
         return
-    from framework.configuration.composition import command_line, folder, help_text, plain, register
+    from framework.configuration.command_line import command_line
+    from framework.configuration.composition import folder, help_text, plain, register
 
     if {"--help", "-h"} & set(sys.argv[1:]):
         sys.stdout.write(help_text() + "\n")

@@ -15,8 +15,8 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
+from framework.configuration.command_line import command_line
 from framework.configuration.composition import (
-    command_line,
     folder,
     in_quotes,
     plain,
@@ -324,3 +324,25 @@ def test_what_cannot_be_read_is_told_in_quotes(framework: Framework) -> None:
     assert "If all of it is one text: \"checkpoint='runs" in done.out
     told = shlex.split(done.out.partition("If all of it is one text: ")[2].strip().removesuffix("."))
     assert "runs/x=(1,é/model.ckpt is neither a file" in framework("mode=test", *told).out
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ("experiment=pascal3d/scvae preset=thesis", "preset=thesis/pascal3d"),
+        ("-m experiment=pascal3d/scvae,pascal3d/mixture preset=thesis", "preset=choice(thesis/pascal3d)"),
+        (
+            "-m experiment=choice(pascal3d/scvae,pascal3d/mixture) preset=thesis",
+            "preset=choice(thesis/pascal3d)",
+        ),
+        ("-m experiment=pascal3d/scvae preset=choice(thesis)", "preset=thesis/pascal3d"),
+        ("-m experiment=pascal3d/scvae +preset=thesis,thesis", "preset=thesis/pascal3d,thesis/pascal3d"),
+    ],
+)
+def test_a_preset_is_that_of_the_data_however_it_is_chosen(given: str, wanted: str) -> None:
+    assert wanted in command_line(given.split())
+
+
+def test_a_preset_of_several_data_sets_is_refused() -> None:
+    with pytest.raises(ConfigError, match="preset=thesis is another for each of these experiments"):
+        command_line(["-m", "experiment=choice(pascal3d/scvae,moons/ensemble)", "preset=thesis"])

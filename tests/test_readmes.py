@@ -13,7 +13,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from framework.configuration import composition
 from framework.configuration.assembly import resolve_all
-from framework.configuration.composition import command_line, folder, plain, register
+from framework.configuration.command_line import command_line
+from framework.configuration.composition import folder, plain, register
 from framework.configuration.config import Config
 from framework.modes import MODES
 

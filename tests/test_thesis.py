@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 import yaml
 
-from framework.configuration.composition import command_line, folder, plain
+from framework.configuration.command_line import command_line
+from framework.configuration.composition import folder, plain
 from framework.configuration.schema import build, resolve
 from framework.model import Model
 from framework.target import Target

@@ -1,0 +1,154 @@
+"""What a command line means, before Hydra reads it."""
+
+import re
+from contextlib import nullcontext, suppress
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+from framework.configuration.composition import folder, in_quotes, options, register
+from framework.errors import ConfigError, did_you_mean
+
+FLAGS = ("--cfg=", "--package=", "--config-", "--info=", "--experimental-rerun=")
+"""Of Hydra's, those that take a value."""
+
+
+def command_line(arguments: list[str]) -> list[str]:
+    """The arguments as Hydra is to read them.
+
+    Raises:
+        ConfigError: one would change Hydra's logging, or names a run to resume that is not there.
+    """
+    for argument in arguments:
+        if re.match("--[^=]+=", argument) and not argument.startswith(FLAGS):
+            raise ConfigError(
+                f"{argument}: no such flag. Settings are written without dashes: {argument.lstrip('-')}"
+            )
+    _refuse_logging_overrides(arguments)
+    return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(arguments)))
+
+
+def _preset_for_the_data(arguments: list[str]) -> list[str]:
+    """`preset=a` as `preset=a/<experiment>` or `preset=a/<data>` where presets by such names stand in a folder a.
+
+    Raises:
+        ConfigError: there is none of that name or for this data, or a sweep over experiments wants several.
+    """
+    arguments = [one.removeprefix("+") if one.startswith("+preset=") else one for one in arguments]
+    given = [one for one in arguments if one.startswith("preset=")]
+    swept = [one for one in arguments if one.startswith("experiment=")]
+    others = [one for one in arguments if one not in (*given, *swept)]
+    known = options("preset") if given else []
+    presets = []
+    for name in _choices(given[-1]) if given else ():
+        if not any(one.startswith(f"{name}/") for one in known):
+            if name not in (*known, ""):
+                folders = sorted({one.partition("/")[0] for one in known})
+                raise ConfigError(f"No configuration 'preset/{name}'.{did_you_mean(name, folders)}")
+            presets.append(name)
+            continue
+        experiments = _choices(swept[-1]) if swept else [""]
+        chosen = {_preset(name, known, others, experiment) for experiment in experiments}
+        if len(chosen) > 1:
+            raise ConfigError(
+                f"preset={name} is another for each of these experiments: {', '.join(sorted(chosen))}. Sweep over "
+                "those of one alone."
+            )
+        presets += chosen
+    return [f"preset={','.join(presets)}" if one in given else one for one in arguments]
+
+
+def _choices(argument: str) -> list[str]:
+    """The name that a group is given, or in a sweep each of them."""
+    with suppress(HydraException):
+        one = OverridesParser.create().parse_override(argument)
+        if one.is_sweep_override():
+            return [str(value) for value in one.sweep_string_iterator()]
+    return [argument.partition("=")[2]]
+
+
+def _preset(name: str, options: list[str], arguments: list[str], experiment: str) -> str:
+    """The one for what the other arguments choose."""
+    own = [one for one in arguments if one.startswith("data=")]
+    register()
+    ready = GlobalHydra.instance().is_initialized()
+    with nullcontext() if ready else initialize_config_dir(str(folder()), version_base="1.3"):
+        composed = compose(
+            "config",
+            [f"experiment={experiment}"] * bool(experiment) + own,
+            return_hydra_config=True,
+        )
+    groups = composed.hydra.runtime.choices
+    for one in (f"{name}/{experiment}", f"{name}/{groups['data']}"):
+        if one in options:
+            return one
+    available = ", ".join(sorted({one.split("/")[1] for one in options if one.startswith(f"{name}/")}))
+    raise ConfigError(
+        f"preset={name} has no setting for data={groups['data']}; it has one for {available}. Leave it out, or choose "
+        "an experiment on one of these."
+    )
+
+
+def _in_resumed_folder(arguments: list[str]) -> list[str]:
+    """`resume=<run folder>` runs in that folder, so that Hydra makes no new one."""
+    for index, argument in enumerate(arguments):
+        key, _, value = argument.partition("=")
+        if key == "resume" and value not in ("auto", "never", "null", ""):
+            path = Path(value).expanduser()
+            if not path.exists() and value[0] in "'\"":
+                with suppress(HydraException):
+                    path = Path(str(OverridesParser.create().parse_override(argument).value())).expanduser()
+            if not (path / "config.yaml").is_file():
+                raise ConfigError(
+                    f"resume={value}: {path / 'config.yaml'} does not exist. Give the folder of a run, "
+                    "as printed at its start (outputs/<experiment>/<time>)."
+                )
+            here = in_quotes(str(path))
+            return [*arguments[:index], f"resume={here}", *arguments[index + 1 :], f"hydra.run.dir={here}"]
+    return arguments
+
+
+def _refuse_logging_overrides(arguments: list[str]) -> None:
+    """Hydra's logging configs go to logging.config.dictConfig, which calls what they name; keep them ours.
+
+    Raises:
+        ConfigError: an argument chooses or changes one.
+    """
+    for argument in arguments:
+        key = argument.lstrip("+~").partition("=")[0]
+        if key.replace(".", "/").startswith(("hydra/job_logging", "hydra/hydra_logging", "hydra/callbacks")):
+            raise ConfigError(
+                f"{argument}: refused, since Hydra's logging and callback configs can run code. "
+                "Set the level with hydra.verbose=true instead."
+            )
+
+
+def _swept_with_experiment(arguments: list[str]) -> list[str]:
+    """The arguments of a sweep over experiments, single values written as sweeps of one.
+
+    Hydra first composes what is not swept, by itself: `data.x=1` beside `experiment=a,b` would meet a config in which
+    no data is chosen yet.
+    """
+    if not {"-m", "--multirun"} & set(arguments):
+        return arguments
+    overrides = [
+        argument for argument in arguments if "=" in argument and not argument.startswith(("-", "~"))
+    ]
+    try:
+        parsed = dict(zip(overrides, OverridesParser.create().parse_overrides(overrides), strict=True))
+    except HydraException:
+        return arguments  # Hydra itself will say what is wrong
+    if not any(one.key_or_group == "experiment" and one.is_sweep_override() for one in parsed.values()):
+        return arguments
+
+    def written(argument: str) -> str:
+        one = parsed.get(argument)
+        if one is None or one.is_sweep_override() or (one.key_or_group or "").startswith("hydra"):
+            return argument
+        key, _, value = argument.partition("=")
+        return f"{key}=choice({value})" if value else argument
+
+    return [written(argument) for argument in arguments]
