@@ -454,6 +454,25 @@ def test_forks_draw_random_numbers_of_their_own(tmp_path: Path) -> None:
     assert len({value for one in drawn for value in one}) == 12
 
 
+def test_what_jobs_are_forks_of_asks_for_no_device_and_starts_no_thread() -> None:
+    """A process that has asked cannot have forks that use one, and threads do not go into forks."""
+    code = (
+        "import importlib, threading, torch\n"
+        "asked = []\n"
+        "for name in ('is_available', 'device_count', '_lazy_init', 'init', 'current_device', 'is_bf16_supported'):\n"
+        "    setattr(torch.cuda, name, lambda *given, name=name: asked.append(name))\n"
+        "from framework.modes import MODES\n"
+        "importlib.import_module('framework.configuration.composition')\n"
+        "for mode in MODES:\n"
+        "    importlib.import_module(f'framework.modes.{mode}')\n"
+        "print(asked, threading.active_count())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert done.stdout == "[] 1\n"
+
+
 def parent_of(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
