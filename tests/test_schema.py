@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date, timedelta
@@ -77,7 +78,33 @@ class Demanding(Toy):
         super().__init__((1,))
 
 
-CLASSES: dict[str, type] = {"toy": Toy, "demanding": Demanding, "framed": Framed}
+class Choosy(Toy):
+    """Checks by itself, or leaves it to torch."""
+
+    def __init__(self, input_shape: tuple[int, ...], *, width: int = 3, by_torch: bool = False) -> None:
+        super().__init__(input_shape, width=width)
+        if by_torch:
+            torch.nn.Conv2d(3, 4, 1, groups=width)
+        elif width % 2:
+            raise ValueError(f"width must be even,\nnot {width}")
+
+
+class Named(Toy):
+    """Its parts have names of their own, which no config can give them."""
+
+    def __init__(
+        self, input_shape: tuple[int, ...], *, experts: dict[str, list[Encoder]] | None = None
+    ) -> None:
+        super().__init__(input_shape)
+
+
+CLASSES: dict[str, type] = {
+    "toy": Toy,
+    "demanding": Demanding,
+    "framed": Framed,
+    "choosy": Choosy,
+    "named": Named,
+}
 
 
 @pytest.fixture(autouse=True)
@@ -574,3 +601,31 @@ def test_a_target_key_is_found_however_deep(value: Any, path: list[str]) -> None
         hidden = [value, hidden] if step == "list" else {"a": value, "b": hidden}
     with pytest.raises(ConfigError, match="must not be able to run code"):
         forbid_targets(hidden)
+
+
+@pytest.mark.parametrize("config", [{}, {"width": 5}, {"width": 2, "by_torch": True}])
+@pytest.mark.parametrize("inner", [False, True])
+def test_a_constructor_may_refuse_by_a_value_error(config: dict[str, Any], inner: bool) -> None:
+    chosen = {"name": "choosy", **config}
+    resolved = resolve("encoder", {"name": "toy", "inner": chosen} if inner else chosen)
+    said = (
+        "must be divisible by groups"
+        if "by_torch" in config
+        else f"width must be even, not {config.get('width', 3)}"
+    )
+    with pytest.raises(ConfigError) as caught:
+        build("encoder", resolved, input_shape=(1,))
+    told = str(caught.value)
+    assert said in told
+    assert "encoder choosy does not take width=" in told
+    (line,) = re.findall(rf"\(ValueError at {re.escape(__file__)}:(\d+)\)", told)
+    source = Path(__file__).read_text(encoding="utf-8").splitlines()[int(line) - 1]
+    assert "Conv2d" in source or "raise ValueError" in source
+    assert told.startswith("encoder toy, of which inner is a part: ") == inner
+
+
+def test_plugins_that_no_config_can_name_are_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"Named: `experts` holds plugins of the group encoder as dict.*a list or a tuple"
+    ):
+        resolve("encoder", "named")

@@ -21,6 +21,7 @@ from decimal import Decimal
 from enum import Enum
 from functools import cache
 from pathlib import PurePath
+from traceback import walk_tb
 from typing import Any, get_args
 from uuid import UUID
 
@@ -96,7 +97,8 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
     """Construct the plugin of a resolved config; parts first, `context` by parameter name.
 
     Raises:
-        ConfigError: the constructor asks the framework for something it does not have here.
+        ConfigError: the constructor asks the framework for something it does not have here, or refuses what it is given
+            by a ValueError.
     """
     cls = load(group, config["name"])
     given = []
@@ -119,7 +121,22 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
                 values[key] = build(part.group, values[key], **context)
         except ConfigError as error:  # which the user may never have named
             raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
-    return cls(*given, **arguments(cls, values))
+    try:
+        return cls(*given, **arguments(cls, values))
+    except ValueError as error:
+        said = " ".join(f"{key}={shown(value)}" for key, value in config.items() if key != "name")
+        raise ConfigError(
+            f"{group} {config['name']} does not take {said or 'what it was given'}: {shown(error)} (ValueError at "
+            f"{_place(error, cls)})."
+        ) from error
+
+
+def _place(error: BaseException, cls: type) -> str:
+    """Where it was raised: the last line of the plugin's own file, if that was reached."""
+    lines = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
+    own = [place for place in lines if place[0] == inspect.getsourcefile(cls)]
+    file, line = (own or lines)[-1]
+    return f"{file}:{line}"
 
 
 def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[str, Any]:

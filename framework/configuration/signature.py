@@ -22,7 +22,11 @@ class Part(typing.NamedTuple):
 
 @cache
 def parts(cls: type) -> dict[str, Part]:
-    """The keyword-only parameters of `cls` that are annotated with an abstract base."""
+    """The keyword-only parameters of `cls` that are annotated with an abstract base.
+
+    Raises:
+        ConfigError: a base stands where no config can name its plugins, in a dict, say.
+    """
     found = {}
     for name, (annotation, _) in signature(cls).items():
         for candidate in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
@@ -33,7 +37,20 @@ def parts(cls: type) -> dict[str, Part]:
             group = group_of(next(iter(typing.get_args(candidate)), None) if many else candidate)
             if group is not None:
                 found[name] = Part(group, many)
+        if name not in found and (group := next(_groups_within(annotation), None)):
+            raise ConfigError(
+                f"{cls.__name__}: `{name}` holds plugins of the group {group} as {shown(annotation)}, which no config "
+                "can name. Annotate it with their base, or with a list or a tuple of that."
+            )
     return found
+
+
+def _groups_within(annotation: Any) -> Iterator[str]:
+    group = group_of(annotation)
+    if group is not None:
+        yield group
+    for inner in typing.get_args(annotation):
+        yield from _groups_within(inner)
 
 
 @cache
