@@ -599,3 +599,30 @@ def test_a_job_of_a_sweep_gives_the_bits_of_a_run_by_itself(
     assert re.sub(
         ".*(run folder|ms / sample|measured on|one sample|in a notebook|all runs|cite):?.*", "", said
     )
+
+
+@pytest.mark.parametrize("at", [2, 14])
+def test_a_run_that_started_from_weights_goes_on_without_them(
+    framework: Framework, whole: Done, tmp_path: Path, at: int
+) -> None:
+    """Once it has a checkpoint of its own."""
+    shutil.copytree(whole.folder, tmp_path / "start")
+    tuned = [*QUIET, f"checkpoint={tmp_path / 'start'}"]
+    kill = [f"+data.signal_at={at}", "+data.signal_number=9", f"+data.signal_marker={tmp_path / 'marker'}"]
+    if at == 14:
+        kill.append("trainer.checkpoint_every_steps=3")
+        tuned.append("trainer.checkpoint_every_steps=3")
+    without = framework(*tuned, folder="without")
+    assert without.code == 0, without.out
+    killed = framework(*tuned, *kill)
+    assert killed.code == -signal.SIGKILL
+    shutil.rmtree(tmp_path / "start")
+    resumed = framework(f"resume={killed.folder}")
+    if at == 2:
+        assert resumed.code == 1, resumed.out
+        assert f"error: {tmp_path / 'start'}" in resumed.out
+        return
+    assert resumed.code == 0, resumed.out
+    assert "resuming from" in resumed.out
+    assert "starting anew" not in resumed.out
+    assert killed.losses() == without.losses()

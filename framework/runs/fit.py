@@ -13,18 +13,14 @@ from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.run import Run
 from framework.runs.session import Session
-from framework.storage.checkpoints import latest_good, read
+from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.training.cached_features import CachedFeatures, fits
-from framework.training.checkpoint import WholeCheckpoints
+from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, trained
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import KeepCheckpoints, Report, StopAtBatch, StopEarly, Training
 from framework.training.progress import Progress
 from framework.uncertainty import outermost
-
-TRAINED = {"last.ckpt", "previous.ckpt"}
-"""Checkpoints that training can go on from; the others hold weights alone."""
-BEST = "best.ckpt"
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
@@ -89,7 +85,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
 
 def _resumed_from(session: Session, run: Run) -> Path | None:
     """The checkpoint that training goes on from: every rank looks before the first writes another."""
-    resume = _trained(run.checkpoints) if run.resumed else None
+    resume = trained(run.checkpoints) if run.resumed else None
     if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
         run.tracker.drop_after(step)
@@ -99,15 +95,6 @@ def _resumed_from(session: Session, run: Run) -> Path | None:
             else f"resuming from {resume} (step {step})."
         )
     return resume
-
-
-def _trained(folder: Path) -> Path | None:
-    found = latest_good(folder, names=TRAINED)
-    if found is not None:
-        return found
-    best = latest_good(folder, names={BEST})
-    # version 0.1 wrote it whole
-    return best if best is not None and "optimizer_states" in read(best) else None
 
 
 def keep_model_alone(run: Run) -> None:

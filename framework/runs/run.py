@@ -72,21 +72,26 @@ def stored_config(folder: Path) -> dict[str, Any] | None:
     return read_yaml(path, "the config of a run") if path.is_file() else None
 
 
-@contextmanager
-def opened(config: Config) -> Iterator[Run]:
-    """Open the run; on the way out close it with the right status.
-
-    Continues the run in its folder when that has the same config, did not finish and `resume` allows it; otherwise
-    what that run left is set aside. A rank other than the first writes nothing: its run is a silent one.
-    """
-    stopper = Stopper()
+def goes_on(config: Config) -> bool:
+    """Whether the run in its folder has the same config, did not finish, and `resume` allows it to go on."""
     earlier = read_run_info(config.folder)
-    resumed = (
+    return (
         earlier is not None
         and earlier.status != "FINISHED"
         and config.settings.resume != "never"
         and _same(stored_config(config.folder), config.values)
     )
+
+
+@contextmanager
+def opened(config: Config) -> Iterator[Run]:
+    """Open the run; on the way out close it with the right status.
+
+    Continues the run in its folder where that goes on (`goes_on`); otherwise what that run left is set aside. A rank
+    other than the first writes nothing: its run is a silent one.
+    """
+    stopper = Stopper()
+    earlier, resumed = read_run_info(config.folder), goes_on(config)
     if not first_rank():
         with stopper.installed():
             yield Run(config, SilentTracker(config.folder), stopper, resumed)

@@ -46,14 +46,14 @@ from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
-from framework.runs.run import Run
+from framework.runs.run import Run, goes_on
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, told
-from framework.training.checkpoint import WholeCheckpoints
+from framework.training.checkpoint import WholeCheckpoints, trained
 
 FEW = 8
 """With so many validation samples wrappers are tried before training: some want more than one."""
@@ -179,7 +179,9 @@ def for_training(config: Config) -> Session:
             if fitted_models(predictor)
             else "Nothing in this model learns by gradient, which objectives work by. Leave objective out."
         )
-    if config.settings.checkpoint is not None:
+    if config.settings.checkpoint is not None and not (
+        goes_on(config) and trained(config.folder / "checkpoints")
+    ):
         start_from(predictor, config.settings, console)
     device = torch.device("cpu")
     method = method_of(config, parts)

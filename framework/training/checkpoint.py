@@ -7,6 +7,10 @@ from pytorch_lightning.plugins.io import CheckpointIO
 
 from framework.storage import checkpoints
 
+TRAINED = {"last.ckpt", "previous.ckpt"}
+"""Checkpoints that training can go on from; the others hold weights alone."""
+BEST = "best.ckpt"
+
 
 @final
 class WholeCheckpoints(CheckpointIO):
@@ -25,3 +29,13 @@ class WholeCheckpoints(CheckpointIO):
 
     def remove_checkpoint(self, path: str | Path) -> None:
         Path(path).unlink(missing_ok=True)
+
+
+def trained(folder: Path) -> Path | None:
+    """The newest good checkpoint in a folder that training can go on from; None where there is none."""
+    found = checkpoints.latest_good(folder, names=TRAINED)
+    if found is not None:
+        return found
+    best = checkpoints.latest_good(folder, names={BEST})
+    # version 0.1 wrote it whole
+    return best if best is not None and "optimizer_states" in checkpoints.read(best) else None
