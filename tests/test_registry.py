@@ -1,6 +1,8 @@
 """Discovery by entry points: lazy, clash-proof, and one broken package disturbs nobody else."""
 
+import os
 import re
+import subprocess
 import sys
 from importlib.metadata import EntryPoint, PathDistribution
 from pathlib import Path
@@ -18,6 +20,8 @@ from framework.configuration.registry import GROUPS, config_folders, find, insta
 from framework.errors import ConfigError
 from framework.modes.plugins import describe, show
 from framework.runs.provenance import package_versions
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 class Distribution:
@@ -279,3 +283,24 @@ def test_a_key_cites_one_thing_and_once() -> None:
         ["@book{one,\n  title = {A, @ B}\n}\n@misc{two,\n}", " @book{one,\n}", "@misc{three, year = 1}"]
     )
     assert list(several) == ["one", "two", "three"] and several["one"] == "@book{one,\n  title = {A, @ B}\n}"
+
+
+@pytest.mark.parametrize("hiding", ["plugins/__init__.py", "plugins/mine.py", "plugins.py"])
+def test_a_package_that_hides_ours_is_named(tmp_path: Path, hiding: str) -> None:
+    (tmp_path / hiding).parent.mkdir(exist_ok=True)
+    (tmp_path / hiding).touch()
+    code = "from framework.configuration.registry import load\nload('metric', 'log_likelihood')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    told = f"not in the package 'plugins' at {tmp_path / hiding}. If that is another package, it hides"
+    if hiding == "plugins/mine.py":  # a folder without __init__.py hides nothing
+        told = ""
+    assert told in done.stderr
+    assert done.returncode == bool(told), done.stderr

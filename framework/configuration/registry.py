@@ -86,7 +86,7 @@ def load(group: str, name: str) -> type[Any]:
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) needs the module {error.name!r}, "
-            f"which is not installed. {_remedy(entry, str(error.name))}"
+            f"{_where_it_is_not(entry, str(error.name))}"
         ) from error
     except Exception as error:
         raise ConfigError(
@@ -105,6 +105,18 @@ def load(group: str, name: str) -> type[Any]:
             f"framework calls. Write what framework.{group} says of them."
         )
     return found
+
+
+def _where_it_is_not(entry: Entry, module: str) -> str:
+    package = entry.module.partition(".")[0]
+    hiding = find_spec(package) if module.startswith(f"{package}.") else None
+    if hiding is None:
+        return f"which is not installed. {_remedy(entry, module)}"
+    place = hiding.origin or next(iter(hiding.submodule_search_locations or ()))
+    return (
+        f"which is not in the package {package!r} at {place}. "
+        "If that is another package, it hides the plugin's: rename it, or run from elsewhere."
+    )
 
 
 def _remedy(entry: Entry, module: str) -> str:
