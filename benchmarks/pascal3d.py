@@ -98,10 +98,13 @@ def main() -> None:
     )
     for path in paths:
         row = json.loads(path.read_text(encoding="utf-8"))
-        rows.append({**row, "milliseconds_per_sample": milliseconds(path.parent, loaders)})
+        name = row["data"].removeprefix("pascal3d ")
+        rows.append({**row, "data": name, "milliseconds_per_sample": milliseconds(path.parent, loaders)})
     rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))
     compared = aggregate(rows, by=["data", "method"])
-    threads = sorted({row["threads"] for row in rows})
+    threads = " or ".join(
+        f"{count} CPU thread{'s' * (count > 1)}" for count in sorted({row["threads"] for row in rows})
+    )
     text = (
         "# Table 3.3: five density heads on synthetic PASCAL3D+\n\n"
         f"Embedded default (generated objects, {size} px crops), `biternion_vgg`, {epochs} epochs, batch {batch}; the "
@@ -109,7 +112,7 @@ def main() -> None:
         "set for one seed. `diningtable` looks the same after 180° (two true azimuths: the least mass a density gives "
         "to one, within 45°), `bottle` from everywhere (the gap between its azimuth entropy and log 2π).\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{over_classes(rows)}\n\n"
-        f"{len(rows)} runs, {threads} CPU threads each. {machine('torch', 'pytorch-lightning')}\n"
+        f"{len(rows)} runs, {threads} each. {machine('torch', 'pytorch-lightning')}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
     sys.stdout.write(text)
