@@ -172,9 +172,9 @@ def main() -> None:
         "# What densities of the azimuth know (synthetic data)\n\n"
         f"The models of [pascal3d.md](pascal3d.md) on the test images of the classes without symmetry; a quarter of "
         "the images is blurred. Means over classes, each the mean of its seeds, ± the standard error over classes; "
-        f"every method has seen {', '.join(classes) or 'none of them'}. The median has the least expected deviation of {SAMPLES} draws "
-        "(eq. 3.24). Turned round: an error above 135°; sure of it: nine tenths of the mass within 45° of the "
-        "point.\n\n" + "\n".join(lines) + "\n\n"
+        f"every method has seen {', '.join(classes) or 'none of them'}. The median has the least expected deviation of "
+        f"{SAMPLES} draws (eq. 3.24). Turned round: an error above 135°; sure of it: nine tenths of the mass within "
+        "45° of the point.\n\n" + "\n".join(lines) + "\n\n"
         f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
     Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
