@@ -256,7 +256,8 @@ def test_resume_names_a_run_folder(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         command_line([f"resume={tmp_path}"])
     (tmp_path / "config.yaml").write_text("seed: 1")
-    assert command_line([f"resume={tmp_path}"])[-1] == f"hydra.run.dir={tmp_path}"
+    here = in_quotes(str(tmp_path))
+    assert command_line([f"resume={tmp_path}"]) == [f"resume={here}", f"hydra.run.dir={here}"]
     assert command_line(["resume=auto"]) == ["resume=auto"]
 
 
