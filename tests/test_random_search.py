@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
+from framework.modes.combine import found
 from framework.runs.job import recorded
 from framework.sweeps import comparison
 from hydra_plugins.framework_random_search import _best, _draws
@@ -533,6 +534,18 @@ def test_jobs_are_found_however_deep_they_lie_and_those_of_a_sweep_below_are_not
         "x=10",
         "experiment=a",
     }
+
+
+def test_members_are_found_however_deep_the_jobs_of_a_sweep_lie(tmp_path: Path) -> None:
+    names = ["experiment=a/seed=9", "experiment=a/seed=10", "experiment=b/seed=9"]
+    for name in names:
+        completed(tmp_path / name, [])
+    for name in names[:2]:
+        (tmp_path / name / "checkpoints").mkdir()
+        (tmp_path / name / "checkpoints" / "model.ckpt").touch()
+    assert found(str(tmp_path)) == [tmp_path / name for name in names[:2]]
+    with pytest.raises(ConfigError, match="gives 0 trained models"):
+        found(str(tmp_path / "experiment=b"))
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[1]", "{}", '{"method": "m", "data": "d"}', None])

@@ -17,7 +17,7 @@ from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
-from framework.runs.job import recorded
+from framework.runs.job import by_number, recorded
 from framework.runs.run import opened
 from framework.runs.session import around, begin, calibrate, tested
 from framework.uncertainty import Joining
@@ -59,7 +59,8 @@ def run(config: Config) -> None:
 
 
 def found(members: str | Sequence[str]) -> list[str | Path]:
-    """Run folders, files or MLflow run ids; of a folder of runs those that hold a trained model, by name.
+    """Run folders, files or MLflow run ids; of a folder of runs those that hold a trained model, by name,
+    and where it holds none itself those of its jobs below.
 
     Raises:
         ConfigError: fewer than two.
@@ -68,7 +69,7 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
         listed: list[str | Path] = list(members)
     else:
         folder = Path(members).expanduser()
-        runs = [path.parent.parent for path in sorted(folder.glob(f"*/{_MODEL}"), key=_by_number)]
+        runs = sorted((path.parent.parent for path in folder.glob(f"*/{_MODEL}")), key=by_number)
         listed = [*(runs or (job for job in recorded(folder) if (job / _MODEL).is_file()))]
     if len(listed) < 2:
         raise ConfigError(
@@ -76,12 +77,6 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
             "a sweep (outputs/sweeps/<time>), or a list of run folders, checkpoint files or MLflow run ids."
         )
     return listed
-
-
-def _by_number(path: Path) -> tuple[int, str]:
-    """Job 2 before job 10."""
-    name = path.parent.parent.name
-    return len(name), name
 
 
 def common(members: Sequence[Description]) -> Description:

@@ -16,8 +16,13 @@ _COMMAND = "multirun.yaml"
 """What Hydra leaves in the folder of a sweep."""
 
 
+def by_number(folder: Path) -> list[tuple[int, str]]:
+    """A key that sorts folders by name, 2 before 10."""
+    return [(len(part), part) for part in folder.parts]
+
+
 def recorded(folder: Path) -> list[Path]:
-    """The folders of a sweep's jobs by name, 2 before 10, however deep they lie; not those of a sweep below it."""
+    """The folders of a sweep's jobs, sorted `by_number`, however deep they lie; not those of a sweep below it."""
     found = []
     for name, below, files in os.walk(folder):
         here = Path(name)
@@ -25,7 +30,7 @@ def recorded(folder: Path) -> list[Path]:
             found.append(here)
         if RECORD in files or (here != folder and _COMMAND in files):
             below.clear()
-    return sorted(found, key=lambda path: [(len(part), part) for part in path.relative_to(folder).parts])
+    return sorted(found, key=by_number)
 
 
 def leave_value(folder: Path, value: float) -> None:

@@ -92,7 +92,7 @@ def main(descriptor: str, modules: str, *target: str) -> None:
     """Import, serve, and in each fork run the target as Python would."""
     channel = socket.socket(fileno=int(descriptor))
     _tell(channel, {"ready": os.getpid()})
-    for name in modules.split(","):
+    for name in filter(None, modules.split(",")):
         with suppress(Exception):  # the job will say what is wrong with it
             import_module(name)
     gc.collect()

@@ -287,7 +287,9 @@ def _end(one: _Running, code: int) -> None:
     """Record how a job ended."""
     job = one.job
     one.process.kill()  # what a killed job left behind: data loaders, the other ranks
-    if code == 0:
+    if one.process.seconds is None:
+        status, error = "died", "nobody saw how it ended, since the process that it was a fork of died"
+    elif code == 0:
         status, error = "completed", None
     elif code < 0:
         status, error = "died", f"killed by {signal.Signals(-code).name}"

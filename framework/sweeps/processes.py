@@ -27,7 +27,7 @@ class Process(Protocol):
     """A job that runs, or has run.
 
     Attributes:
-        seconds: processor time of all its processes, once it has ended; None where nobody saw that.
+        seconds: processor time of all its processes, once it has ended; None where nobody saw how it did.
     """
 
     seconds: float | None
@@ -38,7 +38,7 @@ class Process(Protocol):
         ...
 
     def poll(self) -> int | None:
-        """Exit code, below 0 the signal that killed it; None while it runs."""
+        """Exit code, below 0 the signal that killed it, or that it was sent where nobody saw; None while it runs."""
         ...
 
     def send(self, number: int) -> None:
@@ -94,7 +94,8 @@ class Forks:
     """Starts jobs as forks of one process (`fork_server`), which is started with the first of them; Linux.
 
     A job gets all that a process of its own would have, but for modules that are there already. If that process dies,
-    so do its jobs; later jobs get another one, or processes of their own where it could not start any.
+    so do its jobs; later jobs get another one, or processes of their own where it could not start any, as do jobs that
+    it had not started yet.
 
     Args:
         modules: what it imports.
@@ -169,7 +170,13 @@ class _Server:
         if len(packet) > LARGEST:
             raise OSError("a packet is smaller")
         socket.send_fds(self._channel, [packet], [console, lock])
-        job = _Fork(self)
+        path = Path(f"/proc/self/fd/{console}").readlink()  # whoever opened it closes it soon
+
+        def fresh() -> Process:
+            with path.open("ab") as again:
+                return Fresh(command, environment, again.fileno(), lock)
+
+        job = _Fork(self, fresh)
         self._asked.append(job)
         return job
 
@@ -200,8 +207,12 @@ class _Server:
 
 
 class _Fork:
-    def __init__(self, server: _Server) -> None:
+    """A job that a server is to fork; a process of its own where the server dies before it has."""
+
+    def __init__(self, server: _Server, fresh: Callable[[], Process]) -> None:
         self._server = server
+        self._fresh = fresh
+        self._process: Process | None = None
         self._code: int | None = None
         self._early: list[int] = []
         self.pid: int | None = None
@@ -217,7 +228,17 @@ class _Fork:
 
     def poll(self) -> int | None:
         self._server.listen()
-        if self._code is None and not self._server.alive and not self._runs_on():
+        if self._code is not None:
+            return self._code
+        if self._process is not None:
+            self._code, self.seconds = self._process.poll(), self._process.seconds
+        elif not self._server.alive and self.pid is None:
+            if self._early:
+                self.end(-self._early[0], 0.0)
+            else:
+                self._process = self._fresh()
+                self.pid = self._process.pid
+        elif not self._server.alive and not self._runs_on():
             self._code = -signal.SIGTERM  # as it was told when the server died; nobody else can know
         return self._code
 
@@ -240,11 +261,12 @@ class _Fork:
 
     def kill(self) -> None:
         self._server.listen()
-        if self.pid is None:
-            self._server.close()
-        else:
+        if self.pid is not None:
             with suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGKILL)
+        elif self._code is None:
+            self.end(-signal.SIGKILL, 0.0)
+            self._server.close()
 
 
 def end_with_parent() -> None:
