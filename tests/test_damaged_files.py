@@ -78,6 +78,7 @@ OWN_FILES = {
     "framework/evaluation/cost.py": "/proc",
     "framework/modes/plugins.py": "the package's own modules",
     "framework/sweeps/jobs.py": "the console of a job that it started",
+    "framework/sweeps/processes.py": "/proc",
     "framework/tracking/journal.py": "the run's own journal, line by line",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
     "plugins/renderer/rasterizer/parts.py": "bytes that a guard has read",

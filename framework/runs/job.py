@@ -26,9 +26,11 @@ def recorded(folder: Path) -> list[Path]:
     found = []
     for name, below, files in os.walk(folder):
         here = Path(name)
-        if RECORD in files:
+        # A damaged record may be a folder: whoever reads it says so.
+        is_job = RECORD in files or RECORD in below
+        if is_job:
             found.append(here)
-        if RECORD in files or (here != folder and _COMMAND in files):
+        if is_job or (here != folder and _COMMAND in files):
             below.clear()
     return sorted(found, key=by_number)
 
