@@ -2,6 +2,7 @@
 
 from typing import Annotated, Literal
 
+import torch
 from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
@@ -76,9 +77,38 @@ class DeepSets(Encoder):
     def _described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
-        for layer in self.equivariant:
+        if torch.is_grad_enabled():
+            values, counts = self._attaining(values, counts)
+        *others, final = self.equivariant
+        for layer in others:
             values = self.activation(layer(below_largest(values, counts)))  # Zaheer et al. 2017, §4.2
-        return self.whole(largest(values, counts))
+        # σ grows, so that the largest may pass it alone
+        return self.whole(self.activation(largest(final(below_largest(values, counts)), counts)))
+
+    @torch.no_grad()
+    def _attaining(
+        self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
+    ) -> tuple[Float[Tensor, "attaining columns"], Int[Tensor, "batch"]]:
+        """The points that attain a largest number of any layer, and how many there are of each cloud.
+
+        A network of these alone says the same, and no other point has a gradient (PointNet's critical points: Qi et al.
+        2017, §4.3, theorem 2). Where several attain a number, one is chosen.
+        """
+        *_, final = self.equivariant
+        found = []
+        for part in values.split(counts.tolist()):  # one cloud's numbers stay in a CPU's cache
+            most, index = part.mT.max(1, keepdim=True)
+            columns, chosen = part.mT, [index]
+            for layer in self.equivariant:
+                weight, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
+                columns = torch.addmm(bias.unsqueeze(1), weight, columns - most)
+                columns = columns if layer is final else self.activation(columns)
+                most, index = columns.max(1, keepdim=True)
+                chosen.append(index)
+            found.append(torch.cat(chosen).unique())
+        start = (counts.cumsum(0) - counts).tolist()
+        rows = torch.cat([counts[:0], *(first + index for first, index in zip(start, found, strict=True))])
+        return values.index_select(0, rows), counts.new_tensor([len(index) for index in found])
 
 
 def below_largest(

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import Reading, columns_read, largest, over_points
+from plugins.encoder.point_sets.point_sets import Reading, columns_read, over_points
+from plugins.encoder.point_sets.pooled import largest_after
 
 Width = Annotated[int, Field(gt=0)]
 LOCAL = 2
@@ -85,7 +86,7 @@ class PointNet(Encoder):
         values = self.local(values)
         if self.feature_matrix is not None:
             values = multiplied(values, self.feature_matrix(values, counts), counts)
-        return self.dropout(self.whole(largest(self.deep(values), counts)))
+        return self.dropout(self.whole(largest_after(self.deep, values, counts)))
 
 
 class Matrix(nn.Module):
@@ -112,7 +113,7 @@ class Matrix(nn.Module):
     def forward(
         self, values: Float[Tensor, "point size"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch size size"]:
-        entries = self.entries(self.whole(largest(self.each(values), counts)))
+        entries = self.entries(self.whole(largest_after(self.each, values, counts)))
         return entries.unflatten(1, (self.size, self.size))
 
 
