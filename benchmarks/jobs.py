@@ -23,6 +23,11 @@ def processor_seconds(job: Mapping[str, Any]) -> float:
     return math.nan if spent is None else float(spent)
 
 
+def by_the_clock(job: Mapping[str, Any]) -> float:
+    """Seconds from a job's start to its end; NaN where they are not known."""
+    return job["ended"] - job["started"] if "ended" in job else math.nan
+
+
 def settings(runs: Iterable[Path], *keys: str) -> list[str]:
     """The values that a setting has in the runs' configs, each once: "15" or "15 and 30".
 

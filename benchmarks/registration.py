@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
-from benchmarks.jobs import processor_seconds, record
+from benchmarks.jobs import by_the_clock, record, settings
 from benchmarks.machine import machine, milliseconds
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
@@ -142,7 +142,8 @@ def main(runs: list[Path], scan: Path | None) -> None:
 def trained(run: Path, split) -> list[str]:
     """The errors that a run's own test stage wrote, how long it took, and what one scan costs its model."""
     found = json.loads((run / "results.json").read_text(encoding="utf-8"))
-    minutes = format_number(processor_seconds(record(run)) / 60)
+    minutes = format_number(by_the_clock(record(run)) / 60)
+    (threads,) = settings([run], "threads")
     model = framework.load(run)
     batch = split.__getitems__([0])
     cloud = batch["input"][:, : int((~batch["input"].isnan()).all(-1).sum())]
@@ -151,7 +152,7 @@ def trained(run: Path, split) -> list[str]:
     rows = {"all": found, **found.get("groups", {})}
     keys = ("vertex_error_median_cm", "vertex_error_95_cm")
     return [
-        f"`experiment={found['experiment']}`: {minutes} processor minutes from start to report, "
+        f"`experiment={found['experiment']}`: {minutes} minutes from start to report, threads={threads}, "
         f"computing its features included. From a cloud of {cloud.shape[1]} points to a density of all vertices and "
         f"its median, by `framework.load`, one core: {vertices:.2f} ms. Vertex error of held-out bodies (synthetic), "
         "centimetres (± standard error over scans):",

@@ -8,24 +8,30 @@ where it was stopped. Each table's own script writes its page; thesis_tables.md 
 
 import argparse
 import datetime
+import itertools
 import math
 import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from benchmarks.jobs import processor_seconds, record
+from benchmarks.jobs import by_the_clock, processor_seconds, record
 from benchmarks.machine import machine
 from framework.reports.table import NOT_AVAILABLE, format_number
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[1]
 FOLDER = ROOT / "outputs/thesis_tables"
-SAID = ("pictures=false", "logger=none", "threads=1")
+SAID = ("pictures=false", "logger=none")
+AT_ONCE = 2
+"""Runs, for the minutes that the page says."""
+RUNS, MINUTES, PAGES = 3, 4, 5
+"""Columns of the page."""
 BFLOAT16 = "trainer.precision=bf16-mixed"
 """For convolutions, where asked for: it pays on a processor that has avx512_bf16."""
 CLASSES = (
@@ -59,7 +65,7 @@ class Table(NamedTuple):
         sweeps: arguments of each multirun, by its folder.
         script: beside this file; it is given the folders of its sweeps, or of the only run of each where `alone`.
         seeds: most that are run of each sweep that does not name its own.
-        alone: whether each sweep has one run.
+        alone: whether each sweep has one run, which then has as many threads as others have runs at once.
         convolves: whether `--bfloat16` is for it.
         also: further scripts, each with a page of the same runs.
     """
@@ -178,45 +184,90 @@ def main() -> None:
     unknown = [name for name in given.tables if name not in TABLES]
     if unknown:
         arguments.error(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
+    written: dict[str, float] = {}
     for name in given.tables or TABLES:
-        for command in commands(name, given.seeds, given.jobs, given.bfloat16):
-            sys.stdout.write(" ".join(command[1:]) + "\n")
-            sys.stdout.flush()
-            if not given.tell:
-                subprocess.run(command, cwd=ROOT, check=True)
+        sweeps, pages = commands(name, given.seeds, given.jobs, given.bfloat16)
+        if not given.tell:
+            for sweep, words in TABLES[name].sweeps.items():
+                put_aside(sweep, (*words, *said(TABLES[name], given.jobs, given.bfloat16)))
+        for command in sweeps:
+            carry_out(command, told_only=given.tell)
+        began = time.perf_counter()
+        for command in pages:
+            carry_out(command, told_only=given.tell)
+        written[name] = (time.perf_counter() - began) / 60
     if not given.tell:
         page = HERE.with_suffix(".md")
-        page.write_text(report(page.read_text(encoding="utf-8")), encoding="utf-8")
+        page.write_text(report(page.read_text(encoding="utf-8"), written), encoding="utf-8")
 
 
-def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> list[list[str]]:
-    """Of a table: its sweeps, and its pages at last."""
+def carry_out(command: Sequence[str], *, told_only: bool) -> None:
+    sys.stdout.write(" ".join(command[1:]) + "\n")
+    sys.stdout.flush()
+    if not told_only:
+        subprocess.run(command, cwd=ROOT, check=True)
+
+
+def said(table: Table, jobs: int, bfloat16: bool) -> tuple[str, ...]:
+    """What every run of a table is told."""
+    precision = (BFLOAT16,) if bfloat16 and table.convolves else ()
+    return (*precision, *SAID, f"threads={jobs if table.alone else 1}")
+
+
+def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> tuple[list[list[str]], list[list[str]]]:
+    """Of a table: its sweeps; its pages, which are made of them."""
     table = TABLES[name]
     drawn = "seed=" + ",".join(str(seed) for seed in range(min(seeds, table.seeds)))
-    said = (BFLOAT16, *SAID) if bfloat16 and table.convolves else SAID
     found = [
         [
             *(sys.executable, "-m", "framework", "-m", *words),
             *(() if any(word.startswith("seed=") for word in words) else (drawn,)),
-            *said,
+            *said(table, jobs, bfloat16),
             *(f"hydra.launcher.jobs={jobs}", f"hydra.sweep.dir={folder_of(sweep)}"),
         ]
         for sweep, words in table.sweeps.items()
     ]
     folders = [folder_of(sweep) + ("/0" if table.alone else "") for sweep in table.sweeps]
     pages = [[sys.executable, f"benchmarks/{script}.py", *folders] for script in (table.script, *table.also)]
-    return [*found, *pages]
+    return found, pages
+
+
+def put_aside(sweep: str, words: Sequence[str]) -> None:
+    """Move what ran under another definition of a table to a folder beside, where the table's page does not meet it.
+
+    Args:
+        sweep: its folder.
+        words: what its runs are told now; of any seed they belong to it.
+    """
+    asked = {key: options(told) for key, _, told in (word.partition("=") for word in words)}
+    for path in sorted((FOLDER / sweep).glob("*/job.json")):
+        job = record(path.parent)
+        told = dict(word.split("=", 1) for word in job["overrides"])
+        told.pop("seed", None)
+        if job["status"] == "running" or (
+            told.keys() == asked.keys() - {"seed"}
+            and all(value.lower() in asked[key] for key, value in told.items())
+        ):
+            continue
+        for number in itertools.count():
+            aside = FOLDER / "aside" / f"{sweep}_{path.parent.name}_{number}"
+            if not aside.exists():
+                break
+        aside.parent.mkdir(exist_ok=True)
+        path.parent.rename(aside)
+        sys.stdout.write(f"{sweep}/{path.parent.name} is of another definition of the table: now {aside}\n")
 
 
 def folder_of(sweep: str) -> str:
     return os.path.relpath(FOLDER / sweep, ROOT)
 
 
-def report(page: str) -> str:
+def report(page: str, written: Mapping[str, float]) -> str:
     """The page anew; of tables whose runs are not on this machine it keeps what it said.
 
     Args:
         page: what it was.
+        written: minutes that the pages of a table took; of others it keeps what it said too.
     """
     before = {line.split(" | ")[0].removeprefix("| "): line for line in page.splitlines()}
     lines, counted = [], set[str]()
@@ -229,24 +280,25 @@ def report(page: str) -> str:
             continue
         asked = sum(choices(table.sweeps[sweep], table.seeds) for sweep in own)
         shown = ", ".join(link(f"{script}.md") for script in (table.script, *table.also))
-        minutes = sum(map(processor_seconds, done)) / 60
-        told = NOT_AVAILABLE if math.isnan(minutes) else f"{minutes:.1f}"
-        cells = [name, table.about, shown, f"{len(done)} of {asked}", told, when(done)]
+        seconds = sum(by_the_clock(job) if table.alone else processor_seconds(job) / AT_ONCE for job in done)
+        on_pages = written.get(name, cell(before.get(name, ""), PAGES))
+        told = [one_decimal(seconds / 60), one_decimal(on_pages)]
+        cells = [name, table.about, shown, f"{len(done)} of {asked}", *told, when(done)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(
         [
             "# The thesis's tables, run (synthetic data)",
             "",
-            "Commands: `python benchmarks/thesis_tables.py --tell` prints them. Minutes: processor time of all runs, "
-            "each on one thread; pages take some minutes more. Each page says of which runs it is: of a table not "
-            "yet run whole, of some of these, or of older ones.",
+            "Commands: `python benchmarks/thesis_tables.py --tell` prints them. Minutes of runs: half of their "
+            "processor time, for two run at once, on one thread each; of Table 6.4, whose runs have two threads, by "
+            "the clock. Minutes of pages, which a script makes of the runs: by the clock. Each page says of which "
+            "runs it is: of a table not yet run whole, of some of these, or of older ones.",
             "",
-            "| table | data | page | runs | processor minutes | on |",
-            "|---|---|---|---:|---:|---|",
+            "| table | data | page | runs | minutes of runs | of pages | on |",
+            "|---|---|---|---:|---:|---:|---|",
             *lines,
             "",
-            "Hours that the whole takes two cores, two runs at once (of Table 6.4 one at a time): "
-            f"{format_number(hours(lines))}. "
+            f"Hours that the whole takes two cores: {format_number(hours(lines))}. "
             f"{machine('torch', 'pytorch-lightning')}",
             "",
         ]
@@ -254,18 +306,25 @@ def report(page: str) -> str:
 
 
 def hours(lines: Sequence[str]) -> float:
-    """By the clock, on two cores; runs that go one after the other leave a core idle."""
-    at_once = [1 if table.alone else 2 for table in TABLES.values()]
-    return sum(minutes_of(line) / cores for line, cores in zip(lines, at_once, strict=True)) / 60
+    """Of all runs and pages; NaN where those of a table are not known."""
+    return sum(minutes_of(line) + cell(line, PAGES) for line in lines) / 60
 
 
 def minutes_of(line: str) -> float:
-    """What all runs of a table would take, by those that have run; NaN where none has, or
-    an older line counts minutes by the clock."""
-    runs, minutes = line.split(" | ")[3:5]
-    done, _, asked = runs.partition(" of ")
-    known = re.fullmatch(r"[\d.]+", minutes) is not None and int(done) > 0 and "by the clock" not in line
-    return float(minutes) * int(asked) / int(done) if known else math.nan
+    """What all runs of a table would take, by those that have run; NaN where none has."""
+    done, _, asked = line.split(" | ")[RUNS].partition(" of ")
+    return cell(line, MINUTES) * int(asked) / int(done) if int(done) > 0 else math.nan
+
+
+def cell(line: str, column: int) -> float:
+    """NaN where there is no number."""
+    cells = line.split(" | ")
+    known = len(cells) > column and re.fullmatch(r"[\d.]+", cells[column])
+    return float(cells[column]) if known else math.nan
+
+
+def one_decimal(minutes: float) -> str:
+    return NOT_AVAILABLE if math.isnan(minutes) else f"{minutes:.1f}"
 
 
 def when(jobs: Sequence[Mapping[str, Any]]) -> str:
@@ -282,8 +341,13 @@ def link(page: str) -> str:
 
 def choices(words: Sequence[str], seeds: int) -> int:
     """How many runs a multirun has."""
-    of_each = [len(re.findall(r"\[[^]]*\]|[^,]+", word.partition("=")[2])) for word in words]
+    of_each = [len(options(word.partition("=")[2])) for word in words]
     return math.prod(of_each) * (1 if any(word.startswith("seed=") for word in words) else seeds)
+
+
+def options(told: str) -> list[str]:
+    """What a multirun is told of one setting, taken apart: "[a,b],c" to "[a,b]" and "c"."""
+    return re.findall(r"\[[^]]*\]|[^,]+", told)
 
 
 def completed(sweep: Path) -> list[dict[str, Any]]:

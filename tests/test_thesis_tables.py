@@ -1,8 +1,10 @@
 """What `benchmarks/thesis_tables.md` says of runs that are here, half done, or on another machine."""
 
 import datetime
+import itertools
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,13 +12,18 @@ import pytest
 from benchmarks import thesis_tables
 
 PAGE = """
-| 2.1 | moons | page | 45 of 45 | 19 | elsewhere |
-| 3.3 | objects | page | 16 of 72 | 65 | elsewhere |
+| 2.1 | moons | page | 45 of 45 | 19 | 2.0 | elsewhere |
+| 3.3 | objects | page | 16 of 72 | 65 | 3.0 | elsewhere |
 """
 
 
 def job(folder: Path, number: int, **record: object) -> None:
-    told = {"status": "completed", "ended": 1.8e9, "processor_seconds": 90.0} | record
+    told = {
+        "status": "completed",
+        "started": 1.8e9 - 600,
+        "ended": 1.8e9,
+        "processor_seconds": 180.0,
+    } | record
     path = folder / str(number) / "job.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(told), encoding="utf-8")
@@ -36,26 +43,82 @@ def row(page: str, table: str) -> list[str]:
 
 def test_a_table_whose_runs_are_not_here_keeps_its_line(runs: Path) -> None:
     job(runs / "pascal3d", 0)
-    page = thesis_tables.report(PAGE)
-    assert row(page, "2.1") == ["2.1", "moons", "page", "45 of 45", "19", "elsewhere"]
-    assert row(page, "3.3")[3:5] == ["1 of 72", "1.5"]
-    assert row(page, "3.3")[5].endswith(datetime.date.fromtimestamp(1.8e9).isoformat())
-    assert row(page, "6.4")[3:] == ["0 of 2", "0.0", "not available"]
+    page = thesis_tables.report(PAGE, {})
+    assert row(page, "2.1") == ["2.1", "moons", "page", "45 of 45", "19", "2.0", "elsewhere"]
+    assert row(page, "3.3")[3:6] == ["1 of 72", "1.5", "3.0"]
+    assert row(page, "3.3")[6].endswith(datetime.date.fromtimestamp(1.8e9).isoformat())
+    assert row(page, "6.4")[3:] == ["0 of 2", "0.0", "not available", "not available"]
+    assert row(thesis_tables.report(PAGE, {"3.3": 4.0}), "3.3")[5] == "4.0"
 
 
 def test_only_completed_jobs_count_and_unknown_times_say_so(runs: Path) -> None:
     for number, told in enumerate([{}, {"status": "died"}, {"status": "running", "ended": None}]):
         job(runs / "pascal3d", number, **told)
     job(runs / "moons", 0, processor_seconds=None)
-    page = thesis_tables.report("")
-    assert row(page, "3.3")[3:5] == ["1 of 72", "1.5"]
+    page = thesis_tables.report("", {})
+    assert row(page, "3.3")[3:6] == ["1 of 72", "1.5", "not available"]
     assert row(page, "2.1")[3:5] == ["1 of 60", "not available"]
 
 
-def test_a_whole_is_told_of_tables_that_all_have_run(runs: Path) -> None:
-    assert thesis_tables.minutes_of("| 3.3 | a | b | 16 of 72 | 65 | c |") == 65 * 72 / 16
-    assert math.isnan(thesis_tables.minutes_of("| 6.4 | a | b | 0 of 1 | 0 | c |"))
-    assert math.isnan(thesis_tables.minutes_of("| 6.4 | a | b | 1 of 1 | not available | c |"))
+def test_runs_that_go_alone_count_by_the_clock(runs: Path) -> None:
+    job(runs / "registration", 0)
+    assert row(thesis_tables.report("", {}), "6.4")[3:5] == ["1 of 2", "10.0"]
+
+
+def test_a_whole_is_told_of_tables_that_all_have_run() -> None:
+    lines = ["| 3.3 | a | b | 16 of 72 | 65 | 3.0 | c |", "| 6.4 | a | b | 2 of 2 | 20 | 1.0 | c |"]
+    assert thesis_tables.hours(lines) == pytest.approx((65 * 72 / 16 + 3 + 20 + 1) / 60)
+    for line in (
+        "| 6.4 | a | b | 0 of 1 | 0 | 1.0 | c |",
+        "| 6.4 | a | b | 1 of 1 | not available | 1.0 | c |",
+        "| 6.4 | a | b | 1 of 1 | 20 | not available | c |",
+        "| 6.4 | a | b | 1 of 1 | 20 | of a page as it was before |",
+    ):
+        assert math.isnan(thesis_tables.hours([*lines, line]))
+
+
+def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
+    """Each way in which a definition changes: a choice less, a setting more or less or other; never a seed."""
+    words = ("experiment=a/b,a/c", "data.angles=[pan],[tilt]", "seed=0", "pictures=false", "threads=1")
+    kept = [
+        ["experiment=a/b", "data.angles=[pan]", "seed=0", "pictures=False", "threads=1"],
+        ["experiment=a/c", "data.angles=[tilt]", "seed=7", "pictures=False", "threads=1"],
+    ]
+    other = [
+        ["experiment=a/d", *kept[0][1:]],
+        [*kept[0], "trainer.max_epochs=3"],
+        [*kept[0][:2], *kept[0][3:4]],
+        [*kept[0][:-1], "threads=2"],
+    ]
+    for number, overrides in enumerate([*kept, *other]):
+        job(runs / "a", number, overrides=overrides)
+    job(runs / "a", 9, overrides=other[0], status="running", ended=None)
+    job(runs / "b", 0, overrides=other[0])
+    for _ in range(2):
+        thesis_tables.put_aside("a", words)
+        assert sorted(path.name for path in (runs / "a").iterdir()) == ["0", "1", "9"]
+        assert len(list((runs / "aside").iterdir())) == len(other)
+        assert (runs / "b" / "0").exists()
+    job(runs / "a", 2, overrides=other[0])
+    thesis_tables.put_aside("a", words)
+    assert len(list((runs / "aside").iterdir())) == len(other) + 1
+
+
+def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
+    """Of every table, the runs as Hydra tells them."""
+    for name, table in thesis_tables.TABLES.items():
+        for jobs, bfloat16 in itertools.product((1, 2), (False, True)):
+            for command in thesis_tables.commands(name, 5, jobs, bfloat16)[0]:
+                folder = runs / Path(command[-1].partition("=")[2]).name
+                told = [word.partition("=") for word in command[4:] if not word.startswith("hydra.")]
+                many = itertools.product(*(thesis_tables.options(value) for _, _, value in told))
+                for number, values in enumerate(many):
+                    overrides = [f"{key}={value}" for (key, _, _), value in zip(told, values, strict=True)]
+                    job(folder, number, overrides=overrides)
+                words = (*table.sweeps[folder.name], *thesis_tables.said(table, jobs, bfloat16))
+                thesis_tables.put_aside(folder.name, words)
+                assert len(list(folder.iterdir())) == number + 1
+                shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize(

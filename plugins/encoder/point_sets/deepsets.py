@@ -77,7 +77,7 @@ class DeepSets(Encoder):
     def _described(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
-        if torch.is_grad_enabled():
+        if torch.is_grad_enabled() and values.device.type == "cpu":
             values, counts = self._attaining(values, counts)
         *others, final = self.equivariant
         for layer in others:
