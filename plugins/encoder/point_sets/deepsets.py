@@ -78,7 +78,8 @@ class DeepSets(Encoder):
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if torch.is_grad_enabled() and values.device.type == "cpu":
-            values, counts = self._attaining(values, counts)
+            rows, counts = self._attaining(values, counts)
+            values = values.index_select(0, rows)
         *others, final = self.equivariant
         for layer in others:
             values = self.activation(layer(below_largest(values, counts)))  # Zaheer et al. 2017, §4.2
@@ -88,8 +89,8 @@ class DeepSets(Encoder):
     @torch.no_grad()
     def _attaining(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
-    ) -> tuple[Float[Tensor, "attaining columns"], Int[Tensor, "batch"]]:
-        """The points that attain a largest number of any layer, and how many there are of each cloud.
+    ) -> tuple[Int[Tensor, "attaining"], Int[Tensor, "batch"]]:
+        """Rows of the points that attain a largest number of any layer, and how many there are of each cloud.
 
         A network of these alone says the same, and no other point has a gradient (PointNet's critical points: Qi et al.
         2017, §4.3, theorem 2). Where several attain a number, one is chosen.
@@ -108,7 +109,7 @@ class DeepSets(Encoder):
             found.append(torch.cat(chosen).unique())
         start = (counts.cumsum(0) - counts).tolist()
         rows = torch.cat([counts[:0], *(first + index for first, index in zip(start, found, strict=True))])
-        return values.index_select(0, rows), counts.new_tensor([len(index) for index in found])
+        return rows, counts.new_tensor([len(index) for index in found])
 
 
 def below_largest(

@@ -127,9 +127,9 @@ def test_pointnet_learns_what_it_would_from_every_point(config, monkeypatch):
     found = {}
     for points in (64, 10**9):
         monkeypatch.setattr("plugins.encoder.point_sets.pooled.POINTS", points)
-        one = copy.deepcopy(made)
-        one(clouds).square().sum().backward()
-        found[points] = [parameter.grad for parameter in one.parameters()]
+        one, inputs = copy.deepcopy(made), clouds.clone().requires_grad_()
+        one(inputs).square().sum().backward()
+        found[points] = [inputs.grad, *(parameter.grad for parameter in one.parameters())]
     for mine, every in zip(*found.values(), strict=True):
         torch.testing.assert_close(mine, every, rtol=1e-7, atol=1e-9)
 
@@ -147,10 +147,11 @@ def test_deepsets_learns_from_few_points_what_it_would_from_all(activation):
     for every in (False, True):
         one = copy.deepcopy(made)
         if every:
-            one._attaining = lambda values, counts: (values, counts)
-        value = one(clouds)
+            one._attaining = lambda values, counts: (torch.arange(len(values)), counts)
+        inputs = clouds.clone().requires_grad_()
+        value = one(inputs)
         value.square().sum().backward()
-        found[every] = [value.detach(), *(parameter.grad for parameter in one.parameters())]
+        found[every] = [value.detach(), inputs.grad, *(parameter.grad for parameter in one.parameters())]
     hook.remove()
     assert passed[0] < 250 < passed[1] == 4 * 400 + 30
     for mine, all_of_them in zip(*found.values(), strict=True):
