@@ -1,5 +1,5 @@
 """The largest numbers over each cloud after layers of `layers`, without the numbers of every point where they can be
-spared: of the widest layer, which comes last, a training step then takes a third of the multiplications and memory."""
+spared: a step of PointNet then takes a quarter of the time and a third of the memory (benchmarks/set_steps.md)."""
 
 from typing import cast
 
@@ -11,7 +11,8 @@ from torch.nn.functional import linear
 from plugins.encoder.point_sets.point_sets import largest
 
 POINTS = 64
-"""Of a cloud on average, from which on it is faster to gather the rows that attain a maximum (README)."""
+"""Of a cloud on average, from which on the rows that attain a maximum are few beside all; by count, not by a measured
+limit."""
 
 
 def largest_after(
@@ -92,7 +93,7 @@ def attaining(
     """Of each cloud and channel the row, of all points, with the largest product."""
     start = (counts.cumsum(0) - counts).tolist()
     parts = values.split(counts.tolist())  # one cloud's numbers stay in a CPU's cache
-    # along the rows of the transposed product the search is four times as fast
+    # transposed, so that a channel's numbers lie side by side
     return torch.stack(
         [first + (weight @ part.mT).argmax(1) for first, part in zip(start, parts, strict=True)]
     )
