@@ -13,7 +13,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -26,6 +25,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
 from benchmarks import committed
+from benchmarks.commands import carry_out
 from benchmarks.machine import machine
 from framework.configuration.schema import build, resolve
 from framework.data import Data
@@ -79,7 +79,7 @@ def trained(method: str, root: str | None, seed: int) -> Path:
                 further += [f"checkpoint={RUNS / method}", f"trainer.max_epochs={EPOCHS[method]}", *BRIEF]
         command = [sys.executable, "-m", "framework", f"experiment=table_tennis/{method}", "threads=1"]
         command += ["logger=none", "pictures=false", f"hydra.run.dir={folder}", *further]
-        subprocess.run(command, check=True, cwd=HERE.parent.parent)
+        carry_out(command)
     return folder
 
 

@@ -8,7 +8,6 @@ one core. Results lie beside this file.
 import json
 import math
 import resource
-import subprocess
 import sys
 from functools import partial
 from itertools import product
@@ -20,6 +19,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.commands import ROOT, carry_out
 from benchmarks.machine import machine, milliseconds
 from benchmarks.rasterizer import figure
 from framework.configuration.loading import load_with_description, reader
@@ -29,7 +29,6 @@ from framework.geometry.camera import look_from
 from plugins.renderer.smplpix.canvas import fast_bfloat16
 
 HERE = Path(__file__).resolve()
-ROOT = HERE.parents[1]
 FOLDER = ROOT / "outputs/smplpix_networks"
 SIZES = ((410, 308), (256, 192))
 DISTANCE = 2.5  # metres
@@ -150,7 +149,7 @@ def trained(name: str) -> Trained:
         words = [*TRAININGS[name], "seed=0", "threads=1", "logger=none", "pictures=false"]
         words += [f"hydra.run.dir={folder}"]
         before = processor_seconds()
-        subprocess.run([sys.executable, "-m", "framework", *words], cwd=ROOT, check=True)
+        carry_out([sys.executable, "-m", "framework", *words])
         clock.write_text(f"{(processor_seconds() - before) / 60:.2f}\n")
     numbers = json.loads((folder / "results.json").read_text())
     predictor, description = load_with_description(folder)

@@ -6,7 +6,6 @@ test picture anew; `… <folders of sweeps> [--lpips <alexnet.pth>]` only judges
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.commands import carry_out
 from benchmarks.machine import machine, milliseconds
 from framework.configuration.loading import load_with_description, reader
 from framework.configuration.schema import build, resolve
@@ -136,7 +136,7 @@ def main() -> None:
     given = arguments.parse_args()
     for name, words in [] if given.folders else SWEEPS.items():
         command = [sys.executable, "-m", "framework", "-m", *words, f"hydra.sweep.dir={FOLDER / name}"]
-        subprocess.run(command, cwd=HERE.parents[1], check=True)
+        carry_out(command)
     torch.set_num_threads(1)
     text = report(given.folders or [FOLDER / name for name in SWEEPS], given.lpips)
     HERE.with_suffix(".md").write_text(text, encoding="utf-8")

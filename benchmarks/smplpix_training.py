@@ -9,7 +9,6 @@ import argparse
 import csv
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,12 +20,12 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks import smplpix_table as table
+from benchmarks.commands import ROOT, carry_out
 from benchmarks.machine import machine
 from framework.configuration.loading import load, load_with_description, reader
 from framework.figures.style import GREEN, GREY, RED, titled_figure
 
 HERE = Path(__file__).resolve()
-ROOT = HERE.parents[1]
 FOLDER = ROOT / "outputs/smplpix_training"
 RECORD = HERE.with_suffix(".csv")
 SKINS = "Skins nobody wore in training"
@@ -135,7 +134,7 @@ def run(method: Method, epochs: int, seed: int) -> None:
     words = [*method.words, f"seed={seed}", "threads=1", "logger=none"]
     words += [f"hydra.run.dir={method.place(epochs, seed)}"]
     words += [f"trainer.max_epochs={epochs}"] if epochs else []
-    subprocess.run([sys.executable, "-m", "framework", *words], cwd=ROOT, check=True)
+    carry_out([sys.executable, "-m", "framework", *words])
 
 
 def measured(method: Method, epochs: int) -> Row | None:

@@ -8,7 +8,6 @@ has run in outputs/sweeps/targets does not run again. Writes targets.md beside t
 
 import csv
 import math
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,12 +17,12 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import framework
+from benchmarks.commands import ROOT, carry_out
 from benchmarks.machine import machine
 from framework.distributions.class_probabilities import class_probabilities
 from framework.reports.table import aggregate, markdown
 
 HERE = Path(__file__).resolve()
-ROOT = HERE.parents[1]
 FOLDER = ROOT / "outputs/sweeps/targets"
 ROWS, SEEDS, BINS = 3000, 5, 12
 SEAM = 10.0
@@ -77,7 +76,7 @@ def sweep(name: str) -> Path:
     """Of all seeds, in their order."""
     folder = FOLDER / name.replace(" ", "_")
     command = [sys.executable, "-m", "framework", "-m", *COMMON, *HEADS[name]]
-    subprocess.run([*command, "hydra.launcher.jobs=2", f"hydra.sweep.dir={folder}"], cwd=ROOT, check=True)
+    carry_out([*command, "hydra.launcher.jobs=2", f"hydra.sweep.dir={folder}"])
     return folder
 
 

@@ -12,7 +12,6 @@ import itertools
 import math
 import os
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -20,12 +19,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from benchmarks.commands import ROOT, carry_out
 from benchmarks.jobs import by_the_clock, processor_seconds, record
 from benchmarks.machine import machine
 from framework.reports.table import NOT_AVAILABLE, format_number
 
 HERE = Path(__file__).resolve()
-ROOT = HERE.parents[1]
 FOLDER = ROOT / "outputs/thesis_tables"
 SAID = ("pictures=false", "logger=none")
 AT_ONCE = 2
@@ -185,28 +184,26 @@ def main() -> None:
     unknown = [name for name in given.tables if name not in TABLES]
     if unknown:
         arguments.error(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
-    written: dict[str, float] = {}
     for name in given.tables or TABLES:
         sweeps, pages = commands(name, given.seeds, given.jobs, given.bfloat16)
         if not given.tell:
             for sweep, words in TABLES[name].sweeps.items():
                 put_aside(sweep, (*words, *said(TABLES[name], given.jobs, given.bfloat16)))
-        for command in sweeps:
-            carry_out(command, told_only=given.tell)
+        told(sweeps, run=not given.tell)
         began = time.perf_counter()
-        for command in pages:
-            carry_out(command, told_only=given.tell)
-        written[name] = (time.perf_counter() - began) / 60
-    if not given.tell:
-        page = HERE.with_suffix(".md")
-        page.write_text(report(page.read_text(encoding="utf-8"), written), encoding="utf-8")
+        told(pages, run=not given.tell)
+        if not given.tell:  # after each: who stops it during the next loses nothing
+            page = HERE.with_suffix(".md")
+            written = {name: (time.perf_counter() - began) / 60}
+            page.write_text(report(page.read_text(encoding="utf-8"), written), encoding="utf-8")
 
 
-def carry_out(command: Sequence[str], *, told_only: bool) -> None:
-    sys.stdout.write(" ".join(command[1:]) + "\n")
-    sys.stdout.flush()
-    if not told_only:
-        subprocess.run(command, cwd=ROOT, check=True)
+def told(commands: Sequence[Sequence[str]], *, run: bool) -> None:
+    for command in commands:
+        sys.stdout.write(" ".join(command[1:]) + "\n")
+        sys.stdout.flush()
+        if run:
+            carry_out(command)
 
 
 def said(table: Table, jobs: int, bfloat16: bool) -> tuple[str, ...]:

@@ -1,0 +1,65 @@
+"""A benchmark that is told to stop stops what it runs, and waits until that has closed."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.commands import ROOT, carry_out
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+CHILD = """
+import signal, sys, time
+def closed(number, frame):
+    time.sleep(1.0)  # longer than the quarter of a second that subprocess.run leaves
+    print("closed", signal.Signals(number).name, flush=True)
+    sys.exit(3)
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, closed)
+print("ready", flush=True)
+time.sleep(60)
+"""
+BENCHMARK = (
+    "import sys; from benchmarks.commands import carry_out; carry_out([sys.executable, '-c', sys.argv[1]])"
+)
+
+
+@pytest.mark.parametrize("number", NUMBERS, ids=lambda number: number.name)
+@pytest.mark.parametrize("whole_group", [False, True], ids=["one process", "as from a terminal"])
+def test_what_it_runs_is_told_once_and_waited_for(number: signal.Signals, whole_group: bool) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", BENCHMARK, CHILD], cwd=ROOT, stdout=subprocess.PIPE, text=True, process_group=0
+    ) as benchmark:
+        assert benchmark.stdout is not None
+        assert benchmark.stdout.readline() == "ready\n"
+        if whole_group:
+            subprocess.run(
+                [sys.executable, "-c", f"import os; os.killpg({benchmark.pid}, {number})"], check=True
+            )
+        else:
+            benchmark.send_signal(number)
+        said = benchmark.stdout.read()
+    assert said == f"closed {number.name}\n"
+    assert benchmark.returncode == 128 + number
+
+
+def test_a_command_that_fails_is_an_error_and_handlers_are_as_before() -> None:
+    before = [signal.getsignal(number) for number in NUMBERS]
+    carry_out([sys.executable, "-c", ""])
+    with pytest.raises(subprocess.CalledProcessError, match="exit status 5"):
+        carry_out([sys.executable, "-c", "raise SystemExit(5)"])
+    with pytest.raises(FileNotFoundError):
+        carry_out(["/nowhere/to/be/found"])
+    assert [signal.getsignal(number) for number in NUMBERS] == before
+
+
+def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
+    """A sweep begun by other means goes on by itself, or is killed in the middle of what it writes."""
+    others = [
+        path.name
+        for path in Path(ROOT, "benchmarks").glob("*.py")
+        if '"-m", "framework"' in (text := path.read_text(encoding="utf-8")) and "subprocess.run(" in text
+    ]
+    assert others == []
