@@ -1,8 +1,8 @@
 """Tables 6.1, 6.2 and 6.3 on the synthetic CAD set: every row, error and run time, and the thesis's claims on them.
 
-    python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its two sweeps, to run one by one
+    python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its sweeps, to run one by one
 
-That is three seeds of every row that takes about five minutes or less on one core (`modelnet40_quick`), and one of the
+That is three seeds of every row that takes some minutes on one core (`modelnet40_quick`), and one of the
 others (`modelnet40_slow`), but for two that take hours by themselves (`thesis_tables.BY_HAND`). Add `--bfloat16` where
 /proc/cpuinfo lists avx512_bf16; elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others
 with fewer rows:

@@ -144,6 +144,8 @@ def test_each_sample_has_its_image_band_truth_and_prediction(tmp_path: Path) -> 
     for word in ("predicted density", "truth", "point prediction", "uniform density", "counter-clockwise"):
         assert text.count(word) == 1  # the legend stands once
     assert "equally true" not in text
+    assert text.count("Failed: one peak, sharper than half of all, more than 30° off.") == 1
+    assert "Failed: one peak" not in words(circles([bumps((1, 0, 5))], rows={"certain": 1}))
     assert "Densities (synthetic data)" in text
     drawn(figure, tmp_path)
 

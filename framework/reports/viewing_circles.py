@@ -100,7 +100,7 @@ def viewing_circles(
     density = np.exp(np.minimum(log_density.astype(np.float64), 700))  # beyond, float64 overflows
     if np.isnan(density).any():
         raise ValueError("wanted a log-density everywhere, got NaN.")
-    size = {"least": 3, "width": 2.5, "heights": (2.75,), "flat": (0.6875,), "margin": 1.3}
+    size = {"least": 3, "width": 2.5, "heights": (2.75,), "flat": (0.6875,), "margin": 1.5}
     figure, panels = sample_sheet(rows, **size, title=title, synthetic=synthetic)
     for sample, (axes,) in enumerate(panels):
         _viewing_circle(axes, images[sample], density[:, sample], angles, directions)
@@ -118,6 +118,10 @@ def viewing_circles(
         handles.append(Line2D([], [], color=GREEN, marker="^", ls="", mfc="none", label="equally true"))
     note = f"The object from above: {directions[0]} (0°)" if directions else "0°"
     note += " is at the bottom, angles turn counter-clockwise."
+    if "failed" in rows:
+        note += (
+            f"\nFailed: one peak, sharper than half of all, more than {math.degrees(LARGE_ERROR):.0f}° off."
+        )
     legend = figure.legend(handles=handles, title=note, loc="outside lower center", ncols=3, frameon=False)
     legend.get_title().set_parse_math(False)
     return figure
