@@ -2,7 +2,7 @@
 
     python benchmarks/thesis_tables.py 6.1-6.3          # with --tell it prints its sweeps, to run one by one
 
-That is three seeds of every row that takes some minutes on one core (`modelnet40_quick`), and one of the
+That is three seeds of every row that takes at most five minutes of one core (`modelnet40_quick`), and one of the
 others (`modelnet40_slow`), but for two that take hours by themselves (`thesis_tables.BY_HAND`). Add `--bfloat16` where
 /proc/cpuinfo lists avx512_bf16; elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others
 with fewer rows:
