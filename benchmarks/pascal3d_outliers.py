@@ -2,7 +2,7 @@
 
     python -m framework -m trainer.max_epochs=20 threads=1 hydra.sweep.dir=outputs/sweeps/outliers \\
         experiment=pascal3d_outliers/plain,...   (all of conf/experiment/pascal3d_outliers but base)
-    (and once more experiment=pascal3d_outliers/outlier_exposure objective.outlier_exposure.weight=0.05,1)
+    (and once more experiment=pascal3d_outliers/outlier_exposure objective.outlier_exposure.weight=1)
     python benchmarks/pascal3d_outliers.py outputs/sweeps/outliers
 
 Writes pascal3d_outliers.md beside this file.

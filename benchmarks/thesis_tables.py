@@ -27,6 +27,7 @@ from framework.reports.table import NOT_AVAILABLE, format_number
 HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/thesis_tables"
 SAID = ("pictures=false", "logger=none")
+FIGURES = "| 3.7-3.8 |"
 AT_ONCE = 2
 """Runs, for the minutes that the page says."""
 RUNS, MINUTES, PAGES = 3, 4, 5
@@ -114,6 +115,7 @@ TABLES = {
                 "data.angles=[pan]",
                 SMALL,
                 "density_head.backbones=each",
+                "seed=0,1,2",
             ),
             "caviar": (methods("caviar", "fixed_kappa", "von_mises", "mixture"), SHORTER),
             "towncentre": (methods("towncentre", "fixed_kappa", "von_mises", "mixture"), SHORTER),
@@ -215,11 +217,9 @@ def said(table: Table, jobs: int, bfloat16: bool) -> tuple[str, ...]:
 def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> tuple[list[list[str]], list[list[str]]]:
     """Of a table: its sweeps; its pages, which are made of them."""
     table = TABLES[name]
-    drawn = "seed=" + ",".join(str(seed) for seed in range(min(seeds, table.seeds)))
     found = [
         [
-            *(sys.executable, "-m", "framework", "-m", *words),
-            *(() if any(word.startswith("seed=") for word in words) else (drawn,)),
+            *(sys.executable, "-m", "framework", "-m", *with_seeds(words, seeds, table.seeds)),
             *said(table, jobs, bfloat16),
             *(f"hydra.launcher.jobs={jobs}", f"hydra.sweep.dir={folder_of(sweep)}"),
         ]
@@ -230,21 +230,28 @@ def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> tuple[list[lis
     return found, pages
 
 
+def with_seeds(words: Sequence[str], seeds: int, most: int) -> list[str]:
+    """What a multirun is told, its seeds too: of those that it names, or of as many as a table has at most."""
+    named = [word for word in words if word.startswith("seed=")]
+    drawn = options(named[0].partition("=")[2]) if named else [str(seed) for seed in range(most)]
+    return [*(word for word in words if word not in named), f"seed={','.join(drawn[:seeds])}"]
+
+
 def put_aside(sweep: str, words: Sequence[str]) -> None:
     """Move what ran under another definition of a table to a folder beside, where the table's page does not meet it.
 
     Args:
         sweep: its folder.
-        words: what its runs are told now; of any seed they belong to it.
+        words: what its runs are told now; where they name no seed, of any seed they belong to it.
     """
     asked = {key: options(told) for key, _, told in (word.partition("=") for word in words)}
     for path in sorted((FOLDER / sweep).glob("*/job.json")):
         job = record(path.parent)
         told = dict(word.split("=", 1) for word in job["overrides"])
-        told.pop("seed", None)
+        if "seed" not in asked:
+            told.pop("seed", None)
         if job["status"] == "running" or (
-            told.keys() == asked.keys() - {"seed"}
-            and all(value.lower() in asked[key] for key, value in told.items())
+            told.keys() == asked.keys() and all(value.lower() in asked[key] for key, value in told.items())
         ):
             continue
         for number in itertools.count():
@@ -296,7 +303,8 @@ def report(page: str, written: Mapping[str, float]) -> str:
             "|---|---|---|---:|---:|---:|---|",
             *lines,
             "",
-            f"Hours that the whole takes two cores: {format_number(hours(lines))}. "
+            f"Hours that the whole takes two cores: {format_number(hours(lines))}; without Figures 3.7 and 3.8 "
+            f"{format_number(hours([line for line in lines if not line.startswith(FIGURES)]))}. "
             f"{machine('torch', 'pytorch-lightning')}",
             "",
         ]

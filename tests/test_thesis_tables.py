@@ -78,8 +78,8 @@ def test_a_whole_is_told_of_tables_that_all_have_run() -> None:
 
 
 def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
-    """Each way in which a definition changes: a choice less, a setting more or less or other; never a seed."""
-    words = ("experiment=a/b,a/c", "data.angles=[pan],[tilt]", "seed=0", "pictures=false", "threads=1")
+    """Each way in which a definition changes: a choice less, a setting more or less or other, a seed that is named."""
+    words = ("experiment=a/b,a/c", "data.angles=[pan],[tilt]", "seed=0,7", "pictures=false", "threads=1")
     kept = [
         ["experiment=a/b", "data.angles=[pan]", "seed=0", "pictures=False", "threads=1"],
         ["experiment=a/c", "data.angles=[tilt]", "seed=7", "pictures=False", "threads=1"],
@@ -89,6 +89,7 @@ def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
         [*kept[0], "trainer.max_epochs=3"],
         [*kept[0][:2], *kept[0][3:4]],
         [*kept[0][:-1], "threads=2"],
+        [*kept[0][:2], "seed=1", *kept[0][3:]],
     ]
     for number, overrides in enumerate([*kept, *other]):
         job(runs / "a", number, overrides=overrides)
@@ -102,6 +103,13 @@ def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
     job(runs / "a", 2, overrides=other[0])
     thesis_tables.put_aside("a", words)
     assert len(list((runs / "aside").iterdir())) == len(other) + 1
+
+
+def test_where_no_seed_is_named_runs_of_every_seed_belong_to_the_table(runs: Path) -> None:
+    for seed in range(3):
+        job(runs / "a", seed, overrides=["experiment=a/b", f"seed={seed}"])
+    thesis_tables.put_aside("a", ["experiment=a/b"])
+    assert len(list((runs / "a").iterdir())) == 3
 
 
 def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
@@ -132,3 +140,16 @@ def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
 )
 def test_how_many_runs_a_sweep_has(words: tuple[str, ...], count: int) -> None:
     assert thesis_tables.choices(words, 5) == count
+
+
+@pytest.mark.parametrize(
+    "words, seeds, told",
+    [
+        ((), 9, "0,1,2"),
+        ((), 2, "0,1"),
+        (("seed=0,4",), 9, "0,4"),
+        (("seed=0,4",), 1, "0"),
+    ],
+)
+def test_no_more_seeds_than_asked_for_or_named(words: tuple[str, ...], seeds: int, told: str) -> None:
+    assert thesis_tables.with_seeds(("a=1,2", *words), seeds, 3) == ["a=1,2", f"seed={told}"]

@@ -219,7 +219,7 @@ def rows(
 
     Args:
         better: the metrics to tell of, and which way they are better; each gets a column "<key>_pareto", true
-            on the front beyond noise (`framework.evaluation.pareto.front`).
+            on the front of its own curve, beyond noise (`framework.evaluation.pareto.front`).
     """
     told = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
     found: list[dict[str, object]] = []
