@@ -131,3 +131,11 @@ def test_every_claim_has_evidence_a_verdict_and_a_command() -> None:
     assert f"{len(rows)} claims: {total[0]} hold, {total[1]} contradicted, {total[2]} open ({apart})." in text
     linked = re.findall(r"\]\(([^)]*)\)", text)
     assert linked and not [path for path in linked if not (CLAIMS.parent / path).exists()]
+
+
+def test_each_contradicted_claim_is_explained_once() -> None:
+    text = CLAIMS.read_text(encoding="utf-8")
+    contradicted = re.findall(r"(?m)^\| (\d-\d+) \|.*\| contradicted: [^|]*\| `[^`]*` \|$", text)
+    why = text.partition("\n## What is contradicted, and why\n")[2].partition("\n## ")[0]
+    heads = re.findall(r"(?m)^- \*\*([^*]*)\*\*", why)
+    assert sorted(re.findall(r"\d-\d+", " ".join(heads))) == sorted(contradicted)
