@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -63,3 +64,9 @@ def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
         if '"-m", "framework"' in (text := path.read_text(encoding="utf-8")) and "subprocess.run(" in text
     ]
     assert others == []
+
+
+def test_no_benchmark_hides_a_module() -> None:
+    """A script's folder comes first on its path, which torch's compiler hands on: of `encodings` Python starts."""
+    names = {path.stem for path in Path(ROOT, "benchmarks").glob("*.py")}
+    assert names & {*sys.stdlib_module_names, *packages_distributions()} == set()

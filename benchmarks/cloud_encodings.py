@@ -1,8 +1,9 @@
 """How encodings of a cloud move with it, what of a grid is empty, what stray points do (thesis §6.2, §6.4.1, §6.5.2).
 
-    python benchmarks/encodings.py
+    python benchmarks/cloud_encodings.py
 
-Writes encodings.md beside this file; a minute on one core. Shapes are the generated CAD models of data=modelnet40.
+Writes cloud_encodings.md beside this file; a minute on one core. Shapes are the generated CAD models of
+data=modelnet40.
 """
 
 import os
@@ -158,8 +159,8 @@ def main() -> None:
     }
     text = (
         "# How encodings move with the cloud (synthetic data)\n\n"
-        f"`python benchmarks/encodings.py`: {len(clouds)} synthetic CAD shapes of {POINTS} points, in the unit ball. "
-        "± is the standard error over shapes.\n\n"
+        f"`python benchmarks/cloud_encodings.py`: {len(clouds)} synthetic CAD shapes of {POINTS} points, in the unit "
+        "ball. ± is the standard error over shapes.\n\n"
         "**Shift and turn** (§6.4.1). The change of the features as a share of the mean distance between two shapes' "
         "features, for steps of so many radii or radians, and the power of the step by which its "
         "root mean square grows over the last decade: 1 is smooth, "
