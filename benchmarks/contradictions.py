@@ -3,8 +3,8 @@
     python benchmarks/thesis_tables.py            (first: it is compared with their runs)
     python benchmarks/contradictions.py
 
-About an hour of two cores; what has run in outputs/contradictions does not run again. Writes contradictions.md beside
-this file.
+Less than an hour of two cores; what has run in outputs/contradictions does not run again. Writes contradictions.md
+beside this file.
 """
 
 import json
@@ -31,8 +31,8 @@ HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/contradictions"
 NOISY = FOLDER / "noisy_heads"
 NOISE_DEG = 6.0
-"""Standard deviation of the angles' errors: with it the drawn heads' pan errs about as much as the thesis's."""
-COMMON = ("pictures=false", "logger=none", "threads=1", "hydra.launcher.jobs=2")
+"""Standard deviation of the angles' errors."""
+COMMON = (*thesis_tables.SAID, "threads=1")
 MOONS = {
     "ece": "ECE",
     "brier": "Brier",
@@ -212,9 +212,14 @@ def runs(part: Part, label: str) -> list[Path]:
     sweep, *words = part.rows[label]
     folder = (FOLDER if sweep == part.sweep else thesis_tables.FOLDER) / sweep
     paths = [path.parent for path in sorted(folder.glob("*/results.json"))]
-    found = [path for path in paths if set(words) <= set(record(path)["overrides"])]
+    told = {path: set(record(path)["overrides"]) for path in paths}
+    # what is compared has one precision
+    found = [path for path in paths if set(words) <= told[path] and thesis_tables.BFLOAT16 not in told[path]]
     if not found:
-        raise DataError(f"{folder}: no run of {' '.join(words)}; wanted one. Run thesis_tables.py first.")
+        raise DataError(
+            f"{folder}: no run of {' '.join(words) or 'it'} in float32; wanted one. Run thesis_tables.py first, "
+            "without --bfloat16."
+        )
     return found
 
 
@@ -242,8 +247,9 @@ def main() -> None:
                 runs(part, label)
     write_noisy_heads()
     for part in PARTS:
+        thesis_tables.put_aside(FOLDER / part.sweep, (*part.words, *COMMON))
         told = [sys.executable, "-m", "framework", "-m", *part.words, *COMMON]
-        carry_out([*told, f"hydra.sweep.dir={FOLDER / part.sweep}"])
+        carry_out([*told, "hydra.launcher.jobs=2", f"hydra.sweep.dir={FOLDER / part.sweep}"])
     text = (
         "# What contradicts the thesis, with the suspected cause changed (synthetic data)\n\n"
         "`python benchmarks/contradictions.py`. Numbers of the claims in [claims.md](claims.md), which draws the "

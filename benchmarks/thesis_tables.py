@@ -190,7 +190,7 @@ def main() -> None:
         sweeps, pages = commands(name, given.seeds, given.jobs, given.bfloat16)
         if not given.tell:
             for sweep, words in TABLES[name].sweeps.items():
-                put_aside(sweep, (*words, *said(TABLES[name], given.jobs, given.bfloat16)))
+                put_aside(FOLDER / sweep, (*words, *said(TABLES[name], given.jobs, given.bfloat16)))
         told(sweeps, run=not given.tell)
         began = time.perf_counter()
         told(pages, run=not given.tell)
@@ -237,30 +237,33 @@ def with_seeds(words: Sequence[str], seeds: int, most: int) -> list[str]:
     return [*(word for word in words if word not in named), f"seed={','.join(drawn[:seeds])}"]
 
 
-def put_aside(sweep: str, words: Sequence[str]) -> None:
-    """Move what ran under another definition of a table to a folder beside, where the table's page does not meet it.
+def put_aside(sweep: Path, words: Sequence[str]) -> None:
+    """Move what ran under another definition of a sweep to a folder beside, where no page meets it.
 
     Args:
         sweep: its folder.
         words: what its runs are told now; where they name no seed, of any seed they belong to it.
     """
     asked = {key: options(told) for key, _, told in (word.partition("=") for word in words)}
-    for path in sorted((FOLDER / sweep).glob("*/job.json")):
+    for path in sorted(sweep.glob("*/job.json")):
         job = record(path.parent)
         told = dict(word.split("=", 1) for word in job["overrides"])
         if "seed" not in asked:
             told.pop("seed", None)
         if job["status"] == "running" or (
-            told.keys() == asked.keys() and all(value.lower() in asked[key] for key, value in told.items())
+            told.keys() == asked.keys()
+            and all({value, value.lower()} & {*asked[key]} for key, value in told.items())
         ):
             continue
         for number in itertools.count():
-            aside = FOLDER / "aside" / f"{sweep}_{path.parent.name}_{number}"
+            aside = sweep.parent / "aside" / f"{sweep.name}_{path.parent.name}_{number}"
             if not aside.exists():
                 break
         aside.parent.mkdir(exist_ok=True)
         path.parent.rename(aside)
-        sys.stdout.write(f"{sweep}/{path.parent.name} is of another definition of the table: now {aside}\n")
+        sys.stdout.write(
+            f"{sweep.name}/{path.parent.name} is of another definition of the sweep: now {aside}\n"
+        )
 
 
 def folder_of(sweep: str) -> str:
@@ -347,8 +350,15 @@ def link(page: str) -> str:
 
 def choices(words: Sequence[str], seeds: int) -> int:
     """How many runs a multirun has."""
-    of_each = [len(options(word.partition("=")[2])) for word in words]
-    return math.prod(of_each) * (1 if any(word.startswith("seed=") for word in words) else seeds)
+    return len(each(words)) * (1 if any(word.startswith("seed=") for word in words) else seeds)
+
+
+def each(words: Sequence[str]) -> list[list[str]]:
+    """What every run of a multirun is told, in Hydra's order."""
+    taken = [(key, options(told)) for key, _, told in (word.partition("=") for word in words)]
+    return [
+        list(run) for run in itertools.product(*([f"{key}={one}" for one in told] for key, told in taken))
+    ]
 
 
 def options(told: str) -> list[str]:

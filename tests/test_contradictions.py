@@ -1,8 +1,6 @@
 """What `benchmarks/contradictions.py` compares is run, by itself or by the tables, and all that it runs is compared."""
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -11,24 +9,15 @@ from benchmarks import thesis_tables
 from benchmarks.contradictions import NOISE_DEG, PARTS, Part, wrong
 
 
-def runs(words: Sequence[str]) -> Iterator[set[str]]:
-    """What each run of a multirun is told."""
-    choices = [
-        (key, thesis_tables.options(values)) for key, _, values in (word.partition("=") for word in words)
-    ]
-    for values in itertools.product(*(values for _, values in choices)):
-        yield {f"{key}={value}" for (key, _), value in zip(choices, values, strict=True)}
-
-
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.sweep)
 def test_rows_are_runs_that_are_made_and_no_run_is_left_out(part: Part) -> None:
     sweeps = {name: words for table in thesis_tables.TABLES.values() for name, words in table.sweeps.items()}
     assert part.sweep not in sweeps
     sweeps[part.sweep] = part.words
     for label, (sweep, *words) in part.rows.items():
-        assert any(set(words) <= told for told in runs(sweeps[sweep])), label
+        assert any(set(words) <= set(told) for told in thesis_tables.each(sweeps[sweep])), label
     own = [set(words) for sweep, *words in part.rows.values() if sweep == part.sweep]
-    assert all(sum(words <= told for words in own) == 1 for told in runs(part.words))
+    assert all(sum(words <= set(told) for words in own) == 1 for told in thesis_tables.each(part.words))
 
 
 def test_errors_of_labels_have_their_spread() -> None:

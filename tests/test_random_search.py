@@ -394,12 +394,14 @@ def test_a_metric_of_the_results_ranks_its_own_way(
         comparison.rank(tmp_path, given, [], "acuracy")
 
 
-def completed(home: Path, overrides: list[str], data: str = "d", milliseconds: float = 1.0) -> None:
+def completed(
+    home: Path, overrides: list[str], data: str = "d", milliseconds: float = 1.0, seed: int = 0
+) -> None:
     """Leave in `home` what a job leaves."""
     results = {
         "method": "m",
         "data": data,
-        "seed": 0,
+        "seed": seed,
         "milliseconds_per_sample": milliseconds,
         "batch_size": 15,
         "columns": {},
@@ -428,6 +430,20 @@ def test_jobs_of_two_commands_in_one_folder_are_told_apart(tmp_path: Path) -> No
     rows = compared(tmp_path, ("d", ["x=1", "size=32"]), ("d", ["x=1", "size=16"]), ("d", ["x=1"]))
     assert [row["size"] for row in rows] == ["32", "16", ""]
     assert [float(row["milliseconds_per_sample"]) for row in rows] == [1.0, 2.0, 3.0]
+
+
+def test_a_setting_that_only_one_of_two_commands_names_tells_their_jobs_apart(tmp_path: Path) -> None:
+    jobs = ("d", ["x=1", "seed=0", "threads=1"]), ("d", ["x=1", "seed=0", "threads=1", "size=16"])
+    rows = compared(tmp_path, *jobs)
+    assert [row["size"] for row in rows] == ["", "16"]
+    assert "threads" not in rows[0]
+
+
+def test_seeds_that_another_command_adds_are_the_same_row_whatever_else_it_names(tmp_path: Path) -> None:
+    completed(tmp_path / "0", ["x=1", "seed=0"])
+    completed(tmp_path / "1", ["x=1", "seed=1", "logger=none"], seed=1, milliseconds=3.0)
+    rows = table(tmp_path, ["x=1", "seed=1", "logger=none"])
+    assert [float(row["milliseconds_per_sample"]) for row in rows] == [2.0]
 
 
 def test_what_the_data_column_says_already_is_left_out(tmp_path: Path) -> None:

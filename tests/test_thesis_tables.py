@@ -79,10 +79,10 @@ def test_a_whole_is_told_of_tables_that_all_have_run() -> None:
 
 def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
     """Each way in which a definition changes: a choice less, a setting more or less or other, a seed that is named."""
-    words = ("experiment=a/b,a/c", "data.angles=[pan],[tilt]", "seed=0,7", "pictures=false", "threads=1")
+    words = ("experiment=a/b,a/c", "data.angles=[pan],[Tilt]", "seed=0,7", "pictures=false", "threads=1")
     kept = [
         ["experiment=a/b", "data.angles=[pan]", "seed=0", "pictures=False", "threads=1"],
-        ["experiment=a/c", "data.angles=[tilt]", "seed=7", "pictures=False", "threads=1"],
+        ["experiment=a/c", "data.angles=[Tilt]", "seed=7", "pictures=False", "threads=1"],
     ]
     other = [
         ["experiment=a/d", *kept[0][1:]],
@@ -96,19 +96,19 @@ def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
     job(runs / "a", 9, overrides=other[0], status="running", ended=None)
     job(runs / "b", 0, overrides=other[0])
     for _ in range(2):
-        thesis_tables.put_aside("a", words)
+        thesis_tables.put_aside(runs / "a", words)
         assert sorted(path.name for path in (runs / "a").iterdir()) == ["0", "1", "9"]
         assert len(list((runs / "aside").iterdir())) == len(other)
         assert (runs / "b" / "0").exists()
     job(runs / "a", 2, overrides=other[0])
-    thesis_tables.put_aside("a", words)
+    thesis_tables.put_aside(runs / "a", words)
     assert len(list((runs / "aside").iterdir())) == len(other) + 1
 
 
 def test_where_no_seed_is_named_runs_of_every_seed_belong_to_the_table(runs: Path) -> None:
     for seed in range(3):
         job(runs / "a", seed, overrides=["experiment=a/b", f"seed={seed}"])
-    thesis_tables.put_aside("a", ["experiment=a/b"])
+    thesis_tables.put_aside(runs / "a", ["experiment=a/b"])
     assert len(list((runs / "a").iterdir())) == 3
 
 
@@ -118,13 +118,11 @@ def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
         for jobs, bfloat16 in itertools.product((1, 2), (False, True)):
             for command in thesis_tables.commands(name, 5, jobs, bfloat16)[0]:
                 folder = runs / Path(command[-1].partition("=")[2]).name
-                told = [word.partition("=") for word in command[4:] if not word.startswith("hydra.")]
-                many = itertools.product(*(thesis_tables.options(value) for _, _, value in told))
-                for number, values in enumerate(many):
-                    overrides = [f"{key}={value}" for (key, _, _), value in zip(told, values, strict=True)]
+                told = [word for word in command[4:] if not word.startswith("hydra.")]
+                for number, overrides in enumerate(thesis_tables.each(told)):
                     job(folder, number, overrides=overrides)
                 words = (*table.sweeps[folder.name], *thesis_tables.said(table, jobs, bfloat16))
-                thesis_tables.put_aside(folder.name, words)
+                thesis_tables.put_aside(folder, words)
                 assert len(list(folder.iterdir())) == number + 1
                 shutil.rmtree(folder)
 

@@ -88,7 +88,10 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
     said = ""
     if rows:
         # also those of another command's jobs in this folder: what tells rows apart must be told
-        keys = _varied([*overrides, *(row["overrides"] for row in rows)])
+        everything = [*overrides, *(row["overrides"] for row in rows)]
+        keys = _varied(everything)
+        if _repeated(rows, keys):  # a setting that one command leaves at its default
+            keys = _varied(everything, absent=True)
         rows = [{**dict.fromkeys(keys), **row} for row in rows]
         shown = (key for key in keys if key not in ("seed", "experiment") and not _repeats_data(rows, key))
         by = ["method", "data", *shown]
@@ -249,14 +252,24 @@ def _row(job: Path) -> dict[str, Any] | None:
     return row
 
 
-def _varied(overrides: Sequence[Sequence[str]]) -> list[str]:
-    """The keys that differ between jobs, in the order given."""
-    seen: dict[str, set[str]] = {}
+def _varied(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
+    """The keys that differ between jobs, in the order given; with `absent` those also that only some jobs have."""
+    seen: dict[str, list[str]] = {}
     for job in overrides:
         for override in job:
             key, _, value = override.lstrip("+~").partition("=")
-            seen.setdefault(key, set()).add(value)
-    return [key for key, values in seen.items() if len(values) > 1]
+            seen.setdefault(key, []).append(value)
+    return [
+        key
+        for key, values in seen.items()
+        if len(set(values)) > 1 or (absent and len(values) < len(overrides))
+    ]
+
+
+def _repeated(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> bool:
+    """Whether two rows are the same but for what they found."""
+    told = [tuple(row.get(key) for key in ("method", "data", "seed", *keys)) for row in rows]
+    return len(set(told)) < len(told)
 
 
 def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
