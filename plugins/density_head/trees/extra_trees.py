@@ -24,6 +24,7 @@ from plugins.density_head.trees.heads_without_gradient import (
     single,
     with_gradient_of_0,
 )
+from plugins.density_head.trees.stored_forest import require_forest
 
 INTEGERS = ("feature", "branch", "root", "start", "label", "count")
 ROUNDS = 200
@@ -94,15 +95,15 @@ class ExtraTreesHead(DensityHead, Fitted):
         self.share, self.leaf, self.depth = features, leaf, depth
         self.smoothing = smoothing
         self.unit = Unit.of(target)
-        numbers = 0 if self.classes else len(target.names)
+        self.numbers = 0 if self.classes else len(target.names)
         for name in INTEGERS:
             self.register_buffer(name, torch.zeros(0, dtype=torch.int32))
         self.register_buffer("threshold", torch.zeros(0))
-        self.register_buffer("mean", torch.zeros(0, numbers, dtype=torch.float64))
-        self.register_buffer("width", torch.ones(numbers, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(0, self.numbers, dtype=torch.float64))
+        self.register_buffer("width", torch.ones(self.numbers, dtype=torch.float64))
         self.register_buffer("read", torch.zeros((), dtype=torch.int64))
         self.size = 0
-        load_any_shape(self, ExtraTreesHead._open)
+        load_any_shape(self, ExtraTreesHead._require, ExtraTreesHead._open)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         from plugins.density_head.trees.growing import (
@@ -160,6 +161,9 @@ class ExtraTreesHead(DensityHead, Fitted):
         assert isinstance(density, Mixture)
         means, target = map(self.unit.standardised, (density.components.mean, target.double()))
         self.width.copy_(fitted_width(target.unsqueeze(1) - means))  # (sample, tree, number)
+
+    def _require(self, arrays: Mapping[str, np.ndarray]) -> None:
+        require_forest(arrays, self.classes, self.numbers)
 
     def _open(self, *_: Any) -> None:
         """Read how many features the stored forest asks for."""

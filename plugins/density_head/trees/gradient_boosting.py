@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 import torch
 import xgboost
 from jaxtyping import Float
@@ -23,6 +24,8 @@ from plugins.density_head.trees.heads_without_gradient import (
     single,
     with_gradient_of_0,
 )
+from plugins.density_head.trees.stored_boosting import require_boosting
+from plugins.density_head.trees.stored_forest import require_widths
 
 Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -104,7 +107,7 @@ class XGBoostHead(DensityHead, Fitted):
         self.register_buffer("read", torch.zeros((), dtype=torch.int64))
         self.size = 0
         self.booster: xgboost.Booster | None = None
-        load_any_shape(self, XGBoostHead._open)
+        load_any_shape(self, XGBoostHead._require, XGBoostHead._open)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         options: dict[str, Any] = {
@@ -157,6 +160,19 @@ class XGBoostHead(DensityHead, Fitted):
             single(raw).numpy(), iteration_range=(0, rounds), predict_type="margin"
         )
         return torch.from_numpy(found).reshape(len(raw), self.numbers)
+
+    def _require(self, arrays: Mapping[str, np.ndarray]) -> None:
+        content, size = arrays["model"], arrays["read"]
+        if (
+            content.ndim != 1
+            or size.ndim != 0
+            or not 0 <= int(size) < 2**31
+            or bool(len(content)) != bool(size)
+        ):
+            raise ValueError("model and read are no row of bytes and the number of features that they read")
+        if len(content):
+            require_boosting(content.tobytes(), self.classes, self.numbers, int(size))
+        require_widths(arrays["width"], 0 if self.classes else self.numbers)
 
     def _open(self, *_: Any) -> None:
         """Read the stored model."""

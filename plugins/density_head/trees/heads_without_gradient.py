@@ -1,13 +1,15 @@
 """What heads without gradient share (framework.density_head.Fitted): state of any shape, inputs, and refusals."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from framework.errors import ConfigError, UserError
+from framework.errors import CheckpointError, ConfigError, UserError, shown
 from framework.heads.parameters import require_finite
 from framework.target import Target
 
@@ -58,19 +60,54 @@ def with_gradient_of_0(
     return numbers + zero.reshape(*zero.shape, *(1,) * (numbers.dim() - zero.dim()))
 
 
-def load_any_shape(head: nn.Module, then: Callable[[Any, Any], None]) -> None:
+Arrays = Mapping[str, np.ndarray]
+
+
+def load_any_shape(
+    head: nn.Module, require: Callable[[Any, Arrays], None], then: Callable[[Any, Any], None]
+) -> None:
     """Let `load_state_dict` give the head's own buffers the shapes they have in the state, and call `then` afterwards.
 
+    A state is a stranger's: of its arrays nothing is taken before `require` has seen them all.
+
     Args:
+        require: given the head and the arrays that it would have, with the types of its buffers; raises a ValueError
+            with a clause that says what is wrong where they do not fit.
         then: given the head and torch's lists of missing and unexpected keys; reads what was loaded.
     """
-    head.register_load_state_dict_pre_hook(_take_shapes)
+    head.register_load_state_dict_pre_hook(partial(_take_shapes, require))
     head.register_load_state_dict_post_hook(then)
 
 
-def _take_shapes(head: nn.Module, state: Mapping[str, Shaped[Tensor, "..."]], prefix: str, *_: Any) -> None:
-    """Buffers of a state's shapes, of their own type and device; torch copies the numbers afterwards."""
-    for name, buffer in head.named_buffers(recurse=False):
-        if prefix + name in state:
-            shape = state[prefix + name].shape
-            setattr(head, name, torch.empty(shape, dtype=buffer.dtype, device=buffer.device))
+def _take_shapes(
+    require: Callable[[Any, Arrays], None],
+    head: nn.Module,
+    state: Mapping[str, Any],
+    prefix: str,
+    *_: Any,
+) -> None:
+    """Buffers of a state's shapes, of their own type and device; torch copies the numbers afterwards.
+
+    Raises:
+        CheckpointError: the state is not of such a head.
+    """
+    own = dict(head.named_buffers(recurse=False))
+    stored = {name: state.get(prefix + name, buffer) for name, buffer in own.items()}
+    try:
+        require(head, {name: _array(name, stored[name], buffer) for name, buffer in own.items()})
+    except ValueError as error:
+        raise CheckpointError(
+            f"The state of {type(head).__name__} is damaged: {shown(error)}. Load another checkpoint, or train anew."
+        ) from None
+    for name, buffer in own.items():
+        setattr(head, name, torch.empty(stored[name].shape, dtype=buffer.dtype, device=buffer.device))
+
+
+def _array(name: str, found: Any, buffer: Tensor) -> np.ndarray:
+    """What a buffer will hold; floating-point numbers may be of another width, as a model's that was cast."""
+    if not isinstance(found, Tensor) or found.layout != torch.strided or found.is_quantized:
+        raise ValueError(f"{name} is no array of numbers")
+    if found.dtype != buffer.dtype and not (found.is_floating_point() and buffer.is_floating_point()):
+        raise ValueError(f"{name} holds numbers of type {found.dtype}; wanted {buffer.dtype}")
+    found = found.detach().to("cpu", buffer.dtype)
+    return (found.float() if found.dtype == torch.bfloat16 else found).numpy()  # NumPy has no bfloat16

@@ -73,7 +73,7 @@ class Sized(torch.nn.Module):
         super().__init__()
         self.register_buffer("numbers", torch.arange(count, dtype=torch.int32))
         self.seen = []
-        load_any_shape(self, lambda head, _: head.seen.append(head.numbers.tolist()))
+        load_any_shape(self, lambda head, _: None, lambda head, _: head.seen.append(head.numbers.tolist()))
 
 
 def test_a_state_of_another_shape_is_taken_and_then_read():
@@ -85,7 +85,7 @@ def test_a_state_of_another_shape_is_taken_and_then_read():
     twin.load_state_dict(torch.nn.Sequential(Sized(3), Sized(2)).state_dict())
     assert twin[0].numbers.tolist() == [0, 1, 2] and holder[0].numbers.tolist() == [0, 1, 2, 3, 4]
     with pytest.raises(RuntimeError, match="Missing key"):
-        holder.load_state_dict({"0.numbers": torch.zeros(1)})
+        holder.load_state_dict({"0.numbers": torch.zeros(1, dtype=torch.int32)})
 
 
 NAMES = ("extra_trees", "xgboost")
