@@ -294,10 +294,12 @@ class _Plain:
                 _line(part, "iu") for part in state.get("coords", (state.get("row"), state.get("col")))
             )
         else:
-            starts, inner = _line(state["indptr"], "iu").astype(np.int64), _line(state["indices"], "iu")
+            starts, inner = _line(state["indptr"], "iu"), _line(state["indices"], "iu")
             lines = columns if kind == "csc" else rows
-            counts = np.diff(starts)
-            if len(starts) != lines + 1 or starts[0] != 0 or starts[-1] != len(data) or (counts < 0).any():
+            # bounded before they are cast or subtracted: either is modulo 2^64, and `repeat` adds its counts up
+            bounded = len(starts) == lines + 1 and starts.min() >= 0 and starts.max() <= len(data)
+            counts = np.diff(starts.astype(np.int64)) if bounded else np.array([-1])
+            if not bounded or starts[0] != 0 or starts[-1] != len(data) or (counts < 0).any():
                 _refuse(
                     f"a sparse matrix of {lines} lines whose beginnings do not rise from 0 to {len(data)}"
                 )
