@@ -1,20 +1,19 @@
 """What a checkpoint says of its model beside the weights: enough to build it again, to feed it and to name it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any, get_args
 
 from framework.configuration.assembly import Resolved
-from framework.configuration.schema import resolve
+from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
-from framework.errors import CheckpointError
+from framework.errors import CheckpointError, quoted
+from framework.storage.limits import LONGEST_NAME, MOST_DRAWN, MOST_DRAWS, MOST_INPUT, MOST_NAMES, MOST_SIDES
 from framework.target import Kind, Target
 
-LONGEST_NAME = 1000
-"""Letters of a target's name."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
 """Settings that a later test of the model repeats, so that it gives the numbers of the model's own run."""
 
@@ -93,29 +92,70 @@ class Description:
                 f"{path} was not written by this framework (it holds no model description of format 1). "
                 "Give a run folder, or a checkpoint from its checkpoints/."
             )
+        target = stored_target(stored["target"])
         return cls(
             checked(stored["config"]),
-            stored_target(stored["target"]),
-            tuple(map(int, stored["input_shape"])),
-            tuple(map(str, stored.get("columns", ()))),
+            target,
+            stored_shape(stored["input_shape"]),
+            stored_names(stored.get("columns", ()), "columns"),
             bool(stored.get("synthetic", False)),
             str(stored.get("method", "")),
-            {key: value for key, value in dict(stored.get("settings", {})).items() if key in INHERITED},
+            stored_settings(stored.get("settings", {}), target),
             dict(stored.get("data_state", {})),
             path,
         )
 
 
+def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
+    """The shape of an input; a ValueError where it is none, or of more than MOST_INPUT numbers."""
+    shape = tuple(map(int, stored[: MOST_SIDES + 1]))
+    if len(shape) > MOST_SIDES or min(shape, default=0) < 0 or math.prod(shape) > MOST_INPUT:
+        raise ValueError(
+            f"inputs of shape {quoted(list(shape))}; at most {MOST_SIDES} sides, and {MOST_INPUT} numbers in all"
+        )
+    return shape
+
+
+def stored_names(stored: Sequence[Any], what: str) -> tuple[str, ...]:
+    """Names of columns or of a target; a ValueError where they are too many, or too long."""
+    if len(stored) > MOST_NAMES:
+        raise ValueError(f"{len(stored)} {what}; at most {MOST_NAMES}")
+    names = tuple(map(str, stored))
+    if any(len(name) > LONGEST_NAME for name in names):
+        raise ValueError(f"{what} of more than {LONGEST_NAME} letters")
+    return names
+
+
+def stored_settings(stored: Mapping[str, Any], target: Target) -> dict[str, Any]:
+    """Those `INHERITED`, as the command line takes them; a ValueError where `samples` would fill any memory.
+
+    Raises:
+        ConfigError: a value is of the wrong type or range.
+    """
+    kept = {key: value for key, value in dict(stored).items() if key in INHERITED}
+    values = check(Settings, kept, "settings")
+    samples, numbers = values["samples"], math.prod(target.event_shape)
+    if samples > MOST_DRAWS or samples * numbers > max(MOST_DRAWN, 1000 * numbers):
+        raise ValueError(
+            f"settings.samples = {samples}; at most {MOST_DRAWS}, and {MOST_DRAWN} numbers in all"
+        )
+    return {key: values[key] for key in kept}
+
+
 def stored_target(stored: Mapping[str, Any]) -> Target:
     """What is predicted; a ValueError where that is no target."""
-    kind, names = stored["kind"], tuple(map(str, stored["names"]))
+    kind, names = stored["kind"], stored_names(stored["names"], "names of a target")
     location, scale = (tuple(map(float, stored.get(key, ()))) for key in ("location", "scale"))
     sizes = {len(location), len(scale)}
     size = tuple(map(int, stored.get("size", ())))
-    if kind not in get_args(Kind) or any(len(name) > LONGEST_NAME for name in names):
-        raise ValueError(f"a target of kind {kind!r} with the names {names}")
+    if kind not in get_args(Kind):
+        raise ValueError(f"a target of kind {quoted(kind)} with the names {quoted(names)}")
     if len(size) != 2 * (kind == "image") or min(size, default=1) < 1:
-        raise ValueError(f"a target of kind {kind!r} and of size {size}")
+        raise ValueError(f"a target of kind {kind!r} and of size {quoted(size)}")
+    if math.prod(size) * len(names) > MOST_INPUT:
+        raise ValueError(
+            f"a target of size {quoted(size)} and {len(names)} numbers; at most {MOST_INPUT} in all"
+        )
     if (
         sizes not in ({0}, {len(names)})
         or not all(map(math.isfinite, location + scale))

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from threading import get_ident
 from typing import Any
 
 import torch
@@ -17,7 +18,8 @@ from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
 from framework.distributions.moved import Moved
 from framework.errors import CheckpointError
-from framework.model import Predictor
+from framework.model import FrozenFrontEnd, Predictor
+from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
 from framework.storage.reading import guarded
 from framework.storage.weights import describe_mismatch
@@ -45,7 +47,7 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     predictor, description = load_with_description(run_or_checkpoint, uri=uri)
     predictor.description = description
     user = User(reader(description))
-    predictor.register_forward_pre_hook(user.asks)
+    predictor.register_forward_pre_hook(user.asks, prepend=True)  # before what looks at inputs
     predictor.register_forward_hook(user.hears)
     return predictor
 
@@ -125,9 +127,46 @@ def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
             # the checkpoint holds the weights now; the file they were started from may be gone
             part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
         shape, columns = description.input_shape, description.columns
-        predictor = build_predictor(parts, description.target, shape, 0, columns)
-        fill(predictor, state, description.path)
+        with budget.building(description.path, state.values()):
+            predictor = build_predictor(parts, description.target, shape, 0, columns)
+            fill(predictor, state, description.path)
+    bounded_at_first(predictor, description.path)
     return predictor.eval()
+
+
+def bounded_at_first(predictor: Predictor, path: str) -> None:
+    """Let the first prediction of a stored model end in an error before it takes far more memory than the weights and
+    inputs account for (`budget.predicting`)."""
+    # of one with fixed encoders in front each is called apart, by the frozen form
+    split = isinstance(predictor, FrozenFrontEnd)
+    for module in (predictor.encoders, predictor.predictor) if split else (predictor,):
+        first = FirstPrediction(path)
+        module.register_forward_pre_hook(first.begins)
+        module.register_forward_hook(first.ends, always_call=True)
+
+
+class FirstPrediction:
+    """The hooks of `bounded_at_first`; later predictions for as many samples do nothing with them.
+
+    Args:
+        path: the checkpoint.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.bounded = 0  # rows of the largest batch that was predicted for
+        self.active: dict[int, budget.Budget] = {}  # by thread
+
+    def begins(self, module: nn.Module, given: tuple[Any, ...]) -> None:
+        if isinstance(given[0], Tensor) and len(given[0]) > self.bounded:
+            active = budget.predicting(self.path, module.state_dict().values(), given[0])
+            self.active[get_ident()] = active.__enter__()
+
+    def ends(self, module: nn.Module, given: tuple[Any, ...], density: Any) -> None:
+        active = self.active.pop(get_ident(), None)
+        if active is not None:
+            active.__exit__(None, None, None)
+            self.bounded = max(self.bounded, len(given[0]) if density is not None else 0)
 
 
 def weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:

@@ -1,0 +1,38 @@
+"""The table of limits: what a stranger's file may make this program take. Every reader takes its bounds from here.
+
+A bound is checked before anything is allocated. Most are far above what sound files need, and low enough that a file of
+a few megabytes ends in less than 1 GB and 5 s, in a model or in a sentence.
+"""
+
+# what a checkpoint describes
+
+BUILDING_TIMES, BUILDING_BYTES = 8, 2**27
+"""Memory that building a stored model may hold: so many times its weights, and so many bytes beside.
+
+Members that are laid side by side are allocated twice, orthogonal first weights three times; bases of point sets and
+tables of constants need no weights.
+"""
+CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 30_000
+"""Operations of torch for building a stored model: so many for each tensor of its weights, and so many beside.
+
+A layer takes about ten; the second number takes less than a second.
+"""
+PREDICTING_TIMES, PREDICTING_BYTES, PREDICTING_ROW = 8, 2**27, 2**26
+"""Memory that the first prediction of a stored model may hold: so many times its weights and inputs, so many bytes
+beside, and so many for each sample, an occupancy grid of side 256 say.
+"""
+SMALL_RESULT = 2**17
+"""Numbers, or bytes, of a result that nobody counts: its size is not computed before it is there."""
+MOST_INPUT = 2**24
+"""Numbers of one input, or of one target, that a checkpoint may describe: an image of 2,364 × 2,364 in colour.
+
+A user's file of any size is scaled to an input of this size, so that it is the checkpoint that asks for the memory.
+"""
+MOST_SIDES = 8
+"""Dimensions of one input."""
+MOST_NAMES, LONGEST_NAME = 100_000, 1000
+"""Names of numbers, classes or columns in a checkpoint, and letters of one."""
+MOST_DRAWS = 2**17
+"""Samples of a density that a stored setting may ask for; the usual number is 1000."""
+MOST_DRAWN = 2**26
+"""Numbers that all of them together may be, of one density; up to 1000 samples may be of any density."""
