@@ -1,36 +1,13 @@
 """Where a result comes from: the code's commit, the versions of its packages, its config."""
 
 import platform
-import subprocess
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 from framework.configuration.registry import GROUPS, installed
+from framework.runs.repository import git_commit as git_commit
 
 _PACKAGES = ("torch", "pytorch-lightning", "hydra-core", "omegaconf", "numpy", "mlflow")
-
-
-def git_commit(folder: Path) -> dict[str, str]:
-    """Of the repository around a folder `commit` (40 hex digits) and `dirty` ("true": tracked files differ).
-
-    Empty where the folder is in no repository, the repository has no commit, or git is missing or hangs.
-    """
-    commit = _git(folder, "rev-parse", "--verify", "HEAD")
-    if commit is None:
-        return {}
-    changes = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return {"commit": commit} if changes is None else {"commit": commit, "dirty": str(bool(changes)).lower()}
-
-
-def _git(folder: Path, *arguments: str) -> str | None:
-    # --no-optional-locks: a status that refreshed the index would get in the way of the user's own git.
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()
 
 
 def package_versions() -> dict[str, str]:
