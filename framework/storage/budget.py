@@ -3,17 +3,20 @@
 A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. That the weights do not fit is found when they are
 copied into the model, which must be built first. Here every operation of torch is looked at before it runs: what it
 would allocate is computed from shapes alone, and an error ends the building while the memory is still free.
+
+The sizes have formulas here. torch computes shapes too, on its device "meta", but imports its compiler for some, 0.9 s.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_iter, tree_map_only
+from torch.utils._pytree import tree_iter
 
 from framework.errors import CheckpointError
 from framework.storage import limits
@@ -36,6 +39,10 @@ class Budget(TorchDispatchMode):
         self.path, self.most_bytes, self.calls = path, most_bytes, most_calls
         self.held: list[tuple[StorageWeakRef, int]] = []
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # torch would import its compiler, 0.9 s, to leave alone what nobody compiles
+
     def __torch_dispatch__(
         self,
         func: Any,
@@ -47,25 +54,23 @@ class Budget(TorchDispatchMode):
         self.calls -= 1
         if self.calls < 0:
             raise self._refusal("far more layers or steps")
-        if not _allocates(func) or not _may_be_large(args, given):
+        size = result_bytes(func, args, given)
+        if size <= limits.SMALL_RESULT:
             return func(*args, **given)
-        size = _result_bytes(func, args, given)
-        if size > limits.SMALL_RESULT:
-            self.held = [(storage, held) for storage, held in self.held if not storage.expired()]
-            if size + sum(held for _, held in self.held) > self.most_bytes:
-                raise self._refusal(f"more memory (at last a tensor of {size / 1e6:.4g} MB)")
+        self.held = [(storage, held) for storage, held in self.held if not storage.expired()]
+        if size + sum(held for _, held in self.held) > self.most_bytes:
+            raise self._refusal(f"far more memory (at last a tensor of {size / 1e6:.4g} MB)")
         found = func(*args, **given)
-        if size > limits.SMALL_RESULT:
-            for one in tree_iter(found):
-                if isinstance(one, Tensor) and one.layout is torch.strided:
-                    storage = one.untyped_storage()
-                    self.held.append((StorageWeakRef(storage), storage.nbytes()))
+        for one in tree_iter(found):
+            if isinstance(one, Tensor) and one.layout is torch.strided:
+                storage = one.untyped_storage()
+                self.held.append((StorageWeakRef(storage), storage.nbytes()))
         return found
 
     def _refusal(self, what: str) -> CheckpointError:
         return CheckpointError(
-            f"{self.path} describes a model that takes {what} than its weights and inputs account for. "
-            "Training writes no such file: get it again from where it comes."
+            f"{self.path} describes a model that takes {what} than its weights and inputs account for. Training "
+            "writes no such file: get it again from where it comes."
         )
 
 
@@ -96,39 +101,115 @@ def stored_bytes(tensors: Iterable[Tensor]) -> int:
     return sum(storages.values())
 
 
-def _allocates(func: Any) -> bool:
-    """Whether results of an operation have memory of their own."""
-    return any(result.alias_info is None for result in func._schema.returns)
+def result_bytes(func: Any, args: tuple[Any, ...], given: Mapping[str, Any]) -> int:
+    """What an operation allocates for its result, in bytes, computed before it runs.
 
-
-def _may_be_large(args: tuple[Any, ...], given: dict[str, Any]) -> bool:
-    """Whether shapes and numbers are such that results could be large: small ones are not worth the look."""
-    size: int | float = 1
-    for item in tree_iter((args, given)):
-        if isinstance(item, Tensor):
-            size *= max(item.numel(), 1)
-        elif isinstance(item, int | float) and not isinstance(item, bool) and not -1 <= item <= 1:
-            size *= abs(item)
-        if size > limits.SMALL_RESULT:
-            return True
-    return False
-
-
-def _result_bytes(func: Any, args: tuple[Any, ...], given: dict[str, Any]) -> int:
-    """What an operation would allocate, computed of shapes; 0 where numbers decide it."""
-    args, given = tree_map_only(Tensor, _shape_only, (args, dict(given)))
-    args, given = tree_map_only(torch.Generator, lambda _: None, (args, given))
-    if any(argument.name == "device" for argument in func._schema.arguments):
-        given["device"] = torch.device("meta")
-    given.pop("pin_memory", None)
-    try:
-        found = func(*args, **given)
-    except (
-        Exception
-    ):  # such results are no larger than what comes in, and wrong arguments fail where they are used
+    Operations without a formula count as much as they are given: their results are no larger, or their shapes hang on
+    numbers.
+    """
+    schema = func._schema
+    if all(result.alias_info is not None for result in schema.returns):
         return 0
-    return sum(one.numel() * one.element_size() for one in tree_iter(found) if isinstance(one, Tensor))
+    called = {argument.name: value for argument, value in zip(schema.arguments, args, strict=False)} | dict(
+        given
+    )
+    tensors = [item for item in tree_iter((args, dict(given))) if isinstance(item, Tensor)]
+    width = max((one.element_size() for one in tensors), default=torch.get_default_dtype().itemsize)
+    if isinstance(called.get("dtype"), torch.dtype):
+        width = called["dtype"].itemsize
+    formula = _FORMULAS.get(schema.name.removeprefix("aten::"))
+    try:
+        if formula is not None:
+            return int(width * formula(called))
+        if torch.Tag.pointwise in func.tags:
+            return width * math.prod(np.broadcast_shapes(*(one.shape for one in tensors)))
+        if "size" in called and schema.name not in _SAME_SIZE:
+            return width * math.prod(map(int, called["size"]))
+    except (ArithmeticError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
+        pass  # wrong arguments: the operation itself says so
+    return width * sum(one.numel() for one in tensors)
 
 
-def _shape_only(tensor: Tensor) -> Tensor:
-    return torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")
+_SAME_SIZE = ("aten::_unsafe_view", "aten::_reshape_copy", "aten::view_copy", "aten::expand_copy")
+
+
+def _matrices(called: Mapping[str, Any]) -> int:
+    added = next((names for names in (("mat1", "mat2"), ("batch1", "batch2")) if names[0] in called), None)
+    first, second = (called[name] for name in added or ("self", "mat2"))
+    return math.prod(first.shape[:-1]) * second.shape[-1]
+
+
+def _convolution(called: Mapping[str, Any]) -> int:
+    inputs, weight = called["input"], called["weight"]
+    groups, turned = called.get("groups", 1), called.get("transposed", False)
+    sides = inputs.shape[2:]
+    stride, padding, dilation, more = (
+        _each(called.get(name, usual), len(sides))
+        for name, usual in (("stride", 1), ("padding", 0), ("dilation", 1), ("output_padding", 0))
+    )
+    found = len(inputs) * (weight.shape[1] * groups if turned else weight.shape[0])
+    kernels = zip(sides, weight.shape[2:], stride, padding, dilation, more, strict=True)
+    for side, kernel, step, pad, spread, end in kernels:
+        reach = spread * (kernel - 1) + 1
+        found *= (side - 1) * step - 2 * pad + reach + end if turned else (side + 2 * pad - reach) // step + 1
+    return found
+
+
+def _each(value: Any, count: int) -> list[int]:
+    listed = list(value) if isinstance(value, list | tuple) else [value]
+    return listed * count if len(listed) == 1 else listed
+
+
+def _padded(called: Mapping[str, Any]) -> int:
+    shape, pads = list(called["self"].shape), called["pad"]
+    for side in range(len(pads) // 2):
+        shape[-1 - side] += pads[2 * side] + pads[2 * side + 1]
+    return math.prod(shape)
+
+
+def _scaled(called: Mapping[str, Any]) -> int:
+    inputs = called["self"] if "self" in called else called["input"]
+    sides = called["output_size"]
+    return math.prod(inputs.shape[: inputs.dim() - len(sides)]) * math.prod(sides)
+
+
+def _picked(called: Mapping[str, Any]) -> int:
+    held, index = called.get("self", called.get("weight")), called.get("index", called.get("indices"))
+    assert held is not None
+    if isinstance(index, list | tuple):
+        chosen = [one for one in index if one is not None]
+        return math.prod(np.broadcast_shapes(*(one.shape for one in chosen))) * math.prod(
+            side for side, one in zip(held.shape, [*index, *[None] * held.dim()], strict=False) if one is None
+        )
+    if "dim" in called:
+        return held.numel() // max(held.shape[called["dim"]], 1) * index.numel()
+    return index.numel() * math.prod(held.shape[1:])
+
+
+_FORMULAS: dict[str, Callable[[Mapping[str, Any]], int | float]] = {
+    **dict.fromkeys(("mm", "addmm", "bmm", "baddbmm"), _matrices),
+    "convolution": _convolution,
+    "constant_pad_nd": _padded,
+    **dict.fromkeys(("reflection_pad1d", "reflection_pad2d", "reflection_pad3d"), _padded),
+    **dict.fromkeys(("replication_pad1d", "replication_pad2d", "replication_pad3d"), _padded),
+    **dict.fromkeys(("upsample_nearest1d", "upsample_nearest2d", "upsample_nearest3d"), _scaled),
+    **dict.fromkeys(("upsample_linear1d", "upsample_bilinear2d", "upsample_trilinear3d"), _scaled),
+    **dict.fromkeys(("upsample_bicubic2d", "_upsample_bilinear2d_aa", "_upsample_bicubic2d_aa"), _scaled),
+    **dict.fromkeys(("_adaptive_avg_pool2d", "_adaptive_avg_pool3d", "adaptive_max_pool2d"), _scaled),
+    **dict.fromkeys(("index", "index_select", "embedding"), _picked),
+    "gather": lambda called: called["index"].numel(),
+    "take": lambda called: called["index"].numel(),
+    "repeat": lambda called: called["self"].numel() * math.prod(called["repeats"]),
+    "arange": lambda called: (called["end"] - called.get("start", 0)) / (called.get("step") or 1),
+    "linspace": lambda called: called["steps"],
+    "logspace": lambda called: called["steps"],
+    "eye": lambda called: called["n"] * called.get("m", called["n"]),
+    "randperm": lambda called: called["n"],
+    "tril_indices": lambda called: 2 * called["row"] * called["col"],
+    "triu_indices": lambda called: 2 * called["row"] * called["col"],
+    "_cdist_forward": lambda called: math.prod(called["x1"].shape[:-1]) * called["x2"].shape[-2],
+    "im2col": lambda called: called["self"].numel() * math.prod(called["kernel_size"]),
+    "diag_embed": lambda called: called["self"].numel() * called["self"].shape[-1],
+    "histc": lambda called: called["bins"],
+}
+"""Numbers of the results of operations that give more than they are given, by their names in torch."""
