@@ -2,11 +2,16 @@
 
 import errno
 import hashlib
+import io
 import multiprocessing
 import os
+import pickle
 import random
 import shutil
 import signal
+import time
+import zipfile
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -14,11 +19,12 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from torch import nn
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError
-from framework.storage.checkpoints import latest_good, read, verify
-from framework.storage.weights import describe_mismatch
+from framework.storage.checkpoints import MARK, latest_good, read, verify
+from framework.storage.weights import describe_mismatch, read_weights
 from framework.training.checkpoint import WholeCheckpoints
 
 CONTENTS: dict[str, Any] = {
@@ -273,3 +279,195 @@ def test_describe_mismatch() -> None:
     assert describe_mismatch({"b": torch.zeros(())}, {"b": torch.zeros(4)}) == (
         "1 of 1 weights have another shape: b (4, wanted scalar)."
     )
+    assert describe_mismatch({"a.b": torch.zeros(2)}, {"a.b": torch.zeros(4), "a.c": 1}, ("a.",)) is None
+
+
+KINDS = (
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+    torch.complex64,
+    torch.complex128,
+    torch.bool,
+)
+KINDS += (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+
+
+@pytest.mark.parametrize("wanted", KINDS, ids=str)
+def test_numbers_of_another_kind_do_not_fit(wanted: torch.dtype) -> None:
+    """Floating-point numbers of another width do; a complex number would lose half of itself, an integer its bits."""
+    for found in KINDS:
+        for any_shape in ((), ("a",)):
+            said = describe_mismatch(
+                {"a": torch.zeros(2, dtype=wanted)}, {"a": torch.zeros(2, dtype=found)}, any_shape
+            )
+            if wanted == found or (wanted.is_floating_point and found.is_floating_point):
+                assert said is None
+            else:
+                kinds = f"a ({str(found)[6:]}, wanted {str(wanted)[6:]})"
+                assert said == f"1 of 1 weights have numbers of another type: {kinds}."
+
+
+def signed(content: bytes, path: Path) -> Path:
+    """A file that a forger wrote, checksum and all."""
+    path.write_bytes(content + MARK + hashlib.sha256(content).digest())
+    return path
+
+
+def packed(content: Any) -> bytes:
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    return stream.getvalue()
+
+
+class Subclass(torch.Tensor):
+    """Torch stores its class."""
+
+
+STRUCTURED: dict[str, Callable[[], Any]] = {
+    "sparse COO": lambda: torch.eye(4).to_sparse_coo(),
+    "sparse CSR": lambda: torch.eye(4).to_sparse_csr(),
+    "sparse CSC": lambda: torch.eye(4).to_sparse_csc(),
+    "sparse BSR": lambda: torch.eye(4).to_sparse_bsr((2, 2)),
+    "sparse BSC": lambda: torch.eye(4).to_sparse_bsc((2, 2)),
+    "nested": lambda: torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)]),
+    "jagged": lambda: torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)], layout=torch.jagged),
+    "quantised": lambda: torch.quantize_per_tensor(torch.eye(4), 0.1, 0, torch.qint8),
+    "quantised by channel": lambda: torch.quantize_per_channel(
+        torch.eye(4), torch.ones(4), torch.zeros(4), 0, torch.qint8
+    ),
+    "conjugate": lambda: torch.ones(3, dtype=torch.complex64).conj(),
+    "negative": lambda: torch.ones(3, dtype=torch.complex64).conj().imag,
+    "meta": lambda: torch.empty(9, device="meta"),
+    "a subclass": lambda: torch.zeros(2).as_subclass(Subclass),
+    "float8": lambda: torch.zeros(2, dtype=torch.float8_e4m3fn),
+    "expanded": lambda: torch.zeros(1).expand(10**9),
+    "expanded in part": lambda: torch.zeros(3, 1).expand(3, 1000),
+    "overlapping": lambda: torch.zeros(3000).as_strided((1000, 1000), (1, 1)),
+    "a storage": lambda: torch.zeros(2).untyped_storage(),
+    "a module": lambda: torch.nn.Linear(2, 3),
+    "a path": lambda: Path("a"),
+    "bytes": lambda: bytearray(b"a"),
+}
+"""What torch stores beside dense arrays of plain numbers, and arrays that are not stored number by number."""
+
+
+@pytest.mark.filterwarnings("ignore")  # of torch, about kinds of tensors that are beta or deprecated
+@pytest.mark.parametrize("kind", STRUCTURED)
+def test_only_dense_tensors_are_written_and_read(kind: str, saved: Path) -> None:
+    held = STRUCTURED[kind]()
+    with pytest.raises(CheckpointError, match=r"last\.ckpt was not written: .* Convert these"):
+        WholeCheckpoints().save_checkpoint({"a": [held]}, saved)
+    assert same(read(saved), CONTENTS)
+    content = packed({"a": [held]})
+    with pytest.raises(
+        CheckpointError, match=r"forged\.ckpt (holds more than .*, namely|cannot be used: a has )"
+    ):
+        read(signed(content, saved.with_name("forged.ckpt")))
+    saved.with_name("one.pth").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"one\.pth is (no file of plain tensors|damaged)"):
+        read_weights(str(saved.with_name("one.pth")))
+
+
+def test_whatever_is_plain_is_read_as_torch_reads_it(saved: Path) -> None:
+    """Every type of numbers, views, shared storage, parameters, and the plain values beside them."""
+    numbers = torch.arange(24.0).reshape(4, 6)
+    kinds = (*KINDS, torch.uint16, torch.uint32, torch.uint64)
+    contents = {
+        "kinds": {str(kind): torch.ones(3, dtype=kind) for kind in kinds},
+        "views": [
+            numbers.T,
+            numbers[1:, ::2],
+            numbers[:0],
+            numbers[3, 5],
+            numbers,
+            torch.zeros(1).expand(30, 30),
+        ],
+        "parameters": OrderedDict(a=nn.Parameter(numbers), b=torch.zeros(2, requires_grad=True)),
+        "state": nn.BatchNorm1d(3).state_dict(),  # has attributes of its own
+        "values": [
+            None,
+            True,
+            2**100,
+            -1.5,
+            float("inf"),
+            "\x1bκ",
+            b"bytes" * 99,
+            1j,
+            {1, "a"},
+            (1, (2,)),
+            Counter("aab"),
+        ],
+        "torch's": [torch.Size([2, 3]), torch.float16, torch.device("cuda:1")],
+    }
+    WholeCheckpoints().save_checkpoint(contents, saved)
+    found, wanted = read(saved), torch.load(saved, weights_only=True, map_location="cpu")
+    assert same(found, wanted) and same(found, contents)
+    assert found["state"]._metadata == contents["state"]._metadata
+    assert (
+        found["views"][0].untyped_storage().data_ptr()
+        == found["parameters"]["a"].untyped_storage().data_ptr()
+    )
+    assert [view.stride() for view in found["views"]] == [view.stride() for view in contents["views"]]
+    assert isinstance(found["parameters"]["a"], nn.Parameter) and found["parameters"]["b"].requires_grad
+
+
+def call(name: str, *arguments: Any) -> bytes:
+    """A pickle of what a function makes of these."""
+    module, word = name.rsplit(".", 1)
+    return b"\x80\x02c%s\n%s\n" % (module.encode(), word.encode()) + pickle.dumps(arguments, 2)[2:-1] + b"R."
+
+
+HARMFUL = {
+    "a storage of 1 TB": call("torch.storage.UntypedStorage", 10**12),
+    "a tensor that nobody filled": call("torch.Tensor", 10**5, 10**5),
+    "a tensor by its old name": call("torch.FloatTensor", 10**5, 10**5),
+    "bytes of 1 TB": call("builtins.bytearray", 10**12),
+    "bytes by a slow codec": call("_codecs.encode", "a" * 10**5, "punycode"),
+    "the same bytes again and again": call("_codecs.encode", "a" * 10**6, "latin1")[:-2]
+    + b"q\x01" + b"Rc_codecs\nencode\nh\x01R" * 5000 + b".",
+    "a meta tensor": call("torch._utils._rebuild_meta_tensor_no_storage", torch.float32, (9,), (1,), False),
+    "a call of a value": b"\x80\x02}(K\x01tR.",
+    "a command": call("os.system", "true"),
+    "a command by a later protocol": pickle.dumps(os.system, 4),
+    "a command by the first protocol": b"(S'true'\nios\nsystem\n.",
+    "nothing": b"",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HARMFUL)
+def test_what_a_pickle_calls_is_refused_before_it_is_called(name: str, saved: Path) -> None:
+    for before in (b"}X\x01\x00\x00\x00a", b""):
+        pickled = HARMFUL[name]
+        if before:  # as a value of a dictionary, which a checkpoint is
+            pickled = pickled[:2] + before + pickled[2:-1] + b"s."
+        stream = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(packed({}))) as sound, zipfile.ZipFile(stream, "w") as forged:
+            for part in sound.infolist():
+                forged.writestr(
+                    part.filename, pickled if part.filename.endswith("data.pkl") else sound.read(part)
+                )
+        began = time.process_time()
+        with pytest.raises(CheckpointError, match=r"forged\.ckpt (holds more than|cannot be used)"):
+            read(signed(stream.getvalue(), saved.with_name("forged.ckpt")))
+        assert time.process_time() - began < 1
+
+
+def test_an_archive_that_can_be_read_in_two_ways_is_refused(saved: Path) -> None:
+    """What is looked through must be what torch reads: parts of one name, other bytes before them, an older format."""
+    sound, other = packed(CONTENTS), packed({"other": torch.zeros(3).to_sparse()})
+    twice = io.BytesIO(sound)
+    with zipfile.ZipFile(twice, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("archive/data.pkl", b"}.")
+    old = io.BytesIO()
+    torch.save({"a": torch.zeros(3).to_sparse()}, old, _use_new_zipfile_serialization=False)
+    for content in (
+        twice.getvalue(),
+        other + sound,
+        old.getvalue() + sound,
+        b"PK\x03\x04" + sound,
+        sound[:-22] + sound[-44:],
+    ):
+        with pytest.raises(CheckpointError, match=r"forged\.ckpt (holds more than|cannot be used)"):
+            read(signed(content, saved.with_name("forged.ckpt")))

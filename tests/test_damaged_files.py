@@ -15,7 +15,7 @@ from framework.datasets import images
 from framework.datasets.images import Crop, square
 from framework.errors import ConfigError, DataError, quoted, shown
 from framework.storage import reading
-from framework.storage.plain_values import read_yaml, require_flat
+from framework.storage.plain_values import read_yaml, require_plain_pickle
 from framework.storage.reading import guarded, inflated
 
 ROOT = Path(__file__).parent.parent
@@ -212,9 +212,9 @@ def test_a_pickle_of_tuples_that_hold_the_same_tuple_twice_is_refused() -> None:
     for number in range(30):
         nested, deep = (nested, nested), (deep, number)
     for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
-        require_flat(pickle.dumps({"a": deep, "b": [(1, (2, 3))] * 9, "c": tuple(range(9999))}, protocol))
+        require_plain_pickle(pickle.dumps({"a": deep, "b": [(1, (2, 3))] * 9, "c": tuple(range(9999))}, protocol))
         with pytest.raises(ValueError, match="stands for more than"):
-            require_flat(pickle.dumps([nested], protocol))
+            require_plain_pickle(pickle.dumps([nested], protocol))
 
 
 @pytest.mark.parametrize(

@@ -185,11 +185,7 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
     own = tuple(
         f"{name}." if name else "" for name, part in predictor.named_modules() if isinstance(part, Fitted)
     )
-    wanted, found = (
-        {name: value for name, value in weights.items() if not name.startswith(own)}
-        for weights in (predictor.state_dict(), state)
-    )
-    mismatch = describe_mismatch(wanted, found)
+    mismatch = describe_mismatch(predictor.state_dict(), state, any_shape=own)
     if mismatch:
         raise CheckpointError(
             f"{name} belongs to another model: {mismatch} Use the config it was trained with, or another checkpoint."

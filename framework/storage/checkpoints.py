@@ -11,11 +11,11 @@ from typing import Any, BinaryIO, cast
 
 import torch
 from torch import Tensor
-from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError, shown
 from framework.storage.files import full, remove_leftovers, replacing
-from framework.storage.plain_values import require_flat
+from framework.storage.plain_tensors import load, require_admitted_pickles, require_dense
+from framework.storage.plain_values import Foreign
 
 # A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
 # all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
@@ -44,7 +44,7 @@ def write(checkpoint: Mapping[str, Any], path: Path) -> None:
                 hashed = _Hashed(file)
                 torch.save(checkpoint, cast(BinaryIO, hashed))
                 file.write(MARK + hashed.digest.digest())
-            _require_plain(partial, path)
+            _require_plain(partial, path, checkpoint)
     except (OSError, RuntimeError) as error:
         # torch fails once more when it closes a file that took no more
         fault = error if isinstance(error, OSError) else error.__context__
@@ -69,14 +69,15 @@ def read(path: Path) -> dict[str, Any]:
         file.seek(0)
         try:
             _require_unfolded(file)
-            content = torch.load(file, weights_only=True, map_location="cpu")
+            content = load(file)
             if not isinstance(content, dict):
                 raise ValueError(f"it holds {type(content).__name__}")
             return content
-        except UnpicklingError:
+        except (Foreign, UnpicklingError) as error:
+            named = shown(error) if isinstance(error, Foreign) else "what pickle could make anything of"
             raise CheckpointError(
-                f"The checkpoint {path} holds more than dicts, lists, numbers, strings and tensors, which "
-                "could run code. This framework did not write it: do not use it."
+                f"The checkpoint {path} holds more than dicts, lists, numbers, strings and dense tensors, namely "
+                f"{named}, which could run code or harm. This framework did not write it: do not use it."
             ) from None
         except Exception as error:  # its checksum is right and its content is not: torch raises a dozen kinds
             raise CheckpointError(
@@ -85,16 +86,12 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _require_unfolded(file: BinaryIO) -> None:
-    """Refuse what torch does not write and a small file could take any memory or time by."""
+    """Refuse parts that are compressed: torch does not write such, and a small file could take any memory by them."""
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
         size = os.fstat(file.fileno()).st_size
         if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
             raise ValueError("its parts unfold to more than the file")
-        for part in parts:
-            if part.filename.endswith("data.pkl"):
-                require_flat(archive.read(part))
-    file.seek(0)
 
 
 def verify(path: Path) -> str | None:
@@ -151,13 +148,18 @@ class _Hashed:
         self.file.flush()
 
 
-def _require_plain(partial: Path, path: Path) -> None:
-    names = get_unsafe_globals_in_checkpoint(partial)
-    if names:
+def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Refuse what `read` would not give back."""
+    try:
+        with partial.open("rb") as file:
+            require_admitted_pickles(file)
+        require_dense(checkpoint, partial.stat().st_size)
+    except ValueError as error:
+        held = f"it would hold {shown(error)}" if isinstance(error, Foreign) else shown(error)
         raise CheckpointError(
-            f"The checkpoint {path} was not written: it would hold {', '.join(names)}, and only dicts, "
-            "lists, tuples, numbers, strings and tensors are read. Convert these where the state is made."
-        )
+            f"The checkpoint {path} was not written: {held}, and only dicts, lists, tuples, numbers, strings and dense "
+            "tensors are read. Convert these where the state is made."
+        ) from None
 
 
 def _no_room(path: Path, needed: int) -> CheckpointError:

@@ -2,12 +2,14 @@
 
 import json
 import pickletools
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from framework.errors import DataError, UserError
+from framework.errors import DataError, UserError, shown
 from framework.storage.reading import RESTORE, guarded, read_bytes
 
 LARGEST_JSON, LARGEST_YAML = 2**24, 2**17
@@ -45,33 +47,126 @@ def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserEr
         return yaml.safe_load(text)
 
 
-def require_flat(pickled: bytes) -> None:
-    """Refuse a pickle whose tuples hold the same tuple again and again: as a key such a one is hashed for ever.
+class Foreign(ValueError):
+    """A file holds something else than plain values and dense tensors; its text names it."""
+
+
+@dataclass(slots=True)
+class _Item:
+    """A value on the stack of a pickle, which is not made.
+
+    Attributes:
+        size: of its text, or of what it holds.
+        values: how many a tuple stands for.
+        name: of a global: "module name"; "" for any other value.
+        text: of a short string, or of the last one of a tuple.
+        mark: whether it is a mark.
+    """
+
+    size: int = 1
+    values: int = 1
+    name: str = ""
+    text: str = ""
+    mark: bool = False
+
+
+PUTS = frozenset(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"))
+GETS = frozenset(("GET", "BINGET", "LONG_BINGET"))
+TUPLES = frozenset(("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"))
+ADDS = {"APPEND": 1, "SETITEM": 2, "BUILD": 1, "APPENDS": 0, "SETITEMS": 0, "ADDITEMS": 0}
+"""Instructions that put values into the one below, and how many; 0: all above the mark."""
+OTHERS = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID", "DUP"}
+OTHERS |= {"NEXT_BUFFER", "READONLY_BUFFER"}
+"""Instructions that `torch.save` does not write, nor torch read."""
+RENAMED = {"__builtin__": "builtins"}
+"""Modules of Python 2, as pickles of protocol 2 name them, and of Python 3."""
+ENCODE = "_codecs encode"
+"""Of bytes, as protocol 2 writes them."""
+TIMES_ITSELF = 4
+"""What is made by calls may be so many times the pickle."""
+HIGHEST = 2**62
+
+
+def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Collection[str] = ()) -> None:
+    """Look through a pickle without making anything of it.
+
+    A tuple may not stand for more than MOST_ITEMS values, as one does that holds the same tuple again and again: as a
+    key such a one is hashed for ever.
+
+    Args:
+        pickled: one pickle.
+        called: the globals that it may name and call: "module name", as Python 3 has them.
+        named: those that it may name, and not call.
 
     Raises:
-        ValueError: one stands for more than MOST_ITEMS values, or the pickle is damaged.
+        Foreign: it names another one, or calls something else.
+        ValueError: it would make far more of itself than it is.
+        Exception: it is damaged.
     """
-    stack: list[int] = []  # how many values each item stands for; 0: a mark
-    memo: dict[int, int] = {}
+    stack: list[_Item] = []
+    memo: dict[int, _Item] = {}
+    left = TIMES_ITSELF * len(pickled) + 1000
     for opcode, argument, _ in pickletools.genops(pickled):
-        if "PUT" in opcode.name or opcode.name == "MEMOIZE":
+        name = opcode.name
+        if name in PUTS:
             memo[len(memo) if argument is None else int(argument)] = stack[-1]
-        elif "GET" in opcode.name:
+        elif name in GETS:
             stack.append(memo[int(argument or 0)])
-        elif opcode.name == "MARK":
-            stack.append(0)
-        else:
-            taken = opcode.stack_before
-            size = 0
-            if pickletools.markobject in taken:
-                while stack[-1]:
-                    size += stack.pop()
-                stack.pop()
-                taken = taken[: taken.index(pickletools.markobject)]
-            size += sum(stack.pop() for _ in taken)
-            stack += [1 + size if "TUPLE" in opcode.name else 1] * len(opcode.stack_after)
-            if (size > MOST_ITEMS and "TUPLE" in opcode.name) or opcode.name == "DUP":
+        elif name in TUPLES:
+            inner = (
+                _above_mark(stack) if name == "TUPLE" else [stack.pop() for _ in range(int(name[-1]))][::-1]
+            )
+            values = 1 + sum(item.values for item in inner)
+            if values > MOST_ITEMS:
                 raise ValueError(f"a tuple that stands for more than {MOST_ITEMS} values")
+            text = inner[-1].text if inner else ""
+            stack.append(_Item(1 + sum(item.size for item in inner), values, text=text))
+        elif name == "GLOBAL":
+            module, _, word = str(argument).partition(" ")
+            found = f"{RENAMED.get(module, module)} {word}"
+            if found not in called and found not in named:
+                raise Foreign(shown(found.replace(" ", ".", 1)))
+            stack.append(_Item(name=found))
+        elif name in ADDS:
+            inner = [stack.pop() for _ in range(ADDS[name])] or _above_mark(stack)
+            # one that holds itself would double each time
+            stack[-1].size = min(stack[-1].size + sum(item.size for item in inner), HIGHEST)
+        elif name in ("REDUCE", "NEWOBJ"):
+            given, function = stack.pop(), stack.pop()
+            if function.name not in called:
+                raise Foreign(f"a call of {function.name or 'what is no function'}")
+            if function.name == ENCODE and given.text != "latin1":  # some codecs take quadratic time
+                raise Foreign("bytes that pickle did not write")
+            left -= given.size
+            if left < 0:
+                raise ValueError("it would make far more of itself than it is")
+            stack.append(_Item(given.size))
+        elif name == "MARK":
+            stack.append(_Item(mark=True))
+        elif name in OTHERS:
+            raise Foreign(f"what the instruction {name} makes")
+        else:
+            taken = list(opcode.stack_before)
+            if pickletools.markobject in taken:
+                _above_mark(stack)
+                taken = taken[: taken.index(pickletools.markobject)]
+            size = 1 + sum(stack.pop().size for _ in taken)
+            text = argument if isinstance(argument, str | bytes) else ""
+            short = text if isinstance(text, str) and len(text) < 32 else ""
+            for _ in opcode.stack_after:
+                stack.append(_Item(min(size + len(text), HIGHEST), text=short))
+
+
+def _above_mark(stack: list[_Item]) -> list[_Item]:
+    """What stands above the last mark, which is taken away with it."""
+    place = len(stack) - 1
+    while not stack[place].mark:
+        place -= 1
+        if place < 0:
+            raise ValueError("a pickle without the mark that it asks for")
+    found = stack[place + 1 :]
+    del stack[place:]
+    return found
 
 
 def _content(file: Path, most: int) -> bytes:

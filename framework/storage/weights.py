@@ -14,8 +14,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from framework.errors import CheckpointError, ConfigError, shown
-from framework.storage.plain_values import require_flat
-from framework.storage.reading import room
+from framework.storage.plain_tensors import load
+from framework.storage.plain_values import Foreign
+from framework.storage.reading import opened, room
 
 _log = logging.getLogger(__name__)
 
@@ -95,13 +96,11 @@ def _torch(path: Path) -> Any:
                 if size > room(path.stat().st_size):
                     raise ValueError(f"its parts unfold to {size} bytes")
                 failed = archive.testzip() or next(iter(folders), None)
-                for part in archive.infolist():
-                    if part.filename.endswith("data.pkl"):
-                        require_flat(archive.read(part))
             if failed:
                 raise ValueError(f"its part {failed} fails its checksum")
-        return torch.load(path, weights_only=True, map_location="cpu")
-    except UnpicklingError as error:
+        with opened(path) as file:
+            return load(file)
+    except (Foreign, UnpicklingError) as error:
         raise CheckpointError(
             f"{path} is no file of plain tensors ({_first_line(error)}). Reading anything else could run "
             "code: save it again where it comes from, with `torch.save(network.state_dict(), ...)`."
@@ -132,15 +131,29 @@ def _first_line(error: Exception) -> str:
 
 
 def describe_mismatch(
-    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Shaped[Tensor, "..."]]
+    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Any], any_shape: tuple[str, ...] = ()
 ) -> str | None:
-    """One sentence on how the weights of a file differ from those a model wants, or None where they fit."""
-    missing = [name for name in wanted if name not in found]
-    unexpected = [name for name in found if name not in wanted]
+    """One sentence on how the weights of a file differ from those a model wants, or None where they fit.
+
+    Floating-point numbers may be of any width: they are cast when they are copied. Nothing else is: a complex number
+    would lose its imaginary part, and an integer its upper half, without an error.
+
+    Args:
+        any_shape: beginnings of names whose weights may be of any shape, or lacking.
+    """
+    names = {name for name in (*wanted, *found) if not name.startswith(any_shape)}
+    missing = [name for name in wanted if name in names and name not in found]
+    unexpected = [name for name in found if name in names and name not in wanted]
+    both = [(name, tensor, found[name]) for name, tensor in wanted.items() if name in found]
+    retyped = [
+        f"{name} ({_kind(given)}, wanted {_kind(tensor)})"
+        for name, tensor, given in both
+        if not (isinstance(given, Tensor) and _same_kind(tensor, given))
+    ]
     reshaped = [
-        f"{name} ({_shape(found[name])}, wanted {_shape(tensor)})"
-        for name, tensor in wanted.items()
-        if name in found and found[name].shape != tensor.shape
+        f"{name} ({_shape(given)}, wanted {_shape(tensor)})"
+        for name, tensor, given in both
+        if name in names and isinstance(given, Tensor) and given.shape != tensor.shape
     ]
     parts = [
         f"{len(names)} of {total} {what}: {_some(names)}"
@@ -148,10 +161,19 @@ def describe_mismatch(
             (missing, len(wanted), "weights are missing"),
             (unexpected, len(found), "weights found are unknown"),
             (reshaped, len(wanted), "weights have another shape"),
+            (retyped, len(wanted), "weights have numbers of another type"),
         )
         if names
     ]
     return "; ".join(parts) + "." if parts else None
+
+
+def _same_kind(wanted: Tensor, found: Tensor) -> bool:
+    return wanted.dtype == found.dtype or (wanted.is_floating_point() and found.is_floating_point())
+
+
+def _kind(found: Any) -> str:
+    return str(found.dtype).removeprefix("torch.") if isinstance(found, Tensor) else type(found).__name__
 
 
 def _shape(tensor: Shaped[Tensor, "..."]) -> str:
@@ -160,4 +182,4 @@ def _shape(tensor: Shaped[Tensor, "..."]) -> str:
 
 def _some(names: list[str]) -> str:
     rest = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {rest} more" if rest > 0 else "")
+    return shown(", ".join(names[:LISTED]), 400) + (f" and {rest} more" if rest > 0 else "")

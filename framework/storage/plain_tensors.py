@@ -1,0 +1,169 @@
+"""Reads what `torch.save` writes: plain values and dense tensors, and nothing else that torch would make of a file.
+
+`torch.load(weights_only=True)` runs no code, but it makes sparse, nested and quantised tensors whose insides it takes
+as they are, storages of any size, and views of one number as millions. So the pickle is looked through before torch
+reads it, and the tensors afterwards.
+"""
+
+import math
+import os
+import pickletools
+import zipfile
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import torch
+from torch import Tensor, nn
+
+from framework.errors import shown
+from framework.storage.plain_values import Foreign, require_plain_pickle
+
+TENSORS = ("_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")
+NUMBERS = {
+    "uint8": "Byte",
+    "int8": "Char",
+    "int16": "Short",
+    "int32": "Int",
+    "int64": "Long",
+    "float16": "Half",
+    "bfloat16": "BFloat16",
+    "float32": "Float",
+    "float64": "Double",
+    "bool": "Bool",
+    "complex64": "ComplexFloat",
+    "complex128": "ComplexDouble",
+    "uint16": "",
+    "uint32": "",
+    "uint64": "",
+}
+"""Types of numbers that a tensor may have, and their storages; the last have none of their own."""
+CALLED = frozenset(
+    {
+        "collections OrderedDict",
+        "collections Counter",  # of a schedule's milestones
+        "builtins set",
+        "builtins complex",
+        "_codecs encode",  # of bytes
+        "torch Size",
+        "torch device",
+        "torch.nn.parameter Parameter",  # in files of torch before 0.4
+        *(f"torch._utils {name}" for name in TENSORS),
+    }
+)
+NAMED = frozenset(
+    {
+        "torch.storage UntypedStorage",
+        *(f"torch {name}" for name in NUMBERS),
+        *(f"torch {name}Storage" for name in NUMBERS.values() if name),
+    }
+)
+"""What a pickle of plain values and dense tensors calls and names: "module name", as Python 3 has them."""
+TYPES = frozenset(getattr(torch, name) for name in NUMBERS)
+MOST_EXPANDED = 1000
+"""Numbers of a tensor that may be more than its storage holds."""
+MOST_SHARED = 1000
+"""All tensors together may have so many times the numbers that a file holds: members may share weights."""
+PICKLES_BEFORE_ZIP = 5
+"""In files of torch before 1.6: a mark, a version, the system, the values, and the names of the storages."""
+
+
+def load(file: BinaryIO) -> Any:
+    """What `torch.save` wrote, on the CPU.
+
+    Raises:
+        Foreign: it is made of something else than plain values and dense tensors.
+        Exception: it is damaged; torch, pickle and zipfile raise a dozen kinds.
+    """
+    size = os.fstat(file.fileno()).st_size
+    require_admitted_pickles(file)
+    file.seek(0)
+    content = torch.load(file, weights_only=True, map_location="cpu")
+    require_dense(content, size)
+    return content
+
+
+def require_admitted_pickles(file: BinaryIO) -> None:
+    """Look through what `torch.save` wrote, without making anything of it; errors as `load`."""
+    for pickled in _pickles(file):
+        require_plain_pickle(pickled, CALLED, NAMED)
+
+
+def _pickles(file: BinaryIO) -> Iterator[bytes]:
+    """Those of a file from which torch makes what it holds.
+
+    Raises:
+        ValueError: it is a zip archive in which Python and torch find different things.
+    """
+    file.seek(0)
+    if file.read(4) != b"PK\x03\x04":
+        yield from _pickles_before_zip(file)
+        return
+    file.seek(0)
+    reader = torch._C.PyTorchFileReader(file)
+    names = reader.get_all_records()
+    found = {
+        name: (reader.get_record_header_offset(name), reader.get_record_size(name))  # pyright: ignore[reportAttributeAccessIssue]
+        for name in names
+    }
+    file.seek(0)
+    with zipfile.ZipFile(file) as archive:
+        parts = {
+            part.filename.partition("/")[2]: (part.header_offset, part.file_size)
+            for part in archive.infolist()
+        }
+        if parts != found or len(archive.infolist()) != len(names) or "data.pkl" not in found:
+            raise ValueError("its directory can be read in two ways, or has no values")
+    yield reader.get_record("data.pkl")
+
+
+def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
+    file.seek(0)
+    for _ in range(PICKLES_BEFORE_ZIP):
+        start = file.tell()
+        for _ in pickletools.genops(file):
+            pass
+        end = file.tell()
+        file.seek(start)
+        yield file.read(end - start)
+
+
+def require_dense(content: Any, size: int | float = math.inf) -> None:
+    """Check every tensor in dictionaries, lists, tuples and sets.
+
+    Args:
+        size: bytes of the file that held them.
+
+    Raises:
+        Foreign: one is of another layout, type or class.
+        ValueError: one is a view of far fewer numbers than it has, or all have far more than the file.
+    """
+    seen: set[int] = set()
+    left = MOST_SHARED * size
+    stack: list[tuple[str, Any]] = [("", content)]
+    while stack:
+        name, item = stack.pop()
+        if isinstance(item, Tensor):
+            left -= _require_dense(item, name or "a tensor")
+            if left < 0:
+                raise ValueError("its tensors share so much that they are far more than the file")
+        elif isinstance(item, torch.UntypedStorage | torch.TypedStorage):
+            raise Foreign("a storage without a tensor")
+        elif isinstance(item, dict | list | tuple | set) and id(item) not in seen:
+            seen.add(id(item))
+            inner = item.items() if isinstance(item, dict) else enumerate(item)
+            stack += [(str(key) if isinstance(key, str) else name, value) for key, value in inner]
+
+
+def _require_dense(tensor: Tensor, name: str) -> int:
+    """Bytes of its numbers; errors as above."""
+    if type(tensor) not in (Tensor, nn.Parameter) or tensor.layout != torch.strided:
+        raise Foreign(f"{shown(name)}, a {type(tensor).__name__} of layout {tensor.layout}")
+    if tensor.dtype not in TYPES or tensor.is_nested or tensor.is_conj() or tensor.is_neg():
+        raise Foreign(f"{shown(name)}, a tensor of type {tensor.dtype} that is no array of plain numbers")
+    size, held = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
+    if size > held and tensor.numel() > MOST_EXPANDED:
+        raise ValueError(
+            f"{shown(name)} has {tensor.numel()} numbers that are views of {held // tensor.element_size()}; "
+            "wanted each stored (.contiguous())"
+        )
+    return size
