@@ -414,7 +414,7 @@ def completed(
 
 def table(folder: Path, *given: list[str]) -> list[dict[str, str]]:
     """The lines of comparison.csv."""
-    comparison.summarise(folder, given)
+    comparison.summarise(folder, given, {})
     with (folder / "comparison.csv").open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 

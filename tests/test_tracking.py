@@ -14,7 +14,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -39,13 +39,17 @@ from framework.tracking.run_info import (
     Destination,
     RunInfo,
     Sidecar,
-    default_uri,
     read_run_info,
-    require_own_store,
+)
+from framework.tracking.sender import Record, Sender, Store, batches
+from framework.tracking.stores import (
+    Address,
+    confirmed,
+    default_uri,
+    require_no_password,
     store_uri,
     without_password,
 )
-from framework.tracking.sender import Record, Sender, Store, batches
 from framework.tracking.tracker import MlflowTracker, NoTracker
 from framework.training.checkpoint import WholeCheckpoints
 
@@ -92,6 +96,7 @@ def folder(tmp_path: Path, empty_store: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # MLflow's server sets it for its process
     for name, seconds in {"_SECONDS": 0.1, "_PAUSE": 0.02, "_FIRST_RETRY": 0.05, "_LAST_RETRY": 0.2}.items():
         monkeypatch.setattr(sender, name, seconds)
 
@@ -375,7 +380,7 @@ def test_a_file_that_is_gone_holds_up_nothing(folder: Path, caplog: pytest.LogCa
     assert "missing.png is gone" in caplog.text
 
 
-@pytest.mark.parametrize("path", ["/etc/hostname", "../secret.txt", "link.txt", "folder", "link/secret.txt"])
+@pytest.mark.parametrize("path", ["/etc/hostname", "../secret.txt", "a/../../secret.txt", ".."])
 def test_a_strangers_journal_gives_away_nothing_but_the_run_folder(
     path: str, folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -383,10 +388,7 @@ def test_a_strangers_journal_gives_away_nothing_but_the_run_folder(
     tracker.open()
     log(tracker, range(3))
     (folder.parent / "secret.txt").write_text("secret")
-    (folder / "link").symlink_to(folder.parent)
-    (folder / "link.txt").symlink_to(folder.parent / "secret.txt")
-    (folder / "folder").mkdir()
-    (folder / "folder" / "link.txt").symlink_to(folder.parent / "secret.txt")
+    (folder / "a").mkdir()
     tracker._log(artifact=path, folder="")  # pyright: ignore[reportPrivateUsage]
     tracker.close("FINISHED")
     info = json.loads((folder / "run.json").read_text())
@@ -402,26 +404,95 @@ def test_a_strangers_journal_gives_away_nothing_but_the_run_folder(
     assert not sent
 
 
+FOREIGN = [
+    *(
+        "https://attacker.example/api",
+        "postgresql://a:b@attacker.example/db",
+        "databricks",
+        "http://localhost:5000",
+    ),
+    *("http://127.0.0.2\\@localhost:5000", "http://127.0.0.2#@localhost", "http://localhost@127.0.0.2"),
+    *(
+        "http://localhost:x@127.0.0.2",
+        "http://[::1]@127.0.0.2/",
+        "http://127.0.0.2?@localhost",
+        "http://LOCALHOST:5000/",
+    ),
+    *(
+        "postgresql://localhost/db?host=127.0.0.2",
+        "postgresql:///db?service=x",
+        "mysql://localhost:1@127.0.0.2/db",
+    ),
+    *("sqlite:////anywhere/mlflow.db", "sqlite:///mlflow.db", "file:///tmp/store", "", "\x1b[2J"),
+]
+"""What a run.json of somebody else may name; no setting of the user's does."""
+
+
+@pytest.mark.parametrize("own", [None, "http://localhost:5001", "https://mine.example", "sqlite:///mine.db"])
+@pytest.mark.parametrize("recorded", FOREIGN)
+def test_a_store_that_only_a_file_names_is_not_contacted(
+    recorded: str, own: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether the user names another one in the command or in the environment."""
+    for named, setting in ((own, None), (None, own)):
+        monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        if setting:
+            monkeypatch.setenv("MLFLOW_TRACKING_URI", setting)
+        with pytest.raises(ConfigError, match=r"say so: add logger\.uri=") as caught:
+            confirmed(recorded, named, tmp_path / "run", Path("run.json"))
+        assert "a:b" not in str(caught.value)
+        assert str(caught.value).isprintable()
+
+
 @pytest.mark.parametrize(
-    ("uri", "given", "allowed"),
+    ("recorded", "own"),
     [
-        ("https://attacker.example/api", None, False),
-        ("postgresql://a:b@attacker.example/db", None, False),
-        ("databricks", None, False),
-        ("https://mine.example", "https://other.example", False),
-        ("https://mine.example", "https://mine.example", True),
-        ("https://me:secret@mine.example", "https://mine.example", True),
-        ("http://localhost:5000", None, True),
-        ("sqlite:////anywhere/mlflow.db", None, True),
-        ("", None, True),
+        ("https://mine.example", "https://mine.example"),
+        ("https://mine.example", "https://me:secret@mine.example"),
+        ("postgresql://db/x", "postgresql://me:a/b@db/x"),
+        ("sqlite:////anywhere/mlflow.db", "sqlite:////anywhere/mlflow.db"),
     ],
 )
-def test_a_store_that_only_a_file_names_needs_a_yes(uri: str, given: str | None, allowed: bool) -> None:
-    with (
-        nullcontext() if allowed else pytest.raises(ConfigError, match=r"say so: add logger\.uri=") as caught
-    ):
-        require_own_store(uri, given, Path("run.json"))
-    assert caught is None or "a:b" not in str(caught.value)
+def test_what_is_contacted_is_the_users_own_text(
+    recorded: str, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert confirmed(recorded, own, tmp_path, Path("run.json")) == Address(own, True)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", own)
+    assert confirmed(recorded, None, tmp_path, Path("run.json")) == Address(own, True)
+    default = default_uri(tmp_path / "run")
+    assert confirmed(default, None, tmp_path / "run", Path("run.json")) == Address(default, False)
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        *(
+            "postgresql://me:secret@host/db",
+            "postgresql+psycopg2://me:se/cret@host/db",
+            "mysql://:secret@host/db",
+        ),
+        *("http://me:secret@host", "https://secret@host", "postgresql://host/db?user=me&password=secret"),
+        *(
+            "postgresql://host/db?sslpassword=secret",
+            "https://host/?access_token=secret",
+            "mssql://me:se@cret@host/db",
+        ),
+    ],
+)
+def test_no_address_with_a_password_is_shown_or_taken_from_a_command(uri: str) -> None:
+    assert "secret" not in without_password(uri) and "cret" not in without_password(uri)
+    assert without_password(uri) == without_password(without_password(uri))
+    with pytest.raises(ConfigError, match="MLFLOW_TRACKING_URI") as caught:
+        require_no_password(uri)
+    assert "secret" not in str(caught.value) and "cret@" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "uri", ["sqlite:////home/me@work/a:b@c/mlflow.db", "http://host:5000/a", "mysql://me@host/db"]
+)
+def test_other_addresses_pass(uri: str) -> None:
+    require_no_password(uri)
+    assert without_password(uri) == uri.replace("me@host", "host")
 
 
 # Few calls, in order
@@ -677,7 +748,7 @@ def test_a_server_away_from_start_to_end_and_then_back(
     assert tracker.run_id is None
     assert tracker.url == f"http://127.0.0.1:{port}"
     with pytest.raises(UserError, match="did not take everything"):
-        sync(folder)
+        sync(folder, uri)
     assert "secret" not in caplog.text
 
     monkeypatch.setenv("_MLFLOW_SERVER_FILE_STORE", default_uri(folder))
@@ -689,12 +760,12 @@ def test_a_server_away_from_start_to_end_and_then_back(
     server = make_server("127.0.0.1", port, app)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        assert sync(folder) == 34  # with parameters, the file and two changes of status
-        assert sync(folder) == 0
+        assert sync(folder, uri) == 34  # with parameters, the file and two changes of status
+        assert sync(folder, uri) == 0
         info = read_run_info(folder)
         assert info is not None
         Sidecar(folder, info).update(sent=0)  # as if the process had died before it noted down anything
-        assert sync(folder) == 34
+        assert sync(folder, uri) == 34
     finally:
         server.shutdown()
         server.server_close()

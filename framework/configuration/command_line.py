@@ -11,8 +11,9 @@ from hydra.errors import HydraException
 
 from framework.configuration.composition import folder, in_quotes, options, register
 from framework.errors import ConfigError, did_you_mean
+from framework.tracking.stores import require_no_password
 
-FLAGS = ("--cfg=", "--package=", "--config-", "--info=", "--experimental-rerun=")
+FLAGS = ("--cfg=", "--package=", "--config-", "--info=", "--experimental-rerun=")  # the last is refused
 """Of Hydra's, those that take a value."""
 
 
@@ -20,14 +21,14 @@ def command_line(arguments: list[str]) -> list[str]:
     """The arguments as Hydra is to read them.
 
     Raises:
-        ConfigError: one would change Hydra's logging, or names a run to resume that is not there.
+        ConfigError: one would run code or store a password, or names a run to resume that is not there.
     """
     for argument in arguments:
         if re.match("--[^=]+=", argument) and not argument.startswith(FLAGS):
             raise ConfigError(
                 f"{argument}: no such flag. Settings are written without dashes: {argument.lstrip('-')}"
             )
-    _refuse_logging_overrides(arguments)
+    _refuse_code_and_passwords(arguments)
     return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(arguments)))
 
 
@@ -111,13 +112,22 @@ def _in_resumed_folder(arguments: list[str]) -> list[str]:
     return arguments
 
 
-def _refuse_logging_overrides(arguments: list[str]) -> None:
-    """Hydra's logging configs go to logging.config.dictConfig, which calls what they name; keep them ours.
+def _refuse_code_and_passwords(arguments: list[str]) -> None:
+    """Refuse what would run code, or be stored, before Hydra reads it.
+
+    Hydra's logging configs go to logging.config.dictConfig, which calls what they name. Its reruns unpickle a file.
 
     Raises:
-        ConfigError: an argument chooses or changes one.
+        ConfigError: an argument chooses or changes such a config, names such a file, or holds a password.
     """
     for argument in arguments:
+        if argument.startswith("--exp"):  # argparse takes abbreviations
+            raise ConfigError(
+                f"{argument}: refused, since Hydra unpickles that file, which runs what it holds. Use resume=<folder>, "
+                "or repeat the command that the run's overrides.yaml lists."
+            )
+        if argument.lstrip("+").startswith("logger.uri="):
+            require_no_password(argument.partition("=")[2].strip("'\""))
         key = argument.lstrip("+~").partition("=")[0]
         if key.replace(".", "/").startswith(("hydra/job_logging", "hydra/hydra_logging", "hydra/callbacks")):
             raise ConfigError(

@@ -21,6 +21,7 @@ from framework.errors import CheckpointError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
+from framework.storage.enclosed import require_plain_within
 from framework.storage.reading import guarded
 from framework.storage.weights import describe_mismatch
 
@@ -209,8 +210,10 @@ def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Pat
         return path
     if path.is_dir():
         for folder in (path / "checkpoints", path):
+            require_plain_within(folder / "any", path, CheckpointError)
             for name in ("model.ckpt", "best.ckpt"):
                 if (folder / name).is_file():
+                    require_plain_within(folder / name, path, CheckpointError)
                     return folder / name
             good = latest_good(folder) if folder.is_dir() else None
             if good is not None:

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from framework.configuration.registry import GROUPS
 from framework.configuration.schema import check, forbid_targets
 from framework.errors import ConfigError
+from framework.tracking.stores import require_no_password
 
 
 def _share(value: Any) -> Any:
@@ -97,6 +98,7 @@ class LoggerSettings(_Strict):
 
     name: Literal["mlflow", "none"] = "mlflow"
     uri: str | None = None
+    """Without a password; None: MLFLOW_TRACKING_URI, else mlflow.db in the outputs folder."""
     experiment: str | None = None
 
 
@@ -194,6 +196,8 @@ def settings(config: Mapping[str, Any]) -> Settings:
             own[key] = check(model, own[key], key)
     values = check(Settings, own, "")
     checked = Settings.model_validate(values)
+    if checked.logger.uri is not None:
+        require_no_password(checked.logger.uri)
     check(TrainerSettings, checked.trainer, "trainer")
     every, epochs = checked.trainer.get("check_val_every_n_epoch"), checked.trainer.get("max_epochs")
     if every and epochs:  # a shorter run is validated at its end, too

@@ -9,6 +9,7 @@ from typing import Any
 from framework.configuration.config import Config
 from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
+from framework.storage.enclosed import require_enclosed
 
 MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
 
@@ -22,6 +23,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     Raises:
         ConfigError: an unknown mode, or a fault in the config.
     """
+    require_enclosed(folder)
     if values.get("resume") not in ("auto", "never", None):
         if _sent_the_rest(folder, (values.get("logger") or {}).get("uri")):
             return None
@@ -46,13 +48,12 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
 def _sent_the_rest(folder: Path, store: str | None) -> bool:
     """Send what a run that finished could not send, since its process was killed meanwhile; whether there was any."""
     from framework.tracking.ended import sync
-    from framework.tracking.run_info import read_run_info, require_own_store
+    from framework.tracking.run_info import read_run_info
 
     info = read_run_info(folder)
     if info is None or info.status != "FINISHED" or not info.uri:
         return False
-    require_own_store(info.uri, store, folder / "run.json")
-    sent = sync(folder)
+    sent = sync(folder, store)
     if sent:
         sys.stdout.write(
             f"that run had finished; {sent} lines of its journal that were not sent yet are in its store.\n"
@@ -66,7 +67,8 @@ def _stored(
     """The config and overrides the run in `folder` was started with, but for how it is run now, which is `given`."""
     from framework.runs.run import HOW
     from framework.storage.plain_values import read_yaml
-    from framework.tracking.run_info import read_run_info, require_own_store
+    from framework.tracking.run_info import read_run_info
+    from framework.tracking.stores import confirmed
 
     keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
     others = [item for item, key in keys.items() if key not in ("resume", *HOW)]
@@ -90,8 +92,11 @@ def _stored(
         or not all(isinstance(item, str) for item in (*values, *changed))
     ):
         raise ConfigError(f"{folder / 'config.yaml'} is not a config. Start a new run.")
-    store = (given["logger"] or {}).get("uri") if "logger.uri" in keys.values() else None
-    require_own_store(str((values.get("logger") or {}).get("uri") or ""), store, folder / "config.yaml")
+    logger = values.get("logger")
+    recorded = logger.get("uri") if isinstance(logger, dict) else None
+    if recorded is not None and "logger.uri" not in keys.values():
+        store = confirmed(str(recorded), None, folder, folder / "config.yaml")
+        values["logger"]["uri"] = store.uri if store.named else None
     values["resume"] = "auto"  # also where it was begun with resume=never
     for key in HOW:
         if key in keys.values():

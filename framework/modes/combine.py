@@ -20,6 +20,7 @@ from framework.reports.report import report_test
 from framework.runs.job import by_number, recorded
 from framework.runs.run import opened
 from framework.runs.session import around, begin, calibrate, tested
+from framework.storage.enclosed import require_enclosed
 from framework.uncertainty import Joining
 
 _MODEL = "checkpoints/model.ckpt"
@@ -69,6 +70,7 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
         listed: list[str | Path] = list(members)
     else:
         folder = Path(members).expanduser()
+        require_enclosed(folder, ConfigError)
         runs = sorted((path.parent.parent for path in folder.glob(f"*/{_MODEL}")), key=by_number)
         listed = [*(runs or (job for job in recorded(folder) if (job / _MODEL).is_file()))]
     if len(listed) < 2:

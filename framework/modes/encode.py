@@ -22,6 +22,7 @@ from framework.errors import ConfigError, DataError
 from framework.runs.run import opened
 from framework.runs.session import begin, record_citations
 from framework.runs.user_files import UNREADABLE, to_read
+from framework.storage.enclosed import require_enclosed
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.storage.progress import Work
@@ -85,6 +86,7 @@ def run(config: Config) -> None:
     if not parts["encoder"]:
         raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
     collection = collected(Path(options.files).expanduser(), Path(options.into).expanduser(), options.part)
+    require_enclosed(collection.into, ConfigError)
     files = [collection.root / name for name in collection.names]
     kept, bad = to_read(build("data", parts["data"]), files, parts["data"], console)
     collection = replace(collection, names=[file.relative_to(collection.root).as_posix() for file in kept])

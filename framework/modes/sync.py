@@ -7,7 +7,6 @@ from rich.console import Console
 from framework.configuration.config import Config, Options
 from framework.errors import ConfigError
 from framework.tracking.ended import sync
-from framework.tracking.run_info import read_run_info, require_own_store
 
 
 class SyncOptions(Options):
@@ -23,7 +22,4 @@ def run(config: Config) -> None:
         raise ConfigError(
             f"mode.run={folder}: {folder / 'run.json'} does not exist. Give the folder of a run."
         )
-    info = read_run_info(folder)
-    if info is not None:
-        require_own_store(info.uri, config.settings.logger.uri, folder / "run.json")
-    Console().print(f"{sync(folder)} journal lines sent from {folder}.")
+    Console().print(f"{sync(folder, config.settings.logger.uri)} journal lines sent from {folder}.")

@@ -18,6 +18,7 @@ from framework.configuration.settings import Settings, store_experiment
 from framework.errors import DataError, UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, git_commit, package_versions
+from framework.storage.enclosed import require_enclosed
 from framework.storage.files import unwritable, write_whole
 from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_yaml
@@ -90,6 +91,7 @@ def opened(config: Config) -> Iterator[Run]:
     Continues the run in its folder where that goes on (`goes_on`); otherwise what that run left is set aside. A rank
     other than the first writes nothing: its run is a silent one.
     """
+    require_enclosed(config.folder)
     stopper = Stopper()
     earlier, resumed = read_run_info(config.folder), goes_on(config)
     if not first_rank():
@@ -120,7 +122,9 @@ def opened(config: Config) -> Iterator[Run]:
 
 def _resume(run: Run) -> str:
     """What goes on with it, as typed into a shell."""
-    return shlex.quote(f"resume={run.folder}")
+    store = run.settings.logger.uri  # a stored address is used only where the user says it again
+    words = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
+    return " ".join(map(shlex.quote, words))
 
 
 def _begin_folder(config: Config) -> None:

@@ -103,7 +103,9 @@ def verify(path: Path) -> str | None:
 def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | None:
     """The most recently written checkpoint of a folder that verifies; of these `names` only, where given."""
     files = [
-        path for path in folder.glob("*.ckpt") if path.is_file() and (names is None or path.name in names)
+        path
+        for path in folder.glob("*.ckpt")
+        if path.is_file() and not path.is_symlink() and (names is None or path.name in names)
     ]
     files.sort(key=lambda path: (path.stat().st_mtime_ns, path.name), reverse=True)
     return next((path for path in files if verify(path) is None), None)

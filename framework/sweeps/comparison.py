@@ -1,6 +1,5 @@
 """A sweep as one thing: a parent run, and the table and picture that compare its jobs."""
 
-import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -25,12 +24,11 @@ from framework.runs.run import stored_config
 from framework.storage.plain_values import read_json
 from framework.storage.progress import output
 from framework.storage.reading import RESTORE
-from framework.tracking.ended import mark_dead
-from framework.tracking.run_info import Destination, read_run_info
+from framework.tracking.ended import close_and_send
+from framework.tracking.run_info import Destination, RunInfo, read_run_info
 from framework.tracking.tracker import MlflowTracker, mlflow_store
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
-PARENT_OF = "what a sweep keeps of its parent run"
 DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
 """The tag that MLflow shows as a run's description, and the letters that fit into it."""
 RETURNED = "best validation loss (nats)"
@@ -65,24 +63,25 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
     if logger.get("name") != "mlflow":
         return None
     earlier = read_run_info(folder)  # of the sweep that is being repeated, which may have been killed
-    known = earlier.run_id if earlier else None
-    logger = {**logger, "experiment": store_experiment(config)}
-    tracker = _parent(folder, logger, known)
+    tracker = _parent(folder, config, earlier, store_experiment(config))
     tracker.open()
     tracker.set_tags({"mode": "sweep", "folder": str(folder), DESCRIPTION: f"A sweep in `{folder}`."})
     run_id = tracker.run_id
-    (folder / "parent.json").write_text(json.dumps({"run_id": run_id, "logger": logger}), encoding="utf-8")
     tracker.leave_open()
     return run_id
 
 
-def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
-    """Compare the finished jobs in `folder`: print the table, log it and a picture to the parent."""
+def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[str, Any]) -> None:
+    """Compare the finished jobs in `folder`: print the table, log it and a picture to the parent.
+
+    Args:
+        config: of the first job, as of `begin`; the store it names is the only one that is contacted.
+    """
     console = output()
     jobs = recorded(folder)
     for job in jobs:
         if _status(job) == "died" and (job / "run.json").is_file():
-            mark_dead(job)  # a killed process could not close its run
+            close_and_send(job, store_of(config))  # a killed process could not close its run
     rows = [row for row in map(_row, jobs) if row]
     files: list[Path] = []
     said = ""
@@ -108,7 +107,13 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]]) -> None:
         files.extend(_picture(compared, rows, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
         said = f"{len(rows)} runs over {', '.join(keys) or 'nothing'}.\n\n{markdown(compared, columns, better=better)}"
-    _close_parent(folder, files, said)
+    _close_parent(folder, files, said, config)
+
+
+def store_of(config: Mapping[str, Any]) -> str | None:
+    """Return the address of the store that a sweep's command names; None where it names none."""
+    uri = (config.get("logger") or {}).get("uri")
+    return None if uri is None else str(uri)
 
 
 def rank(
@@ -174,10 +179,10 @@ def rank(
     return Ranking(trials[order[0]], said)
 
 
-def close_ranking(folder: Path, said: str) -> None:
-    """Log to the parent run what a search found; `said` describes it."""
+def close_ranking(folder: Path, said: str, config: Mapping[str, Any]) -> None:
+    """Log to the parent run what a search found; `said` describes it, and `config` is as of `begin`."""
     paths = (folder / name for name in ("ranking.csv", "best.yaml"))
-    _close_parent(folder, [path for path in paths if path.is_file()], said)
+    _close_parent(folder, [path for path in paths if path.is_file()], said, config)
 
 
 def _results(job: Path) -> dict[str, Any]:
@@ -313,21 +318,23 @@ def _picture(
     return [saved(figure, folder / "comparison", stored.get("pictures", True))]
 
 
-def _parent(folder: Path, logger: Mapping[str, Any], run_id: str | None) -> MlflowTracker:
+def _parent(
+    folder: Path, config: Mapping[str, Any], earlier: RunInfo | None, experiment: str
+) -> MlflowTracker:
+    run_id = earlier.run_id if earlier else None
     return MlflowTracker(
         folder,
-        Destination(logger.get("uri"), logger["experiment"], f"sweep {folder.name}", run_id=run_id),
+        Destination(store_of(config), experiment, f"sweep {folder.name}", run_id=run_id),
         opening_patience=30.0,  # its jobs are told its id
         open_store=mlflow_store(),  # which sends what they leave, too
     )
 
 
-def _close_parent(folder: Path, files: Sequence[Path], said: str) -> None:
-    path = folder / "parent.json"
-    if not path.is_file():
+def _close_parent(folder: Path, files: Sequence[Path], said: str, config: Mapping[str, Any]) -> None:
+    begun = read_run_info(folder)  # written by `begin` of this command
+    if (config.get("logger") or {}).get("name") != "mlflow" or begun is None:
         return
-    stored = read_json(path, PARENT_OF)
-    tracker = _parent(folder, stored["logger"], stored["run_id"])
+    tracker = _parent(folder, config, begun, begun.experiment)
     tracker.open()
     if said:  # numbers of the parent's own would be charts that none of its jobs has a point in
         tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {said}"[:LONGEST_DESCRIPTION]})

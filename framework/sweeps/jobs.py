@@ -141,6 +141,7 @@ def run(
     devices: Sequence[str] = (),
     parent: str | None = None,
     starter: Starter = Fresh,
+    store: str | None = None,
 ) -> None:
     """Run every job that has not completed; returns when all have ended, however they ended.
 
@@ -153,6 +154,7 @@ def run(
         devices: CUDA devices to hand out, one to each running job; none leaves all visible to all.
         parent: tracking run the jobs are recorded under.
         starter: of their processes.
+        store: address of the tracking store that the command names.
 
     Raises:
         Stopped: a signal came.
@@ -201,7 +203,7 @@ def run(
                 running.remove(one)
                 _end(one, code)
                 if parent is not None:
-                    sending.submit(_sync, one.job.folder)
+                    sending.submit(_sync, one.job.folder, store)
                 if one.job.record["status"] == "died" and one.job.attempts <= retries and not received:
                     queue.append(one.job)
             time.sleep(0.05)
@@ -209,12 +211,12 @@ def run(
         raise Stopped(received[0])
 
 
-def _sync(folder: Path) -> None:
+def _sync(folder: Path, store: str | None) -> None:
     """Send what a job left unsent; one that died is closed and sent by the comparison."""
     from framework.tracking.ended import sync  # Hydra imports this module at every start
 
     try:
-        sync(folder)
+        sync(folder, store)
     except UserError as error:
         log.warning(f"{folder}: {error}")
 

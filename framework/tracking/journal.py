@@ -13,14 +13,18 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from framework.errors import DataError
-from framework.storage.files import write_whole
-from framework.storage.reading import guarded, opened
+from framework.storage.enclosed import open_plain, read_stream
+from framework.storage.files import replacing
+from framework.storage.reading import guarded
 
 _log = logging.getLogger(__name__)
 # json.dumps with options builds its encoder anew at each call; this one is built once.
 _encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 _NO_NUMBERS = ("nan", "inf", "-inf")
 _BLOCK = 1 << 20  # bytes read at a time: bounds the memory of a reader that is far behind
+_PATIENCE = 2.0  # seconds to wait for another writer
+LARGEST, LONGEST = 1 << 30, 1 << 24
+"""Bytes of a journal (about seven million lines), and of a line of it; what has more was not written here."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +105,10 @@ class Journal:
             if found != after:
                 offset = 0
             rewritten = self._rewritten
-            if not self.path.exists():
+            if not os.path.lexists(self.path):
                 return []
             with guarded(self.path, "a journal"):
-                file = opened(self.path)  # stays the file it is, should drop_after replace it now
+                file = read_stream(self.path)  # stays the file it is, should drop_after replace it now
         records: list[dict[str, Any]] = []
         with file:
             file.seek(offset)
@@ -138,16 +142,16 @@ class Journal:
         with self._lock:
             self.open()
             self._flush()
-            kept: list[bytes] = []
             dropped = 0
-            for line in self.path.read_bytes().splitlines(keepends=True):
-                record = _record(line)
-                if record is not None and record.get("step", step) > step:
-                    dropped += 1
-                else:
-                    kept.append(line)  # a damaged one too: nothing goes that was not understood
             marker = {"n": self.last + 1, "time": round(time.time(), 3), "resumed_after": int(step)}
-            write_whole(self.path, b"".join([*kept, _encode(marker).encode(), b"\n"]))
+            with replacing(self.path) as partial, partial.open("xb") as kept, read_stream(self.path) as file:
+                while line := file.readline(LONGEST):
+                    record = _record(line)
+                    if record is not None and record.get("step", step) > step:
+                        dropped += 1
+                    else:
+                        kept.write(line)  # a damaged one too: nothing goes that was not understood
+                kept.write(_encode(marker).encode() + b"\n")
             self.last += 1
             self._reopen()
             return dropped
@@ -268,22 +272,36 @@ class Journal:
 
     def _mend(self) -> int:
         """Cut off a torn last line; the number of the last whole one."""
-        if not self.path.exists():
+        if not os.path.lexists(self.path):
             return 0
-        content = self.path.read_bytes()
-        end = content.rfind(b"\n") + 1
-        if end < len(content):
-            torn = len(content) - end
-            _log.warning(
-                "Cut off an unfinished last line (%d bytes) of %s, left by a crash.", torn, self.path
-            )
-            os.truncate(self.path, end)
+        with os.fdopen(open_plain(self.path, os.O_RDWR), "r+b") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > LARGEST:
+                raise DataError(
+                    f"The journal {self.path} has {size:,} bytes; wanted {LARGEST:,} at most. Rename it, and the run "
+                    "begins a new one."
+                )
+            start = max(0, size - 2 * LONGEST)
+            file.seek(start)
+            content = file.read()
+            end = content.rfind(b"\n") + 1
+            if end < len(content) and (end or not start):
+                torn = len(content) - end
+                _log.warning(
+                    "Cut off an unfinished last line (%d bytes) of %s, left by a crash.", torn, self.path
+                )
+                file.truncate(start + end)
         while end > 0:
-            start = content.rfind(b"\n", 0, end - 1) + 1
-            record = _record(content[start:end])
+            line = content.rfind(b"\n", 0, end - 1) + 1
+            record = _record(content[line:end])
             if record is not None:
                 return record["n"]
-            end = start
+            end = line
+        if start:
+            raise DataError(
+                f"The journal {self.path} has no line that can be read in its last {size - start:,} bytes. Rename it, "
+                "and the run begins a new one."
+            )
         return 0
 
     def _parse(self, block: bytes, after: int) -> list[dict[str, Any]]:
@@ -302,7 +320,7 @@ class Journal:
 
 
 def _append_to(path: Path) -> int:
-    return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    return open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
 
 def _claim(path: Path) -> int:
@@ -311,9 +329,9 @@ def _claim(path: Path) -> int:
     A POSIX record lock: unlike flock, it is not inherited by data-loading processes, which outlive a killed
     parent by seconds. It stands on a file of its own, since closing any descriptor of a file ends it.
     """
-    owner = os.open(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    owner = open_plain(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT)
     try:
-        fcntl.lockf(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(owner)
     except (BlockingIOError, PermissionError):
         holder = os.pread(owner, 32, 0).decode(errors="replace").strip() or "unknown"
         os.close(owner)
@@ -328,11 +346,23 @@ def _claim(path: Path) -> int:
     return owner
 
 
+def _lock(owner: int) -> None:
+    """Lock a descriptor; wait a moment, for which who closes the run of a killed process (`ended`) holds it."""
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            return fcntl.lockf(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            if time.monotonic() > deadline:
+                raise
+        time.sleep(0.02)
+
+
 def _whole_lines(file: BinaryIO) -> bytes:
     """The next block of about a mebibyte that ends with a line; empty where there is no whole one."""
     block = file.read(_BLOCK)
     if not block.endswith(b"\n"):
-        block += file.readline()
+        block += file.readline(LONGEST)
     return block[: block.rfind(b"\n") + 1]
 
 
@@ -356,8 +386,8 @@ def _record(line: bytes) -> dict[str, Any] | None:
         value in _NO_NUMBERS if isinstance(value, str) else isinstance(value, int | float)
         for value in values.values()
     )
-    placed = all(isinstance(record.get(key), int | float) for key in ("time", "step", "epoch"))
-    return record if whole and (placed or not values) else None
+    placed = [isinstance(record[key], int | float) for key in ("time", "step", "epoch") if key in record]
+    return record if whole and all(placed) and (len(placed) == 3 or not values) else None
 
 
 @cache

@@ -15,17 +15,11 @@ from typing import final
 
 from framework.errors import CheckpointError, DataError
 from framework.storage.cache import folder as cache_folder
+from framework.storage.enclosed import require_enclosed, require_plain_within
 from framework.storage.files import alone, remove_leftovers, replacing
-from framework.tracking.run_info import (
-    MODEL,
-    RunInfo,
-    default_uri,
-    read_run_info,
-    sqlite_path,
-    store_uri,
-    without_password,
-)
+from framework.tracking.run_info import MODEL, RunInfo, read_run_info
 from framework.tracking.sender import Record, Store, reason
+from framework.tracking.stores import address, require_own_files, sqlite_path, without_password
 
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 # One retry instead of minutes of them: who calls this tries again by itself, and has to notice its end.
@@ -65,7 +59,7 @@ class MlflowStore(Store):
     """
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
-        self._folder = folder
+        self._folder, self._info = folder, info
         self._client, experiment_id = _opened(info)
         run = self._found(info, experiment_id)
         self.replay = {"replay_after": info.replay_after, "replay_until": info.replay_until}
@@ -87,11 +81,17 @@ class MlflowStore(Store):
         }
         self._run_id: str = run.info.run_id
         self._experiment_id: str = run.info.experiment_id
+        self._files: str | None = run.info.artifact_uri
         self._model_name = re.sub(r"[^\w-]", "_", info.run_name.partition(",")[0])[:_LONGEST_NAME] or "model"
         self._params: dict[str, str] = dict(run.data.params)
         # The last step of each metric; RunData itself gives the values alone.
         self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
         self._renamed: set[str] = set()
+
+    def _require_own_files(self, location: str | None) -> None:
+        """Refuse to write files where a store that nobody named wants them, but in its own folder."""
+        if not self._info.named:
+            require_own_files(self._info.uri, (location or "",))
 
     def send(self, batch: Sequence[Record]) -> None:
         """As in `Store`: SQL stores know a metric by key, time, step and value, and keep it once."""
@@ -115,12 +115,19 @@ class MlflowStore(Store):
 
     def send_file(self, path: str, place: str) -> None:
         """As in `Store`; a file that is gone, or leads out of the run folder, is said and passed over."""
-        file, home = self._folder / path, self._folder.resolve()
+        file = self._folder / path
         # a journal may be a stranger's: what lies elsewhere is not the run's to give away
-        held = [file, *file.rglob("*")] if file.is_dir() else [file]
-        if not all(item.resolve().is_relative_to(home) for item in held):
-            _log.warning("%s leads out of the run folder %s: it is not sent.", file, home)
-        elif place == MODEL and file.is_file():
+        try:
+            if not file.is_relative_to(self._folder) or ".." in file.parts:
+                raise DataError("it names a file elsewhere")
+            require_plain_within(file, self._folder)
+            if file.is_dir():
+                require_enclosed(file)
+        except DataError as error:
+            _log.warning("%s leads out of the run folder %s (%s): it is not sent.", file, self._folder, error)
+            return
+        self._require_own_files(self._files)
+        if place == MODEL and file.is_file():
             self._send_model(file)
         elif file.is_dir():
             self._client.log_artifacts(
@@ -139,6 +146,7 @@ class MlflowStore(Store):
         model = found[0] if found else None
         if model is None:
             model = self._client.create_logged_model(self._experiment_id, self._model_name, self._run_id)
+        self._require_own_files(model.artifact_location)
         described = Model(run_id=self._run_id, model_id=model.model_id)
         described.add_flavor(
             "python_function", loader_module=_LOADER, data=file.name, python_version=platform.python_version()
@@ -154,7 +162,10 @@ class MlflowStore(Store):
     def _found(self, info: RunInfo, experiment_id: str) -> Run | None:
         if info.run_id is not None:
             try:
-                return self._client.get_run(info.run_id)
+                run = self._client.get_run(info.run_id)
+                # an id that a file names may be that of another run of the user's
+                if run.data.tags.get(_KEY, info.key) == info.key:
+                    return run
             except MlflowException as error:
                 if error.error_code != "RESOURCE_DOES_NOT_EXIST":
                     raise
@@ -248,17 +259,23 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
     Raises:
         CheckpointError: the store has no such run, or the run has no checkpoints.
     """
-    uri = store_uri(uri) if uri else default_uri(Path.cwd() / "outputs" / "any")
-    shown = without_password(uri)
-    path = sqlite_path(uri)
+    store = address(uri, Path.cwd() / "outputs" / "any")
+    shown = without_password(store.uri)
+    path = sqlite_path(store.uri)
     if path is not None and not path.is_file():  # MLflow would make one
         raise CheckpointError(f"There is no tracking store {path}. Give its address (logger.uri=...).")
-    client = MlflowClient(tracking_uri=uri)
+    if not store.named:
+        require_own_files(store.uri)
+    client = MlflowClient(tracking_uri=store.uri)
     try:
         run = client.get_run(run_id)
         made = Path(run.data.tags.get(_FOLDER, ""))
-        if _FOLDER in run.data.tags and _holds(made, run_id):
+        # a store that nobody named may have come with somebody's folder, and says nothing of other folders
+        trusted = store.named or (path is not None and made.resolve().is_relative_to(path.parent.resolve()))
+        if _FOLDER in run.data.tags and trusted and _holds(made, run_id):
             return made
+        if not store.named:
+            require_own_files(store.uri, (run.info.artifact_uri or "",))
         models = _models(run)
         if not models and not client.list_artifacts(run_id, "checkpoints"):
             raise CheckpointError(
@@ -268,7 +285,9 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         copy.mkdir(exist_ok=True)
         if models:
             place = client.get_logged_model(models[0]).artifact_location  # "models:/" asks another store
-            return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=uri))
+            if not store.named:
+                require_own_files(store.uri, (place or "",))
+            return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=store.uri))
         client.download_artifacts(run_id, "checkpoints", str(copy))  # a run of version 0.1
     except MlflowException as error:
         raise CheckpointError(f"Run {run_id} cannot be had from {shown}: {reason(error)}.") from error
@@ -291,6 +310,8 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
         client = MlflowClient(tracking_uri=info.uri)
         return client, _experiment(client, info)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if not info.named:
+        require_own_files(info.uri)
     # MLflow's own migrations and get-or-create fail when several processes begin at once.
     with alone(path.with_name(f".{path.name}.lock")):
         if not path.exists() or path.stat().st_size == 0:

@@ -10,7 +10,8 @@ from typing import Any
 
 from framework.errors import UserError
 from framework.tracking.journal import Journal
-from framework.tracking.run_info import RunInfo, Sidecar, without_password
+from framework.tracking.run_info import RunInfo, Sidecar
+from framework.tracking.stores import without_password
 
 _log = logging.getLogger(__name__)
 

@@ -18,16 +18,10 @@ from framework.errors import DataError
 from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.tracking.journal import Journal
-from framework.tracking.run_info import (
-    SIDECAR,
-    Destination,
-    RunInfo,
-    Sidecar,
-    read_run_info,
-    without_password,
-)
+from framework.tracking.run_info import SIDECAR, Destination, RunInfo, Sidecar, read_run_info
 from framework.tracking.sender import OpenStore, Sender
 from framework.tracking.store_process import StoreProcess
+from framework.tracking.stores import without_password
 
 _log = logging.getLogger(__name__)
 
@@ -321,7 +315,8 @@ def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None
             started=earlier.started,
             experiment_id=earlier.experiment_id,
         )
-        if (earlier.uri, earlier.run_id) == (known.uri, known.run_id):  # another store gets everything
+        here = (without_password(known.uri), known.run_id)
+        if (without_password(earlier.uri), earlier.run_id) == here:  # another store gets everything
             known = replace(
                 known,
                 sent=earlier.sent,

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from framework.configuration.composition import in_quotes
 from framework.errors import ConfigError
+from framework.storage.enclosed import require_enclosed
 from framework.storage.files import alone
 from framework.sweeps import jobs as sweep
 from framework.sweeps.processes import Forks, Fresh, Starter
@@ -59,6 +60,7 @@ class PoolLauncher(Launcher):
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         self.loader = hydra_context.config_loader
         self.config = config
+        require_enclosed(Path(str(config.hydra.sweep.dir)))  # before Hydra writes multirun.yaml into it
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Called once, or by some sweepers once for each batch of jobs."""
@@ -83,7 +85,7 @@ class PoolLauncher(Launcher):
             _leave_nothing(folder)
             raise
         if not self.launched:
-            self.parent = comparison.begin(folder, _plain(configs[0], folder))
+            self.parent = comparison.begin(folder, values[0])
         self.launched += [job.overrides for job in jobs]
         try:
             with self._starter(jobs, values) as starter:
@@ -94,9 +96,10 @@ class PoolLauncher(Launcher):
                     devices=self.devices,
                     parent=self.parent,
                     starter=starter,
+                    store=comparison.store_of(values[0]),
                 )
         finally:
-            comparison.summarise(folder, self.launched)
+            comparison.summarise(folder, self.launched, values[0])
         failure = sweep.failure(jobs)
         return [_returned(job, failure) for job in jobs]
 

@@ -1,6 +1,5 @@
 """The best trial of a search as an experiment file."""
 
-import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,21 +11,20 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from rich.console import Console
 
+from framework.storage.files import write_whole
+
 OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
 """Keys that say how a trial was run, not what it was; they stay on the command line."""
 
 
 def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: str) -> None:
-    """Write best.yaml into `folder`, and a link by which `--config-dir=<folder>` finds it as an experiment."""
+    """Write best.yaml into `folder`, and a copy by which `--config-dir=<folder>` finds it as an experiment."""
     name, content = experiment(overrides, loader, found)
     path = folder / "best.yaml"
-    path.write_text(content, encoding="utf-8")
+    write_whole(path, content.encode())
     for old in (folder / "experiment").rglob("*.yaml"):  # of an earlier search in this folder
-        if old.is_symlink():
-            old.unlink()
-    link = folder / "experiment" / f"{name}.yaml"
-    link.parent.mkdir(parents=True, exist_ok=True)
-    link.symlink_to(os.path.relpath(path, link.parent))
+        old.unlink()
+    write_whole(folder / "experiment" / f"{name}.yaml", content.encode())
     command = content.splitlines()[1].removeprefix("# python -m framework ")
     Console().print(
         f"best trial: {path}\n"

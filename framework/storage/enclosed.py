@@ -1,0 +1,125 @@
+"""Run folders that may be a stranger's: plain files inside the folder, opened without following a link.
+
+A folder that somebody sends can hold a symbolic or a hard link, a pipe or a device in place of any file. Whoever
+followed it would read, change or cut off a file of the user, or wait for ever. So a command calls `require_enclosed`
+before it uses a folder, and opens single files through `open_plain`, `read_plain` or `require_plain_within`.
+"""
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from framework.errors import DataError, UserError, shown
+
+MOST_ENTRIES = 1_000_000
+"""Files and folders that a run or sweep folder may hold; more are not looked through."""
+REMEDY = "A run folder may be a stranger's, so no link in it is followed. Replace it by a copy or remove it."
+
+
+def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
+    """Refuse a folder that holds anything but folders and plain files of its own; one that does not exist passes.
+
+    The folder itself may be a link: its name comes from the user.
+
+    Args:
+        folder: of a run, a sweep, or what another command writes into.
+        error: class of the error.
+
+    Raises:
+        error: an entry is a link, has a second name elsewhere (a hard link), or is no regular file; names the first.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise error(f"{shown(folder)} is no folder. Give the folder of a run.")
+    folders, seen = [os.fspath(folder)], 0
+    while folders:
+        try:
+            with os.scandir(folders.pop()) as entries:
+                for entry in entries:
+                    seen += 1
+                    status = entry.stat(follow_symlinks=False)
+                    if fault := _fault(status):
+                        raise error(f"{shown(entry.path)} is {fault}. {REMEDY}")
+                    if stat.S_ISDIR(status.st_mode):
+                        folders.append(entry.path)
+        except FileNotFoundError:  # removed meanwhile by the process that writes there
+            continue
+        except OSError as refused:
+            raise error(
+                f"{shown(refused.filename or folder)} cannot be looked through ({refused.strerror}). Give a "
+                "folder that you may read."
+            ) from refused
+        if seen > MOST_ENTRIES:
+            raise error(
+                f"{shown(folder)} holds more than {MOST_ENTRIES:,} files; wanted the folder of a run. Give that one."
+            )
+
+
+def require_plain_within(file: Path, folder: Path, error: type[UserError] = DataError) -> None:
+    """Refuse a file below `folder` that a link leads to; errors as `require_enclosed`. A missing file passes."""
+    below = file.relative_to(folder)
+    for part in (*reversed(below.parents[:-1]), below):
+        path = folder / part
+        try:
+            status = path.lstat()
+        except FileNotFoundError:
+            return
+        if fault := _fault(status):
+            raise error(f"{shown(path)} is {fault}. {REMEDY}")
+
+
+def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
+    """Open a file of a run folder as `os.open` does, but never through a link; the descriptor.
+
+    `flags` never hold O_TRUNC, which would cut off a file before it is known whose it is.
+
+    Raises:
+        DataError: it is a link, has a second name elsewhere, or is no regular file.
+        OSError: as `os.open`.
+    """
+    assert not flags & os.O_TRUNC
+    try:
+        # without O_NONBLOCK the opening of a pipe would wait for its other end
+        descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode)
+    except OSError:
+        if path.is_symlink():
+            raise DataError(f"{shown(path)} is a link. {REMEDY}") from None
+        raise
+    if fault := _fault(os.fstat(descriptor)):
+        os.close(descriptor)
+        raise DataError(f"{shown(path)} is {fault}. {REMEDY}")
+    return descriptor
+
+
+def read_stream(path: Path) -> BinaryIO:
+    """Open a file of a run folder for reading; errors as `open_plain`, and whoever asks closes it."""
+    return os.fdopen(open_plain(path, os.O_RDONLY), "rb")
+
+
+def read_plain(path: Path, most: int) -> bytes:
+    """Return all of a file of a run folder.
+
+    Raises:
+        DataError: as `open_plain`, or it has more than `most` bytes.
+        OSError: as `os.open`.
+    """
+    with read_stream(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > most:
+            raise DataError(
+                f"{shown(path)} has {size:,} bytes; wanted {most:,} at most. Restore it from its source."
+            )
+        return stream.read(most + 1)
+
+
+def _fault(status: os.stat_result) -> str:
+    """What an entry is that it may not be; empty for a folder or a plain file."""
+    if stat.S_ISLNK(status.st_mode):
+        return "a link"
+    if stat.S_ISDIR(status.st_mode):
+        return ""
+    if not stat.S_ISREG(status.st_mode):
+        return "no regular file"
+    return "" if status.st_nlink <= 1 else "a file that has a second name elsewhere (a hard link)"
