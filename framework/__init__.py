@@ -1,14 +1,12 @@
 """An experiment framework for robust and efficient visual learning; `python -m framework --help` says what it runs."""
 
-from __future__ import annotations
-
+# Only what Python has loaded by itself is imported here: `python -m` looks for anything else in the working directory
+# until `__main__` forbids it.
 import sys
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import spec_from_loader
-from typing import TYPE_CHECKING, ClassVar
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import ModuleType
@@ -33,50 +31,52 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-class _Moved(MetaPathFinder, Loader):
-    """Old names of modules that plugins import: each is the module that is at its new place, not a copy of it."""
+_NOW = {
+    f"framework.{old}": f"framework.{new}"
+    for old, new in {
+        "cache": "storage.cache",
+        "camera": "geometry.camera",
+        "cdf": "distributions.protocol",
+        "circular": "distributions.circular",
+        "circular_moments": "distributions.circular_moments",
+        "class_probabilities": "distributions.class_probabilities",
+        "clouds": "geometry.clouds",
+        "density": "distributions.density",
+        "fields": "datasets.fields",
+        "generated": "storage.generated",
+        "images": "datasets.images",
+        "meshes": "geometry.meshes",
+        "module_flags": "calibration.module_flags",
+        "monte_carlo": "distributions.protocol",
+        "nan": "distributions.checks",
+        "nearest": "geometry.nearest",
+        "normals": "distributions.protocol",
+        "raw_numbers": "heads.parameters",
+        "rearranged": "distributions.batch_shapes",
+        "rotation": "geometry.rotation",
+        "runs.description": "configuration.description",
+        "runs.loading": "configuration.loading",
+        "temper": "distributions.tempering",
+        "validation": "calibration.validation",
+    }.items()
+}
+"""Old names of modules that plugins import, and where those are now."""
 
-    NOW: ClassVar = {
-        f"framework.{old}": f"framework.{new}"
-        for old, new in {
-            "cache": "storage.cache",
-            "camera": "geometry.camera",
-            "cdf": "distributions.protocol",
-            "circular": "distributions.circular",
-            "circular_moments": "distributions.circular_moments",
-            "class_probabilities": "distributions.class_probabilities",
-            "clouds": "geometry.clouds",
-            "density": "distributions.density",
-            "fields": "datasets.fields",
-            "generated": "storage.generated",
-            "images": "datasets.images",
-            "meshes": "geometry.meshes",
-            "module_flags": "calibration.module_flags",
-            "monte_carlo": "distributions.protocol",
-            "nan": "distributions.checks",
-            "nearest": "geometry.nearest",
-            "normals": "distributions.protocol",
-            "raw_numbers": "heads.parameters",
-            "rearranged": "distributions.batch_shapes",
-            "rotation": "geometry.rotation",
-            "runs.description": "configuration.description",
-            "runs.loading": "configuration.loading",
-            "temper": "distributions.tempering",
-            "validation": "calibration.validation",
-        }.items()
-    }
+
+class _Moved:
+    """A finder by which an old name is the module at its new place, not a copy of it."""
 
     def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        return spec_from_loader(fullname, self) if fullname in self.NOW else None
+        self, fullname: str, path: "Sequence[str] | None", target: "ModuleType | None" = None
+    ) -> "ModuleSpec | None":
+        return ModuleSpec(fullname, self) if fullname in _NOW else None  # type: ignore[arg-type]
 
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        module = import_module(self.NOW[spec.name])
+    def create_module(self, spec: ModuleSpec) -> "ModuleType":
+        module = import_module(_NOW[spec.name])
         self.spec = module.__spec__
         return module
 
-    def exec_module(self, module: ModuleType) -> None:
+    def exec_module(self, module: "ModuleType") -> None:
         module.__spec__ = self.spec  # which the import system has just replaced by the old name's
 
 

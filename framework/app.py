@@ -44,7 +44,7 @@ def _run() -> None:
     if spec is None or not spec.origin or Path(spec.origin).resolve() != expected:
         raise ConfigError(
             f"The package `plugins` was found at {spec and spec.origin}, not at {expected}: a file or folder of that "
-            "name in the current directory hides it. Rename it, run from elsewhere, or use `python -P -m framework`."
+            "name hides it. Rename it, take its folder out of PYTHONPATH, or use `python -P -m framework`."
         )
     if sys.argv[1:] == ["mode=plugins"]:  # needs no config, and so makes no run folder
         from framework.modes.plugins import show

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -266,6 +267,7 @@ def test_a_shadowed_plugins_package_is_named(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "framework", "mode=plugins"],
         cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
         capture_output=True,
         text=True,
         timeout=60,
