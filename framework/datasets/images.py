@@ -2,6 +2,7 @@
 
 import math
 import os
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,18 +21,19 @@ from framework.data import Batch
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.storage import reading
+from framework.storage.limits import AT_ONCE, LONGEST_SIDE, MOST_PADDED, MOST_PIXELS, MOST_PIXELS_OF
 from framework.storage.progress import tracked
 
 READERS = min(8, os.cpu_count() or 1)
 """So many threads decode at once."""
 FORMATS = ("AVIF", "BMP", "GIF", "ICO", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
 """Of Pillow's formats those that decode pixels and do nothing else: EPS starts another program."""
-MOST_PIXELS, LONGEST_SIDE = 2**26 + 2**24, 2**16
-"""Of an image as it is stored; below where Pillow warns."""
 SUFFIXES = (".avif", ".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """The usual ends of their names; a file of another one is an image where it can be read."""
-MOST_PADDED = 2**26
-"""Pixels of a square; where one that must be padded has more, it is scaled down before."""
+ORIENTATION = 0x0112
+"""Number of EXIF's entry that says how an image is turned."""
+STRIP = 256
+"""Rows that are converted at once."""
 IN_MEMORY = 2 * 2**30
 """Crops of up to so many bytes are kept in memory."""
 
@@ -67,10 +69,10 @@ class Crop:
         Raises:
             DataError: the file is missing, is no image, is cut short, or the box lies outside the image.
         """
-        with opened(self.file) as raw:
+        with opened(self.file) as raw, DECODED.taking(raw.width * raw.height):
             image = plain(raw, self.channels, upright=self.upright)
-        whole = (0.0, 0.0, float(image.width), float(image.height))
-        pixels = square(image, self.box or whole, self.margin, self.side)
+            whole = (0.0, 0.0, float(image.width), float(image.height))
+            pixels = square(image, self.box or whole, self.margin, self.side)
         if pixels is None:
             raise self._outside(image.size)
         return blurred(torch.from_numpy(pixels), self.blur)
@@ -104,25 +106,71 @@ def opened(file: Path) -> Iterator[Image.Image]:
         reading.opened(file) as stream,
         Image.open(stream, formats=FORMATS) as image,
     ):
-        if image.width * image.height > MOST_PIXELS or max(image.size) > LONGEST_SIDE:
+        most = MOST_PIXELS_OF.get(image.format or "", MOST_PIXELS)
+        if image.width * image.height > most or max(image.size) > LONGEST_SIDE:
             raise ValueError(
-                f"{image.width} x {image.height} pixels; at most {MOST_PIXELS}, and {LONGEST_SIDE} along a side"
+                f"{image.width} x {image.height} pixels; at most {most}, and {LONGEST_SIDE} along a side"
             )
         yield image
 
 
+class AtOnce:
+    """Lets threads hold so many pixels together, and one of them alone any number: decoded images take the memory.
+
+    Args:
+        most: pixels.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most, self.taken, self.changed = most, 0, threading.Condition()
+        os.register_at_fork(after_in_child=self._forget)
+
+    @contextmanager
+    def taking(self, pixels: int) -> Iterator[None]:
+        """Wait until there is room for so many pixels, and hold it."""
+        with self.changed:
+            self.changed.wait_for(lambda: not self.taken or self.taken + pixels <= self.most)
+            self.taken += pixels
+        try:
+            yield
+        finally:
+            with self.changed:
+                self.taken -= pixels
+                self.changed.notify_all()
+
+    def _forget(self) -> None:
+        """Of the threads that hold some a forked process has none."""
+        self.taken, self.changed = 0, threading.Condition()
+
+
+DECODED = AtOnce(AT_ONCE)
+
+
 def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
     """Decode an image to RGB or grey with eight bits, however it was stored; transparent pixels become white."""
-    whole = ImageOps.exif_transpose(image) if upright else image
-    if whole.mode == "F":
+    if image.mode == "F":
         raise ValueError("its pixels are floating-point numbers of unknown range; wanted 8 or 16 bits")
-    if whole.mode.startswith("I"):
-        whole = Image.fromarray((np.asarray(whole).clip(0, 65535) // 257).astype(np.uint8))
-    if "transparency" in whole.info or whole.mode in ("LA", "PA", "RGBA"):
-        whole = Image.alpha_composite(Image.new("RGBA", whole.size, "white"), whole.convert("RGBA"))
+    turned = upright and image.getexif().get(ORIENTATION, 1) != 1
+    whole = ImageOps.exif_transpose(image) if turned else image  # which would copy it in any case
     whole.load()
     mode = "RGB" if channels == 3 else "L"
-    return whole if whole.mode == mode else whole.convert(mode)
+    if whole.mode == mode and "transparency" not in whole.info:
+        return whole
+    found = Image.new(mode, whole.size)
+    # in strips: beside the image and the result a whole one of each step would take four times the memory
+    for top in range(0, whole.height, STRIP):
+        strip = whole.crop((0, top, whole.width, min(top + STRIP, whole.height)))
+        found.paste(_eight_bit(strip).convert(mode), (0, top))
+    return found
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    """The same without alpha, and with eight bits."""
+    if image.mode.startswith("I"):
+        return Image.fromarray((np.asarray(image).clip(0, 65535) // 257).astype(np.uint8))
+    if "transparency" in image.info or image.mode in ("LA", "PA", "RGBA"):
+        return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
+    return image
 
 
 def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
@@ -146,14 +194,29 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
         small = (left / step, top / step, right / step, bottom / step)
         return square(image.reduce(step), small, margin, side)
     cut = image if inside == (0, 0, *image.size) else image.crop(inside)
-    missing = ((inside[1] - first_y, last_y - inside[3]), (inside[0] - first_x, last_x - inside[2]))
-    if any(map(any, missing)):
-        pixels = np.asarray(cut)
-        cut = Image.fromarray(np.pad(pixels, (*missing, (0, 0))[: pixels.ndim], mode="edge"))
+    if padded:
+        cut = _padded(cut, inside[0] - first_x, inside[1] - first_y, (last_x - first_x, last_y - first_y))
     start_x, start_y = max(0.0, x - half - first_x), max(0.0, y - half - first_y)
     window = (start_x, start_y, min(cut.width, start_x + 2 * half), min(cut.height, start_y + 2 * half))
     result = np.asarray(cut.resize((side, side), Image.Resampling.BILINEAR, box=window))
     return np.array(np.atleast_3d(result).transpose(2, 0, 1), order="C")
+
+
+def _padded(image: Image.Image, left: int, top: int, size: tuple[int, int]) -> Image.Image:
+    """An image of `size` in which this one lies at (left, top); around it its border pixels are repeated."""
+    width, height = size
+    right, bottom = left + image.width, top + image.height
+    found = Image.new(image.mode, size)
+    found.paste(image, (left, top))
+    for edge, first, last in ((left, 0, left), (right - 1, right, width)):
+        column = found.crop((edge, top, edge + 1, bottom))
+        if last > first:
+            found.paste(column.resize((last - first, image.height), Image.Resampling.NEAREST), (first, top))
+    for edge, first, last in ((top, 0, top), (bottom - 1, bottom, height)):
+        if last > first:
+            row = found.crop((0, edge, width, edge + 1))
+            found.paste(row.resize((width, last - first), Image.Resampling.NEAREST), (0, first))
+    return found
 
 
 def clipped(box: Box, size: tuple[int, int]) -> Box | None:

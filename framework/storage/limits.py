@@ -12,7 +12,7 @@ BUILDING_TIMES, BUILDING_BYTES = 8, 2**27
 Members that are laid side by side are allocated twice, orthogonal first weights three times; bases of point sets and
 tables of constants need no weights.
 """
-CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 30_000
+CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 10_000
 """Operations of torch for building a stored model: so many for each tensor of its weights, and so many beside.
 
 A layer takes about ten; the second number takes less than a second.
@@ -36,3 +36,16 @@ MOST_DRAWS = 2**17
 """Samples of a density that a stored setting may ask for; the usual number is 1000."""
 MOST_DRAWN = 2**26
 """Numbers that all of them together may be, of one density; up to 1000 samples may be of any density."""
+
+# images
+
+MOST_PIXELS, LONGEST_SIDE = 2**25 + 2**24, 2**16
+"""Of an image as it is stored: 8,688 × 5,792, a camera's of 50 megapixels. Decoded, Pillow holds 4 bytes for each; with
+alpha, or where its square is padded, it is there twice.
+"""
+MOST_PIXELS_OF = {"WEBP": 2**25, "JPEG2000": 2**25, "AVIF": 2**25}
+"""Of formats whose decoders hold the image two or three times beside."""
+MOST_PADDED = 2**26
+"""Pixels of a square; where one that must be padded has more, it is scaled down before."""
+AT_ONCE = 2**25
+"""Pixels of images that several threads decode at the same time."""

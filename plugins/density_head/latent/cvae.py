@@ -15,6 +15,7 @@ from framework.density_head import DensityHead
 from framework.distributions.protocol import tempered
 from framework.heads.parameters import require_finite, require_trained
 from framework.heads.unit import Unit
+from framework.storage.limits import MOST_DRAWS
 from framework.target import Target
 from plugins.density_head.latent.decoder import LARGEST_FEATURE, LatentDecoder
 from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity
@@ -160,8 +161,8 @@ class CVAEHead(DensityHead):
         *,
         latent: Annotated[int, Field(ge=1)] = 8,
         hidden: Annotated[int, Field(ge=1)] = 128,
-        training_samples: Annotated[int, Field(ge=1)] = 10,
-        samples: Annotated[int, Field(ge=1)] = 500,
+        training_samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 10,
+        samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 500,
         tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
         backbones: Literal["shared", "each"] = "shared",
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework

@@ -14,6 +14,7 @@ from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import tempered
 from framework.heads.parameters import require_finite, require_trained
+from framework.storage.limits import MOST_DRAWS
 from framework.target import Target
 from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity, sampled_mixture
@@ -91,8 +92,8 @@ class SCVAEHead(DensityHead):
         *,
         latent: Annotated[int, Field(ge=1)] = 2,
         hidden: Annotated[int, Field(ge=1)] = 128,
-        training_samples: Annotated[int, Field(ge=1)] = 50,
-        samples: Annotated[int, Field(ge=1)] = 500,
+        training_samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 50,
+        samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 500,
         tolerance: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None,
         component: DensityHead = MODERATE,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:

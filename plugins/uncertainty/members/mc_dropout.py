@@ -16,6 +16,7 @@ from framework.data import Batch
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
+from framework.storage.limits import MOST_DRAWS
 from framework.uncertainty import Uncertainty
 from plugins.uncertainty.members.equal_mixture import equal_mixture
 
@@ -63,7 +64,9 @@ class MCDropout(Uncertainty):
   year      = {2016}
 }"""
 
-    def __init__(self, model: Callable[[], Predictor], *, samples: Annotated[int, Field(ge=1)] = 50) -> None:
+    def __init__(
+        self, model: Callable[[], Predictor], *, samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 50
+    ) -> None:
         super().__init__()
         self.model = model()
         self.samples = samples
