@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 
 from framework.configuration.registry import GROUPS, installed
-from framework.runs.repository import git_commit as git_commit
 
 _PACKAGES = ("torch", "pytorch-lightning", "hydra-core", "omegaconf", "numpy", "mlflow")
 
