@@ -17,7 +17,8 @@ from framework.configuration.config import Config
 from framework.configuration.settings import Settings, store_experiment
 from framework.errors import DataError, UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
-from framework.runs.provenance import flatten, git_commit, package_versions
+from framework.runs.provenance import flatten, package_versions
+from framework.runs.repository import git_commit
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import unwritable, write_whole
 from framework.storage.first_rank import first_rank
