@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-from framework.tracking.signals import SIGNALS
+from framework.tracking.signals import SIGNALS, ending_with_parent
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -16,7 +16,8 @@ def carry_out(command: Sequence[str]) -> None:
 
     Ctrl-C, SIGTERM and the closing of a terminal are passed on to it, once each: it has a process group of its own,
     since from a terminal it would get them a second time, which hurries it. `subprocess.run` kills what has not ended
-    a quarter of a second after Ctrl-C, and on SIGTERM leaves a sweep to itself.
+    a quarter of a second after Ctrl-C, and on SIGTERM leaves a sweep to itself. Where this process is killed, the
+    command gets SIGTERM (Linux).
 
     Raises:
         SystemExit: it was told to stop; with the exit code that shells give.
@@ -36,7 +37,7 @@ def carry_out(command: Sequence[str]) -> None:
 
     before = {number: signal.signal(number, passed_on) for number in numbers}
     try:
-        started.append(subprocess.Popen(command, cwd=ROOT, process_group=0))
+        started.append(subprocess.Popen(command, cwd=ROOT, process_group=0, preexec_fn=ending_with_parent()))
         for number in early:
             started[0].send_signal(number)
         code = started[0].wait()

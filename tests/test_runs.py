@@ -108,7 +108,7 @@ def test_a_killed_run_goes_on_with_the_same_bits(
     ]
     killed = framework(*arguments)
     assert killed.code == -signal.SIGKILL
-    assert status(killed) == "RUNNING"
+    wait_for(lambda: status(killed) == "KILLED")
     resumed = framework(f"resume={killed.folder}", f"workers={2 - workers}", "threads=1")
     assert resumed.code == 0, resumed.out
     assert "resuming from" in resumed.out

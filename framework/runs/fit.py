@@ -1,6 +1,9 @@
 """Fits the session's predictor: by gradient with Lightning, or at once where its head has no gradient."""
 
+import shlex
+import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytorch_lightning as pl
@@ -15,11 +18,13 @@ from framework.runs.run import Run
 from framework.runs.session import Session
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
+from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, trained
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import KeepCheckpoints, Report, StopAtBatch, StopEarly, Training
 from framework.training.progress import Progress
+from framework.training.rank_processes import sharing_one_fate
 from framework.uncertainty import outermost
 
 
@@ -35,6 +40,8 @@ def fit(session: Session, run: Run) -> tuple[float, int | None]:
 
 
 def _at_once(session: Session, run: Run) -> float:
+    if run.resumed:
+        run.tracker.drop_after(-1)  # it may have been killed with its loss logged, which is of step 0
     fed = _cached(session) if fitted_models(session.predictor) else session.data
     inner = session.predictor
     if fed is not session.data and isinstance(inner, FrozenFrontEnd):
@@ -71,8 +78,9 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     batches.orders = several.trained if several else 1
     batches.attach(trainer)
     resume = _resumed_from(session, run)
-    trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
-    _part()
+    with sharing_one_fate(trainer, run.stopper, partial(_give_up, run)):
+        trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
+        _part()
     early = any(isinstance(one, StopEarly) and one.stopped for one in trainer.callbacks)  # type: ignore[attr-defined]
     session.console.print(
         f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
@@ -101,6 +109,15 @@ def keep_model_alone(run: Run) -> None:
     """Delete what only going on would need: the run is about to finish, and its model.ckpt is written."""
     for name in (*TRAINED, BEST):
         (run.checkpoints / name).unlink(missing_ok=True)
+
+
+def _give_up(run: Run, error: BaseException) -> None:
+    """Close the run of a process that cannot go on and will not come back."""
+    stopped = isinstance(error, Stopped)
+    sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
+    sys.stderr.write(f"{sentence}; go on with: python -m framework {shlex.quote(f'resume={run.folder}')}\n")
+    run.tracker.set_tags({"error": sentence})
+    run.tracker.close("KILLED" if stopped else "FAILED")
 
 
 def _part() -> None:

@@ -27,6 +27,7 @@ from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
+from framework.tracking.watch import watched
 
 LEFT_BY_RUNS = (
     "config.yaml",
@@ -101,7 +102,7 @@ def opened(config: Config) -> Iterator[Run]:
         return
     config.folder.mkdir(parents=True, exist_ok=True)
     tracker = _tracker(config, earlier.run_id if resumed and earlier else None, resumed)
-    with stopper.installed():
+    with stopper.installed(), watched(config.folder):
         tracker.open()  # from here on the folder is this process's
         run = Run(config, tracker, stopper, resumed)
         try:

@@ -13,7 +13,6 @@ import os
 import random
 import runpy
 import select
-import signal
 import socket
 import sys
 from collections.abc import Sequence
@@ -22,7 +21,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from framework.sweeps.processes import LARGEST, end_with_parent
+from framework.sweeps.processes import LARGEST
+from framework.tracking.signals import ending_with_parent
 
 PATIENCE = 0.02
 """Seconds within which the end of a job is noticed."""
@@ -48,11 +48,13 @@ def serve(channel: socket.socket) -> Given | None:
                 return None
             asked: dict[str, Any] = json.loads(packet)
             job = Given(asked["arguments"], asked["environment"], *descriptors)
-            server = os.getpid()
+            end_with_server = ending_with_parent()
             pid = os.fork()
             if pid == 0:
+                os.setsid()
+                end_with_server()
                 channel.close()
-                _become(job, server)
+                _become(job)
                 return job
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -66,12 +68,8 @@ def serve(channel: socket.socket) -> Given | None:
                 _tell(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status), "seconds": seconds})
 
 
-def _become(job: Given, server: int) -> None:
-    """What a process of its own would have: its session, streams, environment, arguments and random numbers."""
-    os.setsid()
-    end_with_parent()
-    if os.getppid() != server:  # it ended before that could be told
-        os.kill(os.getpid(), signal.SIGTERM)
+def _become(job: Given) -> None:
+    """What a process of its own would have: its streams, environment, arguments and random numbers."""
     for number, descriptor in enumerate((os.open(os.devnull, os.O_RDONLY), job.console, job.console)):
         os.dup2(descriptor, number)
     os.close(job.console)

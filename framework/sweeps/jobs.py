@@ -22,7 +22,7 @@ from framework.storage.files import write_whole
 from framework.storage.plain_values import read_json
 from framework.storage.reading import guarded, read_bytes
 from framework.sweeps.processes import Fresh, Process, Starter
-from framework.tracking.signals import SIGNALS, Stopped, handled
+from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """What runs one job; its overrides follow. No config can set it, since it would then run code."""
@@ -173,11 +173,17 @@ def run(
     )
     running: list[_Running] = []
     passed_on = 0
+    started_by, orphaned_at = os.getppid(), None
     with _signals() as received, ThreadPoolExecutor(1, "sync") as sending:
         while running or (queue and not received):
             for number in received[passed_on:]:
                 _pass_on(number, passed_on, running)
                 passed_on += 1
+            if orphaned_at is None and os.getppid() != started_by and ends_with_parent():
+                orphaned_at = time.monotonic()
+            if orphaned_at is not None and time.monotonic() - orphaned_at > ENDING:
+                for one in running:
+                    one.process.kill()
             for _ in range(len(queue)):
                 if received or len(running) == at_once:
                     break
@@ -297,7 +303,7 @@ def _end(one: _Running, code: int) -> None:
         status, error = "died", f"killed by {signal.Signals(-code).name}"
         if code == -signal.SIGKILL:
             error += ", as the system does when memory runs out"
-    elif code - 128 in SIGNALS:
+    elif code - 128 in (*SIGNALS, signal.SIGKILL):  # the latter where a rank of several was killed
         status, error = "died", f"stopped by {signal.Signals(code - 128).name}"
     else:
         status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"

@@ -7,19 +7,20 @@ import resource
 import signal
 import socket
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from framework.tracking.signals import ending_with_parent
+
 LARGEST = 2**17
 """Bytes of a packet that describes a job."""
 PATIENCE = 60.0
 """Seconds that the start of a process may take, without what it imports then."""
 _SERVER = "framework.sweeps.fork_server"
-_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
+_SET_CHILD_SUBREAPER = 36  # of prctl.h
 
 
 @runtime_checkable
@@ -69,7 +70,7 @@ class Fresh:
             env=environment,
             pass_fds=(lock,),
             start_new_session=True,  # Ctrl-C comes to the sweep alone, and from there once to each job
-            preexec_fn=end_with_parent,
+            preexec_fn=ending_with_parent(),
         )
         self.pid = self._process.pid
         self.seconds: float | None = None
@@ -94,8 +95,8 @@ class Forks:
     """Starts jobs as forks of one process (`fork_server`), which is started with the first of them; Linux.
 
     A job gets all that a process of its own would have, but for modules that are there already. If that process dies,
-    so do its jobs; later jobs get another one, or processes of their own where it could not start any, as do jobs that
-    it had not started yet.
+    its jobs are told to end; later jobs get another one, or processes of their own where it could not start any, as do
+    jobs that it had not started yet.
 
     Args:
         modules: what it imports.
@@ -135,6 +136,7 @@ class _Server:
     def __init__(
         self, command: Sequence[str], modules: Sequence[str], environment: Mapping[str, str]
     ) -> None:
+        _adopt_orphans()
         target = _target(command)
         self._environment = dict(environment)
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -146,7 +148,7 @@ class _Server:
                 env=environment,
                 pass_fds=(theirs.fileno(),),
                 start_new_session=True,
-                preexec_fn=end_with_parent,
+                preexec_fn=ending_with_parent(),
             )
         self._channel.settimeout(PATIENCE)
         try:
@@ -191,6 +193,7 @@ class _Server:
                 packet = b""
             if not packet:
                 self.alive = False
+                self.close()  # when it has ended, its jobs are children of this process
                 return
             answer: dict[str, Any] = json.loads(packet)
             if "started" in answer:
@@ -238,18 +241,15 @@ class _Fork:
             else:
                 self._process = self._fresh()
                 self.pid = self._process.pid
-        elif not self._server.alive and not self._runs_on():
-            self._code = -signal.SIGTERM  # as it was told when the server died; nobody else can know
+        elif not self._server.alive and self.pid is not None:
+            try:
+                ended, status, usage = os.wait4(self.pid, os.WNOHANG)
+            except ChildProcessError:  # the server asked how it ended, and died before it said so
+                self._code = -signal.SIGTERM
+            else:
+                if ended:
+                    self.end(os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime)
         return self._code
-
-    def _runs_on(self) -> bool:
-        if self.pid is None:
-            return False
-        try:
-            state = Path(f"/proc/{self.pid}/stat").read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            return False
-        return state.rpartition(")")[2].split()[0] not in "ZX"  # ended, and nobody has asked how
 
     def send(self, number: int) -> None:
         self._server.listen()
@@ -269,10 +269,9 @@ class _Fork:
             self._server.close()
 
 
-def end_with_parent() -> None:
-    """In a new process: get SIGTERM when its parent is killed (Linux; elsewhere it runs on)."""
-    if _LIBRARY is not None:
-        _LIBRARY.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+def _adopt_orphans() -> None:
+    """Become the parent of the children of a child that dies (Linux), so that their ends are known."""
+    ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1)
 
 
 def _target(command: Sequence[str]) -> int:

@@ -1,7 +1,10 @@
-"""Ctrl-C, SIGTERM and a terminal that is closed: stop where it is safe, and say so in the exit code."""
+"""Ctrl-C, SIGTERM, a closed terminal, a parent that dies: stop where it is safe, and say so in the exit code."""
 
+import ctypes
+import os
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
@@ -9,6 +12,10 @@ from typing import NoReturn
 CLOSED = getattr(signal, "SIGHUP", None)
 """That the terminal was closed; None on a system that has none."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([CLOSED] if CLOSED else []))
+ENDING = 8.0
+"""Seconds that a process has to end by itself once its parent has died, or once it can no longer go on."""
+_LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
+_SET_PARENT_DEATH, _GET_PARENT_DEATH = 1, 2  # of prctl.h
 
 
 def handled() -> tuple[signal.Signals, ...]:
@@ -59,3 +66,29 @@ class Stopper:
         self.received = self.received or number
         if not (self.wait and first):
             raise Stopped(number)
+
+
+def ending_with_parent(number: int = signal.SIGTERM) -> Callable[[], None]:
+    """Return what a new child of this process calls before anything else, to get a signal when this one dies.
+
+    Linux; elsewhere the child runs on. Start the child in the main thread: the signal comes when that thread ends.
+    """
+    parent = os.getpid()
+
+    def begin() -> None:
+        if _LIBRARY is not None:
+            _LIBRARY.prctl(_SET_PARENT_DEATH, number)
+            if os.getppid() != parent:  # it died before that could be asked for
+                os.kill(os.getpid(), number)
+
+    return begin
+
+
+def ends_with_parent() -> bool:
+    """Return whether this process gets a signal when its parent dies (Linux)."""
+    number = ctypes.c_int(0)
+    return (
+        _LIBRARY is not None
+        and _LIBRARY.prctl(_GET_PARENT_DEATH, ctypes.byref(number)) == 0
+        and number.value != 0
+    )
