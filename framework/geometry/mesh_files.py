@@ -15,16 +15,14 @@ from numpy.typing import NDArray
 
 from framework.errors import shown
 from framework.storage import arrays
+from framework.storage.limits import MOST_ANNOUNCED as MOST
+from framework.storage.limits import MOST_COLUMNS, MOST_NUMBERS
 
 XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
 OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
 """What files call the columns that have a name of their own here."""
-MOST = 2**31
-"""Vertices or faces that a header may announce; more is damage."""
-MOST_COLUMNS = 1000
-"""Numbers that a vertex may have."""
 
 
 class Parsed(NamedTuple):
@@ -243,6 +241,9 @@ def npy(content: bytes) -> Parsed:
 def npz(content: bytes) -> Parsed:
     """A NumPy archive: `points`, or the only array; `normals`, `colors` and other columns by their names; `faces`."""
     held = arrays.archive(content)
+    numbers, most = sum(array.size for array in held.values()), max(MOST_NUMBERS, len(content))
+    if numbers > most:
+        raise ValueError(f"it unfolds to {numbers} numbers; at most {most} for {len(content)} bytes")
     key = "points" if "points" in held or len(held) != 1 else next(iter(held))
     if key not in held:
         raise ValueError(f"wanted an array named points, got {shown(', '.join(held)) or 'nothing'}")

@@ -1,6 +1,7 @@
 """Parses PLY files, text or binary, into arrays: vertices with all their properties, and faces."""
 
 import re
+import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,8 @@ TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I"}
+"""Of whole numbers for `struct`."""
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 
@@ -167,23 +170,46 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
             return fans(np.full(len(corners), corners.shape[1]), corners.astype(np.int64).ravel()), end
     least = sum(int((entry.length or entry.kind)[1]) for entry in element.properties)
     _require(body, start + element.count * least)
-    counts, corners = [], []
-    for _ in range(element.count):
-        for entry in element.properties:
-            length = 1
-            if entry.length is not None:
-                length = int(_values(body, start, 1, order + entry.length)[0])
-                start += int(entry.length[1])
-                if length < 0:
-                    raise ValueError(f"a list {entry.name} has {length} values")
-            if entry == wanted:
-                counts.append(length)
-                corners.append(_values(body, start, length, order + entry.kind))
-            start += length * int(entry.kind[1])
-    _require(body, start)
+    counts, places = _walked(body, start, element, wanted, order)
+    end = int(places[-1])
     if wanted is None:
-        return empty, start
-    return fans(np.array(counts), np.concatenate(corners).astype(np.int64)), start
+        return empty, end
+    kind = np.dtype(order + wanted.kind)
+    first = np.repeat(places[:-1] - kind.itemsize * (np.cumsum(counts) - counts), counts)
+    byte = (first + kind.itemsize * np.arange(len(first)))[:, None] + np.arange(kind.itemsize)
+    corners = np.frombuffer(body, np.uint8)[byte].view(kind)[:, 0]
+    return fans(counts, corners.astype(np.int64)), end
+
+
+def _walked(
+    body: bytes, start: int, element: Element, wanted: Property | None, order: str
+) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
+    """Of each item how long its list `wanted` is, and where that begins; the last place is where the items end."""
+    counts, places = np.zeros(element.count, np.int64), np.zeros(element.count + 1, np.int64)
+    lengths = [
+        struct.Struct((order or "=") + CODES[entry.length]) if entry.length else None
+        for entry in element.properties
+    ]
+    entries = [
+        (entry is wanted, int(entry.kind[1]), length)
+        for entry, length in zip(element.properties, lengths, strict=True)
+    ]
+    for item in range(element.count):
+        for chosen, width, length in entries:
+            count = 1
+            if length:
+                if start + length.size > len(body):
+                    _require(body, start + length.size)
+                (count,) = length.unpack_from(body, start)
+                start += length.size
+                if count < 0:
+                    raise ValueError(f"a list of an element {shown(element.name)} has {count} values")
+            if chosen:
+                counts[item], places[item] = count, start
+            start += count * width
+    _require(body, start)
+    places[-1] = start
+    return counts, places
 
 
 def _uniform(body: bytes, start: int, element: Element, order: str) -> np.dtype:

@@ -49,3 +49,12 @@ MOST_PADDED = 2**26
 """Pixels of a square; where one that must be padded has more, it is scaled down before."""
 AT_ONCE = 2**25
 """Pixels of images that several threads decode at the same time."""
+
+# meshes and point clouds
+
+MOST_ANNOUNCED = 2**31
+"""Vertices or faces that a header may announce; more is damage."""
+MOST_COLUMNS = 1000
+"""Numbers that a vertex may have."""
+MOST_NUMBERS = 2**24
+"""Numbers that a compressed archive may unfold to, or as many as it has bytes; each takes 8 bytes when it is read."""
