@@ -9,7 +9,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from framework.configuration.composition import folder, in_quotes, options, register
+from framework.configuration.composition import folder, groups, in_quotes, options, register
+from framework.configuration.foreign_configs import require_harmless
 from framework.errors import ConfigError, did_you_mean
 from framework.tracking.stores import require_no_password
 
@@ -29,6 +30,7 @@ def command_line(arguments: list[str]) -> list[str]:
                 f"{argument}: no such flag. Settings are written without dashes: {argument.lstrip('-')}"
             )
     _refuse_code_and_passwords(arguments)
+    require_harmless(arguments, groups())
     return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(arguments)))
 
 

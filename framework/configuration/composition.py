@@ -128,11 +128,12 @@ def help_text() -> str:
     Hydra's own copies its store of configs for each group, which takes longer than all else.
     """
     words = yaml.safe_load((folder() / "config.yaml").read_text(encoding="utf-8"))["hydra"]["help"]
-    lines = [f"{group}: {', '.join(options(group))}" for group in _groups()]
+    lines = [f"{group}: {', '.join(options(group))}" for group in groups()]
     return "\n".join([words["header"], *lines, "", words["footer"].rstrip()])
 
 
-def _groups() -> list[str]:
+def groups() -> list[str]:
+    """Return the names of all config groups, ours and the plugins'."""
     return sorted({path.name for root in _roots() for path in root.iterdir() if path.is_dir()})
 
 
@@ -245,7 +246,7 @@ def _unknown(cause: OmegaConfBaseException) -> str:
     elsewhere = {
         path.rpartition(".")[2]: path for path in _paths(OmegaConf.to_container(root, resolve=False))
     }
-    beside = [*known, *_groups()] if cause.parent_node is root else known
+    beside = [*known, *groups()] if cause.parent_node is root else known
     near = key if key in elsewhere else nearest(key, beside) or nearest(key, elsewhere, 0.7)
     if cause.parent_node is root and key in beside:
         return f"No {key} is chosen, so {cause.full_key}... sets nothing. Choose one: {key}=<name>, or {key}=[<name>]."

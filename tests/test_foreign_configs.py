@@ -1,0 +1,100 @@
+"""A config folder that is added on the command line runs no code, writes nowhere and names no store."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from framework.configuration.command_line import command_line
+from framework.configuration.foreign_configs import require_harmless
+from framework.errors import ConfigError
+
+HEADED = "# @package {}\n{}"
+BAD = {
+    "callbacks": ("experiment/x.yaml", "hydra: {callbacks: {a: {b: c}}}"),
+    "environment": ("experiment/x.yaml", "hydra: {job: {env_set: {PYTHONSTARTUP: evil.py}}}"),
+    "logging": ("experiment/x.yaml", "hydra: {job_logging: {handlers: {a: {'()': os.system}}}}"),
+    "search path": ("config.yaml", "hydra: {searchpath: [pkg://evil]}"),
+    "all of hydra": ("x.yaml", "hydra: text"),
+    "where runs go": ("x.yaml", "hydra: {run: {dir: /somewhere}}"),
+    "where sweeps go": ("x.yaml", "hydra: {sweep: {dir: /somewhere, subdir: a}}"),
+    "target": ("experiment/x.yaml", "data: {a: [{_target_: os.system}]}"),
+    "target of a launcher": ("x.yaml", "hydra: {launcher: {_target_: os.system}}"),
+    "group of hydra": ("hydra/job_logging/x.yaml", "a: 1"),
+    "package by name": ("a/hydra.yaml", "a: 1"),
+    "package in a header": ("a/x.yaml", HEADED.format("hydra.callbacks", "a: 1")),
+    "package of its name": ("a/b.yaml", HEADED.format("_name_", "a: 1")),
+    "package in a choice": ("x.yaml", "defaults: [{/a@hydra.callbacks: b}]"),
+    "choice of logging": ("x.yaml", "defaults: [{override /hydra/job_logging: x}]"),
+    "choice elsewhere": ("x.yaml", "defaults: [{override /hydra/launcher: ../../x}]"),
+    "choice as text": ("x.yaml", "defaults: [/a@hydra.job/b]"),
+    "store": ("x.yaml", "logger: {uri: 'http://127.0.0.2'}"),
+    "store in a package": ("x.yaml", HEADED.format("logger", "uri: http://127.0.0.2")),
+    "store as a group": ("logger/x.yaml", "uri: http://127.0.0.2"),
+    "store by a choice": ("x.yaml", "defaults: [{/a@logger: b}]"),
+    "mode": ("x.yaml", "mode: {name: encode, files: /home, into: /tmp}"),
+    "config of a sweep": ("experiment/x.yaml", "defaults: [/multirun@_global_]"),
+    "config of a job": ("experiment/x.yaml", "defaults: [{/0@_global_: config}]"),
+    "alias": ("x.yaml", "a: &a [1]\nb: *a"),
+    "tag": ("x.yaml", "a: !!python/object/apply:os.system [id]"),
+    "no YAML": ("x.yml", "a: ["),
+}
+GROUPS = ("experiment", "data", "logger", "a")
+FORMS = (
+    ["--config-dir={}"],
+    ["--config-dir", "{}"],
+    ["-cd", "{}"],
+    ["--config-d={}"],
+    ["--config-path={}"],
+    ["-cp", "{}"],
+)
+
+
+@pytest.mark.parametrize("form", FORMS, ids=str)
+@pytest.mark.parametrize("kind", BAD)
+def test_a_foreign_config_says_neither_what_runs_nor_where_results_go(
+    kind: str, form: list[str], tmp_path: Path
+) -> None:
+    name, text = BAD[kind]
+    file = tmp_path / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=file.name):
+        require_harmless(
+            [*(word.format(tmp_path) for word in form), "experiment=x", "--config-name=x"], GROUPS
+        )
+
+
+def test_what_it_may_say_passes(tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    content = {
+        "defaults": [
+            {"/experiment@_global_": "a"},
+            {"override /hydra/launcher": "basic"},
+            {"override /logger": "none"},
+            "_self_",
+        ],
+        "hydra": {"sweeper": {"params": {"seed": "1,2"}}, "launcher": {"jobs": 2}},
+        "logger": {"experiment": "mine"},
+        "data": {"root": "/data"},
+    }
+    (tmp_path / "experiment" / "x.yaml").write_text("# @package _global_\n" + yaml.safe_dump(content))
+    require_harmless([f"--config-dir={tmp_path}"], GROUPS)
+    (tmp_path / "0").mkdir()
+    for left in ("multirun.yaml", "0/config.yaml"):  # as a sweep leaves them; nothing can choose them
+        (tmp_path / left).write_text("hydra: {callbacks: {}}")
+    require_harmless([f"--config-dir={tmp_path}"], GROUPS)
+    require_harmless(["--config-dir=nowhere", "seed=1", "-m"], GROUPS)
+    (tmp_path / "experiment" / "y.yaml").symlink_to("x.yaml")
+    with pytest.raises(ConfigError, match="is a link"):
+        require_harmless([f"--config-dir={tmp_path}"], GROUPS)
+
+
+@pytest.mark.parametrize(
+    "argument",
+    ["--experimental-rerun=a.pickle", "--experimental-rerun", "--exp=a", "logger.uri=http://me:secret@host"],
+)
+def test_flags_that_run_or_store_what_they_should_not_are_refused(argument: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        command_line([argument, "a.pickle"])
+    assert "secret" not in str(caught.value)
