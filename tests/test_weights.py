@@ -1,4 +1,5 @@
 import json
+import math
 import random
 import struct
 import zipfile
@@ -9,7 +10,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from framework.errors import CheckpointError, ConfigError
-from framework.storage.weights import fill_from_file, read_weights
+from framework.storage.weights import ABOVE_0, FINITE, FROM_0, fill_from_file, read_weights, require_state
 
 
 def network():
@@ -104,6 +105,17 @@ def test_the_network_may_be_a_part_of_the_one_in_the_file(tmp_path):
         (lambda found: found.pop("1.bias"), "1 of 6 weights are missing: 1.bias"),
         (lambda found: found.update(extra=torch.zeros(1)), "weights found are unknown: extra"),
         (lambda found: found.update({"0.weight": torch.zeros(3, 9, 1, 1)}), "have another shape: 0.weight"),
+        *(
+            (
+                lambda found, kind=kind: found.update({"0.weight": found["0.weight"].to(kind)}),
+                rf"of another type: 0\.weight \({str(kind)[6:]}, wanted float32\)",
+            )
+            for kind in (torch.complex64, torch.bool, torch.int32, torch.uint8)
+        ),
+        (
+            lambda found: found.update({"1.num_batches_tracked": torch.tensor(1.0)}),
+            r"another type: 1\.num_batches_tracked \(float32, wanted int64\)",
+        ),
     ],
 )
 def test_says_what_does_not_fit_and_changes_nothing(tmp_path, change, said):
@@ -219,3 +231,38 @@ def test_refuses_numbers_that_are_no_weights(tmp_path, kind):
     save_file({"weight": torch.zeros(3, dtype=kind)}, tmp_path / "weights.safetensors")
     with pytest.raises(CheckpointError, match=f"weight has numbers of type {kind}, wanted torch.float64"):
         read_weights(str(tmp_path / "weights.safetensors"))
+
+
+class Calibrated(nn.Module):
+    """Something with a buffer that was fitted."""
+
+    def __init__(self, values, bounds):
+        super().__init__()
+        self.register_buffer("fitted", torch.tensor(values, dtype=torch.float64))
+        require_state(self, fitted=bounds)
+
+
+@pytest.mark.parametrize("shape", [(), (3,)])
+@pytest.mark.parametrize("bounds", [ABOVE_0, FROM_0, FINITE, (-math.inf, math.inf), (-2.0, 0.5)])
+def test_a_stored_buffer_is_taken_within_its_bounds_only(bounds, shape):
+    """NaN never is, nor are numbers of another shape, for a single number not even one in a row, or of another type."""
+    whole = torch.full(shape, 0.25, dtype=torch.float64)
+    holder = nn.Sequential(Calibrated(whole.tolist(), bounds))
+    for value in (-math.inf, -1e300, -1.0, 0.0, 0.5, 1e300, math.inf, math.nan):
+        state = {"0.fitted": whole.clone()}
+        state["0.fitted"].view(-1)[-1:] = value
+        if bounds[0] <= value <= bounds[1]:
+            holder.load_state_dict(state)
+            assert torch.equal(holder[0].fitted, state["0.fitted"])
+            holder.load_state_dict({"0.fitted": whole})
+        else:
+            with pytest.raises(
+                CheckpointError, match="Calibrated is damaged: fitted has numbers that are not between"
+            ):
+                holder.load_state_dict(state)
+    for wrong in (whole[None], whole[..., None], whole.bool(), whole.to(torch.complex128), whole.tolist()):
+        with pytest.raises(CheckpointError, match=r"Calibrated is damaged: .* fitted "):
+            holder.load_state_dict({"0.fitted": wrong})
+    assert torch.equal(holder[0].fitted, whole)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        holder.load_state_dict({})

@@ -186,12 +186,18 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
     own = tuple(
         f"{name}." if name else "" for name, part in predictor.named_modules() if isinstance(part, Fitted)
     )
-    mismatch = describe_mismatch(predictor.state_dict(), state, any_shape=own)
+    require_match(describe_mismatch(predictor.state_dict(), state, any_shape=own), name)
+    predictor.load_state_dict(dict(state))
+    # of a row of numbers torch takes the first where it wants one
+    require_match(describe_mismatch(predictor.state_dict(), state), name)
+
+
+def require_match(mismatch: str | None, name: str) -> None:
+    """Refuse weights that do not fit; errors as `fill`."""
     if mismatch:
         raise CheckpointError(
             f"{name} belongs to another model: {mismatch} Use the config it was trained with, or another checkpoint."
         )
-    predictor.load_state_dict(dict(state))
 
 
 def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Path:

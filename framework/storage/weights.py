@@ -3,6 +3,7 @@
 import logging
 import zipfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -166,6 +167,40 @@ def describe_mismatch(
         if names
     ]
     return "; ".join(parts) + "." if parts else None
+
+
+LARGEST = torch.finfo(torch.float64).max
+FINITE, FROM_0, ABOVE_0 = (-LARGEST, LARGEST), (0.0, LARGEST), (torch.finfo(torch.float64).tiny, LARGEST)
+"""What the numbers of a buffer may be: least and most."""
+
+
+def require_state(module: nn.Module, **bounds: tuple[float, float]) -> None:
+    """Let `load_state_dict` refuse buffers of the module that are not what was fitted: of another shape, out of bounds.
+
+    Args:
+        bounds: the least and the most that a buffer's numbers may be, by its name; NaN is neither.
+    """
+    module.register_load_state_dict_pre_hook(partial(_require_state, bounds))
+
+
+def _require_state(
+    bounds: Mapping[str, tuple[float, float]],
+    module: nn.Module,
+    state: Mapping[str, Any],
+    prefix: str,
+    *_: Any,
+) -> None:
+    for name, (least, most) in bounds.items():
+        buffer, found = module.get_buffer(name), state.get(prefix + name)
+        if found is None:
+            continue  # torch says what is missing
+        mismatch = describe_mismatch({name: buffer}, {name: found})
+        if mismatch is None and not ((found >= least) & (found <= most)).all():
+            mismatch = f"{name} has numbers that are not between {least:.4g} and {most:.4g}."
+        if mismatch:
+            raise CheckpointError(
+                f"The state of {type(module).__name__} is damaged: {mismatch} Load another checkpoint, or train anew."
+            )
 
 
 def _same_kind(wanted: Tensor, found: Tensor) -> bool:

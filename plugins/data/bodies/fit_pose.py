@@ -16,6 +16,7 @@ from framework.errors import ConfigError
 from framework.geometry.camera import Camera
 from framework.heads.parameters import require_finite
 from framework.renderer import Renderer
+from framework.storage.weights import ABOVE_0, require_state
 from framework.target import Target
 from plugins.data.bodies.descent import Descent, Fit
 from plugins.data.bodies.figure import Figure, figure_of
@@ -148,6 +149,7 @@ class FitPoseHead(DensityHead, Fitted):
         spread = torch.tensor(target.scale or (1.0,) * numbers, dtype=torch.float64)
         self.register_buffer("prior", spread)
         self.register_buffer("spread", spread.expand(2, -1).clone())
+        require_state(self, prior=ABOVE_0, spread=ABOVE_0)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         self.prior.copy_(target.double().square().mean(0).sqrt().clamp(min=FLOOR))

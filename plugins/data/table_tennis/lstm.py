@@ -92,7 +92,7 @@ class LSTMHead(DensityHead):
             widths.append(width)
         shape = (*raw.shape[:-1], 3 * self.future)
         mean, scale = (torch.stack(part, 1).reshape(shape) for part in (places, widths))
-        return IndependentNormals(mean, scale)
+        return IndependentNormals(require_finite(mean, shape[-1]), require_finite(scale, shape[-1]))
 
     def _next(
         self, place: Tensor, move: Tensor, there: Tensor, state: tuple[Tensor, Tensor] | None

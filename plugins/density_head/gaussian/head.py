@@ -13,6 +13,7 @@ from torch.nn.functional import hardtanh, mse_loss
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
 from framework.heads.unit import Unit
+from framework.storage.weights import ABOVE_0, FINITE, require_state
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
 
@@ -70,6 +71,7 @@ class GaussianHead(DensityHead):
             self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
             side = self.numbers if self.full else 0  # of a diagonal covariance none: numbers may be very many
             self.register_buffer("coefficients", torch.zeros(side, side, dtype=torch.float64))
+            require_state(self, scale=ABOVE_0, coefficients=FINITE)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Gaussian:
         raw = require_finite(raw, self.size)

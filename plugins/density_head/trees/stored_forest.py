@@ -97,8 +97,10 @@ def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...])
 
 def _empty(arrays: Mapping[str, np.ndarray], *names: str) -> None:
     for name in names:
-        if arrays[name].size:
-            raise ValueError(f"{name} has {arrays[name].size} numbers; wanted none for such a target")
+        if arrays[name].size or arrays[name].ndim != (2 if name == "mean" else 1):
+            raise ValueError(
+                f"{name} has the shape {arrays[name].shape}; wanted no numbers for such a target"
+            )
 
 
 def _within(values: np.ndarray, least: int, end: int, name: str) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
+from framework.storage.weights import FROM_0, require_state
 from framework.target import Target
 from plugins.density_head.von_mises import functions
 from plugins.density_head.von_mises.angles import half_angle
@@ -65,6 +66,7 @@ class VonMisesHead(DensityHead):
         self.size = self.angles * (3 if self.predicted else 2)
         if not self.predicted:
             self.register_buffer("concentration", torch.ones(self.angles, dtype=torch.float64))
+            require_state(self, concentration=FROM_0)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> VonMises:
         number = self._per_angle(raw)

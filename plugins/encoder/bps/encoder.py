@@ -10,6 +10,7 @@ from torch import Tensor
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, require_clouds
+from framework.storage.weights import FINITE, require_state
 from plugins.encoder.bps import basis as sets
 from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, prepared, width
 
@@ -72,6 +73,7 @@ class BPS(Encoder):
         self.rotation_invariant = rotation_invariant
         made = sets.basis(basis, points, radius, basis_seed).to(torch.get_default_dtype())
         self.register_buffer("basis", made)
+        require_state(self, basis=FINITE)
         self._prepared: Basis | None = None
         total = sum(width(feature) for feature in features)
         self.output_shape = (total, *[sets.side(points)] * 3) if basis == "grid" else (total * points,)

@@ -15,6 +15,7 @@ from framework.calibration.validation import densities, repeatable, require_numb
 from framework.data import Batch
 from framework.errors import UserError
 from framework.model import Predictor
+from framework.storage.weights import require_state
 from framework.uncertainty import Uncertainty
 from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
@@ -84,6 +85,7 @@ class Conformal(Uncertainty):
         self.miscoverage = miscoverage
         self.score: Score = score
         self.register_buffer("threshold", torch.tensor(math.inf, dtype=torch.float64))
+        require_state(self, threshold=(-math.inf, math.inf))
 
     def forward(self, inputs: Tensor) -> PredictionSet:
         return PredictionSet(self.model(inputs), self.threshold, self.score)

@@ -12,6 +12,7 @@ from framework.calibration.validation import densities, repeatable, require_numb
 from framework.data import Batch
 from framework.distributions.tempering import RescaledClasses, log_probabilities
 from framework.model import Predictor
+from framework.storage.weights import FINITE, require_state
 from framework.target import Target
 from framework.uncertainty import Uncertainty
 from plugins.uncertainty.scaling.likelihood import minimise
@@ -68,6 +69,7 @@ class Platt(Uncertainty):
         self.smoothing = smoothing
         self.register_buffer("slope", torch.ones((), dtype=torch.float64))
         self.register_buffer("biases", torch.zeros(len(target.names), dtype=torch.float64))
+        require_state(self, slope=(0.0, STEEPEST), biases=FINITE)
 
     def forward(self, inputs: Tensor) -> Distribution:
         density = self.model(inputs)
