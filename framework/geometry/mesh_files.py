@@ -17,6 +17,7 @@ from framework.errors import shown
 from framework.storage import arrays
 from framework.storage.limits import MOST_ANNOUNCED as MOST
 from framework.storage.limits import MOST_COLUMNS, MOST_NUMBERS
+from framework.storage.reading import require_numbers
 
 XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
@@ -241,9 +242,7 @@ def npy(content: bytes) -> Parsed:
 def npz(content: bytes) -> Parsed:
     """A NumPy archive: `points`, or the only array; `normals`, `colors` and other columns by their names; `faces`."""
     held = arrays.archive(content)
-    numbers, most = sum(array.size for array in held.values()), max(MOST_NUMBERS, len(content))
-    if numbers > most:
-        raise ValueError(f"it unfolds to {numbers} numbers; at most {most} for {len(content)} bytes")
+    require_numbers(sum(array.size for array in held.values()), MOST_NUMBERS, len(content))
     key = "points" if "points" in held or len(held) != 1 else next(iter(held))
     if key not in held:
         raise ValueError(f"wanted an array named points, got {shown(', '.join(held)) or 'nothing'}")

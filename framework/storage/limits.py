@@ -37,6 +37,11 @@ MOST_DRAWS = 2**17
 MOST_DRAWN = 2**26
 """Numbers that all of them together may be, of one density; up to 1000 samples may be of any density."""
 
+# compressed files
+
+UNFOLDED_BYTES, UNFOLDED_TIMES = 2**27, 20
+"""A compressed file may unfold to the larger of so many bytes, and so many times its size."""
+
 # images
 
 MOST_PIXELS, LONGEST_SIDE = 2**25 + 2**24, 2**16
@@ -58,3 +63,10 @@ MOST_COLUMNS = 1000
 """Numbers that a vertex may have."""
 MOST_NUMBERS = 2**24
 """Numbers that a compressed archive may unfold to, or as many as it has bytes; each takes 8 bytes when it is read."""
+
+# volumes
+
+MOST_OF_SPECTRA, MOST_VOXELS = 2**24, 2**22
+"""Numbers in a volume of spectra, and its voxels, or as many as its file has bytes: 128 kB of zeros would unfold to 134
+million.
+"""

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from framework.errors import DataError, UserError, shown
+from framework.storage import limits
 
 RESTORE = "Restore it from its source."
-SMALL, MOST_TIMES = 2**27, 20
-"""A compressed file may unfold to the larger of so many bytes, and so many times its size."""
+SMALL, MOST_TIMES = limits.UNFOLDED_BYTES, limits.UNFOLDED_TIMES
 
 
 @contextmanager
@@ -64,6 +64,18 @@ def read_bytes(file: Path) -> bytes:
 def room(size: int) -> int:
     """Bytes that a compressed file of `size` bytes may unfold to."""
     return max(SMALL, MOST_TIMES * size)
+
+
+def require_numbers(numbers: int, small: int, size: int) -> None:
+    """Refuse what unfolds to more than `small` numbers, and to more than the `size` of its file in bytes.
+
+    A number of one byte takes eight when it is computed with, and files of zeros unfold a thousandfold.
+
+    Raises:
+        ValueError: says how many.
+    """
+    if numbers > max(small, size):
+        raise ValueError(f"it unfolds to {numbers} numbers; at most {max(small, size)} in {size} bytes")
 
 
 def inflated(data: bytes, most: int, *, part: bool = False) -> bytes:

@@ -1,5 +1,6 @@
 """Z-spectra and maps in NIfTI, through nibabel (the extra `nifti`), which nothing else needs."""
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,7 +9,8 @@ import nibabel
 import numpy as np
 
 from framework.errors import DataError
-from framework.storage.reading import guarded, inflated, read_bytes, room
+from framework.storage.limits import MOST_OF_SPECTRA
+from framework.storage.reading import guarded, inflated, read_bytes, require_numbers, room
 
 PACKED = b"\x1f\x8b"
 
@@ -54,4 +56,6 @@ def _read(file: Path) -> nibabel.Nifti1Image:
     content = read_bytes(file)
     if content.startswith(PACKED):
         content = inflated(content, room(len(content)))
-    return nibabel.Nifti1Image.from_bytes(content)
+    image = nibabel.Nifti1Image.from_bytes(content)
+    require_numbers(math.prod(map(int, image.shape)), MOST_OF_SPECTRA, file.stat().st_size)
+    return image

@@ -1,5 +1,6 @@
 """Reads Z-spectra volumes: MATLAB 5 (.mat), NumPy (.npz), and NIfTI (.nii, .nii.gz) beside a list of offsets."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, shown
 from framework.storage.arrays import archive
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.limits import MOST_OF_SPECTRA, MOST_VOXELS
+from framework.storage.reading import guarded, read_bytes, require_numbers
 
 SUFFIXES = (".mat", ".npz", ".nii", ".gz")
 SPECTRA = ("spectra", "rawData")
@@ -57,7 +59,11 @@ def read_volume(file: Path) -> Volume:
         DataError: it is missing, damaged, of another layout, or holds no voxel; says what was wanted.
     """
     with guarded(file, "a volume of Z-spectra", WANTED):
-        return _volume(_found(file))
+        found = _found(file)
+        numbers = sum(np.size(values) for values in found.values())
+        size = file.stat().st_size
+        require_numbers(numbers, MOST_OF_SPECTRA, size)
+        return _volume(found, size)
 
 
 def _found(file: Path) -> Mapping[str, Any]:
@@ -81,7 +87,7 @@ def _nifti(file: Path) -> Mapping[str, Any]:
     return read_nifti(file)
 
 
-def _volume(found: Mapping[str, Any]) -> Volume:
+def _volume(found: Mapping[str, Any], size: int) -> Volume:
     name = next((name for name in SPECTRA if name in found), None)
     if name is None or "offsets" not in found:
         raise DataError(f"it holds {shown(', '.join(found)) or 'nothing'}. {WANTED}")
@@ -90,6 +96,7 @@ def _volume(found: Mapping[str, Any]) -> Volume:
         raise DataError(f"{name} is of shape {spectra.shape} for {len(offsets)} offsets. {WANTED}")
     if not np.isfinite(offsets).all() or len(np.unique(offsets)) < len(offsets):
         raise DataError("offsets that are not finite, or stand there twice. Mend the list; it is in ppm.")
+    require_numbers(math.prod(spectra.shape[:-1]), MOST_VOXELS, size // 4)
     shape = (*spectra.shape[:-1], *(1,) * (4 - spectra.ndim))
     spectra = spectra.reshape(*shape, -1)
     spectra, offsets = _normalised(spectra, offsets, found.get("M0"))
