@@ -123,6 +123,9 @@ elif what == "hold":
     signal.signal(signal.SIGTERM, close)
     (folder / "ready").touch()
     wait_for(here / "release")
+elif what == "sleep":
+    (folder / "ready").touch()
+    wait_for(here / "release")
 elif what == "stubborn":
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -389,23 +392,24 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
 @LINUX
 def test_jobs_end_with_the_process_they_are_forks_of_and_the_next_ones_get_another(tmp_path: Path) -> None:
     app = App(tmp_path, fork=True)
-    process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1,2", "hydra.launcher.jobs=2")
+    """How they end is known: one closes, one ends as if nothing were, one dies of it."""
+    jobs = ["what=hold,stubborn,sleep,ok", "hydra.launcher.jobs=3"]
+    process = app.start("-m", "hydra/launcher=pool", *jobs)
     try:
-        app.until_ready(0, 1)
+        app.until_ready(0, 1, 2)
         app.until(lambda: app.record(0)["pid"] is not None)
         server = parent_of(app.record(0)["pid"])
         assert server not in (1, process.pid)
         os.kill(server, signal.SIGKILL)
         app.until((app.sweep / "0" / "closed SIGTERM").exists)
-        app.until_ready(2)
-        assert app.record(2)["tries"] == 1
+        app.until(lambda: app.record(3)["status"] == "completed")
         (app.folder / "release").touch()
         assert process.wait(timeout=60) == 1
     finally:
         app.close()
-    records = [app.record(number) for number in range(3)]
-    assert [one["status"] for one in records] == ["died", "died", "completed"]
-    assert [one["error"] for one in records] == ["stopped by SIGTERM"] * 2 + [None]
+    records = [app.record(number) for number in range(4)]
+    assert [one["status"] for one in records] == ["died", "completed", "died", "completed"]
+    assert [one["error"] for one in records] == ["stopped by SIGTERM", None, "killed by SIGTERM", None]
     assert all(one["processor_seconds"] > 0 for one in records)
 
 

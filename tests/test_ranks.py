@@ -13,8 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from benchmarks.kills import differences, status
 from framework.training.ranks import Share, WholeBatch
 from tests.conftest import TINY, Done, Forks, Framework, command
+from tests.test_kills import Lives
 
 TWO = ("trainer=ddp", "trainer.devices=2", "trainer.accelerator=cpu")
 QUIET = ("logger=none", "pictures=false")
@@ -105,37 +107,52 @@ def test_two_ranks_give_the_numbers_of_one_process(name: str, framework: Framewo
     assert two.out.count("run folder:") == 2, "the first rank alone speaks: at the start and at the end"
 
 
-@pytest.mark.parametrize(
-    ("number", "launcher"),
-    [(15, "ours"), (9, "ours"), (9, "torchrun")],
-    ids=["SIGTERM", "SIGKILL", "resumed by torchrun"],
-)
-def test_ranks_that_were_stopped_go_on_to_the_same_bits(
-    number: int, launcher: str, whole_of_two: Done, framework: Framework, stranger_site: Path, tmp_path: Path
+KILLS = {
+    "1|start|SIGKILL": "KILLED",  # the first waits for it
+    "0|first step|SIGTERM": "KILLED",
+    "1|between epochs|error": "FAILED",
+    "0|in a checkpoint|SIGKILL": "KILLED",
+    "1|collective|SIGKILL": "KILLED",
+    "0|testing|SIGKILL": "KILLED",
+}
+"""How the run is closed when a rank ends at a moment in some way, from its start to its end."""
+
+
+def test_a_rank_that_dies_ends_the_others_and_the_run_goes_on_to_the_same_bits(
+    whole_of_two: Done, stranger_site: Path, tmp_path: Path
+) -> None:
+    lives = Lives(STEPS, tmp_path, stranger_site)
+    for kill, wanted in KILLS.items():
+        assert lives(kill) != 0
+        assert status(lives.folder) == wanted, kill
+    assert lives() == 0, lives.output()
+    assert differences(lives.folder, whole_of_two.folder) == []
+    said = lives.output()
+    assert said.count("resuming from") == len(KILLS) - 1, "there was no checkpoint at the first two kills"
+    assert said.count("Rank 1 of the training failed (exit code 1)") == 1
+
+
+def test_ranks_that_were_stopped_go_on_under_another_launcher_to_the_same_bits(
+    whole_of_two: Done, framework: Framework, stranger_site: Path, tmp_path: Path
 ) -> None:
     marker = tmp_path / "marker"
-    stop = ("+data.signal_at=14", f"+data.signal_number={number}", f"+data.signal_marker={marker}")
+    stop = ("+data.signal_at=14", "+data.signal_number=9", f"+data.signal_marker={marker}")
     broken = framework(*STEPS, *stop, folder="broken")
     assert broken.code != 0
     assert marker.exists()
-    if launcher == "ours":
-        resumed = framework(f"resume={broken.folder}")
-        assert resumed.code == 0, resumed.out
-        assert resumed.out.count("resuming from") == 1
-    else:
-        launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-        environment = {**os.environ, "PYTHONPATH": str(stranger_site), "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(
-            [*launch, "-m", "framework", f"resume={broken.folder}"],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=200,
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert (done.stdout + done.stderr).count("resuming from") == 1
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    environment = {**os.environ, "PYTHONPATH": str(stranger_site), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*launch, "-m", "framework", f"resume={broken.folder}"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (done.stdout + done.stderr).count("resuming from") == 1
     wanted, found = (numbers(done, "") for done in (whole_of_two, broken))
     exact = [key for key in wanted if not key.startswith("cost/")]
     assert len(exact) > 30

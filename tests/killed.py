@@ -1,0 +1,69 @@
+"""`python -m framework`, of which one rank ends at a chosen moment: `python -m tests.killed <arguments>`.
+
+KILL in the environment is `<rank>|<moment>|<how>`, with how the name of a signal or "error"; KILLED is a file that is
+there once that has happened.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+PLACES = {
+    "start": None,
+    "first step": ("framework.training.module", "KeepCheckpoints", "on_train_batch_start", 1),
+    "collective": ("framework.training.module", None, "share", 5),
+    "between epochs": ("framework.training.module", "StopAtBatch", "on_train_epoch_end", 1),
+    "in a checkpoint": ("torch", None, "save", 5),
+    "testing": ("framework.modes.train", None, "report_test", 1),
+    "fitted": ("framework.runs.fit", None, "mean_loss", 1),
+    "logged": ("framework.modes.train", None, "calibrate", 1),
+    "tested": ("framework.modes.train", None, "keep_model_alone", 1),
+}
+"""Module, class, function, and how often it is called until the rank ends, before it does anything."""
+
+
+def end(how: str) -> None:
+    """What becomes of this process."""
+    Path(os.environ["KILLED"]).touch()
+    if how == "error":
+        raise ValueError("this rank is bad")
+    os.kill(os.getpid(), signal.Signals[how])
+
+
+def plant() -> None:
+    """Have this process end where KILL says, if it is the rank."""
+    rank, moment, how = os.environ["KILL"].split("|")
+    if os.environ.get("LOCAL_RANK", "0") != rank:
+        return
+    place = PLACES[moment]
+    if place is None:
+        end(how)
+        return
+    from importlib import import_module
+
+    module, owner, name, count = place
+    holder: Any = import_module(module)
+    holder = getattr(holder, owner) if owner else holder
+    original: Callable[..., Any] = getattr(holder, name)
+    calls = 0
+
+    def called(*given: Any, **named: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == count:
+            end(how)
+        return original(*given, **named)
+
+    setattr(holder, name, called)
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "framework"
+    if os.environ.get("KILL"):
+        plant()
+    from framework.app import main
+
+    main()
