@@ -1,9 +1,11 @@
 """Files that are whole or absent, and locks between processes."""
 
 import errno
+import fcntl
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -82,6 +84,23 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def lock_within(descriptor: int, seconds: float) -> None:
+    """Take the POSIX record lock of a file, which is this process's alone until it closes any descriptor of the file.
+
+    Raises:
+        BlockingIOError, PermissionError: after so many seconds another process still holds it.
+        OSError: the file system has no locks.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            if time.monotonic() > deadline:
+                raise
+        time.sleep(0.02)
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """The local journal of a run: every number stands on disk here before anything else sees it."""
 
-import fcntl
 import json
 import logging
 import os
@@ -14,7 +13,7 @@ from typing import Any, BinaryIO
 
 from framework.errors import DataError
 from framework.storage.enclosed import open_plain, read_stream
-from framework.storage.files import replacing
+from framework.storage.files import lock_within, replacing
 from framework.storage.reading import guarded
 
 _log = logging.getLogger(__name__)
@@ -22,7 +21,7 @@ _log = logging.getLogger(__name__)
 _encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 _NO_NUMBERS = ("nan", "inf", "-inf")
 _BLOCK = 1 << 20  # bytes read at a time: bounds the memory of a reader that is far behind
-_PATIENCE = 2.0  # seconds to wait for another writer
+_PATIENCE = 2.0  # seconds, for which who closes the run of a killed process (`ended`) may write
 LARGEST, LONGEST = 1 << 30, 1 << 24
 """Bytes of a journal (about seven million lines), and of a line of it; what has more was not written here."""
 
@@ -331,7 +330,7 @@ def _claim(path: Path) -> int:
     """
     owner = open_plain(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT)
     try:
-        _lock(owner)
+        lock_within(owner, _PATIENCE)
     except (BlockingIOError, PermissionError):
         holder = os.pread(owner, 32, 0).decode(errors="replace").strip() or "unknown"
         os.close(owner)
@@ -344,18 +343,6 @@ def _claim(path: Path) -> int:
     os.ftruncate(owner, 0)
     os.pwrite(owner, str(os.getpid()).encode(), 0)
     return owner
-
-
-def _lock(owner: int) -> None:
-    """Lock a descriptor; wait a moment, for which who closes the run of a killed process (`ended`) holds it."""
-    deadline = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            return fcntl.lockf(owner, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError):
-            if time.monotonic() > deadline:
-                raise
-        time.sleep(0.02)
 
 
 def _whole_lines(file: BinaryIO) -> bytes:
