@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.kills import ALLOWED, ROOT, Command, differences, status
+from framework.tracking.ended import mark_dead
 from tests.test_pool import App
 
 pytestmark = pytest.mark.skipif(
@@ -113,7 +114,9 @@ def test_a_run_that_is_fitted_at_once_logs_every_number_once(tmp_path: Path) -> 
     assert len(names) == len(set(names))
 
 
-@pytest.mark.parametrize("how", ["is killed", "is the job of a sweep that is killed", "closes"])
+@pytest.mark.parametrize(
+    "how", ["is killed", "is killed, and closed by two", "is the job of a sweep that is killed", "closes"]
+)
 def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Path) -> None:
     """A process beside it closes it; of a dead sweep the job is killed if it does not end by itself."""
     run = [sys.executable, "-c", RUN, str(tmp_path), how]
@@ -122,6 +125,9 @@ def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Pat
     until((tmp_path / "ready").exists)
     if how != "closes":
         os.kill(command.process.pid, signal.SIGKILL)
+    if "two" in how:
+        while status(tmp_path) == "RUNNING":
+            mark_dead(tmp_path)
     assert command.seconds_until_gone(60) < ALLOWED
     assert status(tmp_path) == ("FINISHED" if how == "closes" else "KILLED")
     lines = [json.loads(line) for line in (tmp_path / "journal.jsonl").read_text("utf-8").splitlines()]

@@ -12,7 +12,7 @@ from typing import NoReturn
 CLOSED = getattr(signal, "SIGHUP", None)
 """That the terminal was closed; None on a system that has none."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([CLOSED] if CLOSED else []))
-ENDING = 8.0
+ENDING = 6.0
 """Seconds that a process has to end by itself once its parent has died, or once it can no longer go on."""
 _LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
 _SET_PARENT_DEATH, _GET_PARENT_DEATH = 1, 2  # of prctl.h

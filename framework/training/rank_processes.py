@@ -25,6 +25,8 @@ from framework.tracking.signals import ENDING, SIGNALS, Stopped, Stopper, ending
 
 _GRACE = 4.0
 """Seconds that this rank has to leave the training by itself, after another one has died."""
+_CLOSING = 3.0
+"""Seconds for closing the run where this rank has not left by itself."""
 _MOMENT = 2.0
 """Seconds within which a rank that has caused an error of this one has ended."""
 _PAUSE = 0.1
@@ -172,7 +174,7 @@ class _Guard(threading.Thread):
             if self._left is not None:
                 if now - self._left > _GRACE:
                     self._kill()
-                if self._caused and died is not None and now - died > ENDING:
+                if self._caused and died is not None and now - died > 2 * _GRACE:
                     os._exit(1)  # the run is closed; what the store lacks is sent by a later sync
             elif died is not None and now - died > _GRACE:
                 self._end(self.cause(0.0) or RankFailed("Another rank ended before the training did."))
@@ -234,6 +236,6 @@ class _Guard(threading.Thread):
         self._kill()
         closing = threading.Thread(target=self._close, args=(error,), daemon=True)
         closing.start()
-        closing.join(_GRACE)
+        closing.join(_CLOSING)
         sys.stderr.flush()
         os._exit(error.code if isinstance(error, Stopped) and isinstance(error.code, int) else 1)
