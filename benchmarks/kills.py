@@ -157,12 +157,18 @@ def first(command: Command) -> list[int]:
 
 
 def rank(number: int) -> Choose:
-    """Of a training with several processes."""
-    return lambda command: [
-        one.number
-        for one in command.alive()
-        if one.rank == str(number) and "framework" in one.command and "multiprocessing" not in " ".join(one.command)
-    ]  # fmt: skip
+    """Of a training with several processes; not what loads data for it, or watches it."""
+
+    def chosen(command: Command) -> list[int]:
+        found = [
+            one
+            for one in command.alive()
+            if one.rank == str(number) and {"framework", "framework.__main__"} & {*one.command}
+        ]
+        inner = {one.number for one in found}
+        return [one.number for one in found if number or one.parent not in inner]
+
+    return chosen
 
 
 def fork_server(command: Command) -> list[int]:
