@@ -495,6 +495,26 @@ def test_other_addresses_pass(uri: str) -> None:
     assert without_password(uri) == uri.replace("me@host", "host")
 
 
+@pytest.mark.parametrize("by_setting", [False, True], ids=["in Python", "by MLFLOW_TRACKING_URI"])
+def test_no_file_of_a_run_holds_the_password_of_its_store(
+    by_setting: bool, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Everything that a store gets stands in the journal first."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    uri = f"http://me:pa/ssw0rd@{address}"
+    if by_setting:
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+    tracker = build(folder, uri=None if by_setting else uri, patience=0.0, opening_patience=0.0)
+    tracker.open()
+    log(tracker, [1, 2])
+    tracker.close("FINISHED")
+    assert json.loads((folder / "run.json").read_text())["uri"] == f"http://{address}"
+    assert not [path for path in folder.rglob("*") if path.is_file() and b"ssw0rd" in path.read_bytes()]
+    assert "ssw0rd" not in caplog.text + tracker.url
+
+
 # Few calls, in order
 
 

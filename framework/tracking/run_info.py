@@ -16,7 +16,7 @@ from framework.storage.enclosed import read_plain
 from framework.storage.files import write_whole
 from framework.storage.plain_values import LARGEST_JSON
 from framework.storage.reading import guarded
-from framework.tracking.stores import Address, address, artifact_folder, without_password
+from framework.tracking.stores import Address, address, artifact_folder, require_own_files, without_password
 
 _log = logging.getLogger(__name__)
 
@@ -82,8 +82,11 @@ class RunInfo:
 
         Raises:
             ConfigError: MLflow cannot keep runs in that store.
+            DataError: the default store leads out of its folder.
         """
         store = address(place.uri, folder)
+        if not store.named:
+            require_own_files(store.uri)
         return cls(
             place.run_id,
             store.uri,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from framework.errors import UserError
+from framework.errors import DataError, UserError
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import RunInfo, Sidecar
 from framework.tracking.stores import without_password
@@ -38,7 +38,11 @@ class Store(ABC):
 
     @abstractmethod
     def send_file(self, path: str, place: str) -> None:
-        """Store a file or a directory, its path absolute or in the run folder, under the folder `place`."""
+        """Store a file or a directory, its path absolute or in the run folder, under the folder `place`.
+
+        Raises:
+            DataError: this store may not take files; another call would not help.
+        """
 
 
 OpenStore = Callable[[Path, RunInfo], Store]
@@ -89,10 +93,24 @@ def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[]
     return count
 
 
-def send_owed(sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> None:
-    """Send the files that wait, in order."""
+def send_owed(
+    sidecar: Sidecar,
+    store: Store,
+    stop: Callable[[], bool],
+    refused: Callable[[DataError], None] | None = None,
+) -> None:
+    """Send the files that wait, in order.
+
+    Args:
+        refused: told of a file that may not be sent, which is then left out; None: the error is raised.
+    """
     while sidecar.info.owed and not stop():
-        store.send_file(*sidecar.info.owed[0])
+        try:
+            store.send_file(*sidecar.info.owed[0])
+        except DataError as error:
+            if refused is None:
+                raise
+            refused(error)
         sidecar.update(owed=sidecar.info.owed[1:])
 
 
@@ -132,6 +150,7 @@ class Sender(threading.Thread):
         self._finishing = threading.Event()
         self._abandoned = False
         self._away_since: float | None = None
+        self._told_refusal = False
 
     def notice(self) -> None:
         """One more line waits."""
@@ -195,7 +214,12 @@ class Sender(threading.Thread):
             self._store = self._open_store(self._folder, self._sidecar.info)
             self._sidecar.update(**self._store.identity)
         send_new(self._journal, self._sidecar, self._store, lambda: self._abandoned)
-        send_owed(self._sidecar, self._store, lambda: self._abandoned)
+        send_owed(self._sidecar, self._store, lambda: self._abandoned, self._refused)
+
+    def _refused(self, error: DataError) -> None:
+        if not self._told_refusal:
+            self._told_refusal = True
+            _log.warning("The files of this run are not stored, its numbers are: %s", error)
 
 
 def reason(error: BaseException) -> str:

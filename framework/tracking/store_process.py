@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, final
 
 from pydantic import TypeAdapter
 
+from framework.errors import DataError
 from framework.tracking.run_info import RunInfo
 from framework.tracking.sender import Record, Store, reason
 
@@ -49,6 +50,7 @@ class StoreProcess:
         """What the process answers; what it has to say on the way is said here.
 
         Raises:
+            DataError: the store may not take a file.
             StoreAway: the store failed, or the process has ended.
         """
         process = self._process
@@ -58,11 +60,12 @@ class StoreProcess:
             process.stdin.write(json.dumps(question).encode() + b"\n")
             process.stdin.flush()
             line = process.stdout.readline()
-        answer: dict[str, Any] = json.loads(line) if line else {"error": "the sending process has ended"}
+        gone = {"error": "the sending process has ended", "refused": False}
+        answer: dict[str, Any] = json.loads(line) if line else gone
         for level, text in answer.get("said", ()):
             _log.log(level, "%s", text)
         if "error" in answer:
-            raise StoreAway(answer["error"])
+            raise DataError(answer["error"]) if answer["refused"] else StoreAway(answer["error"])
         return answer
 
     def end(self, *, at_once: bool = False) -> None:
@@ -130,7 +133,8 @@ def serve(questions: BinaryIO, answers: BinaryIO) -> None:
                 store.send_file(question["send_file"], question["place"])
             answer: dict[str, Any] = {"identity": dict(store.identity), "replay": dict(store.replay)}
         except Exception as error:
-            answer = {"error": reason(error)}
+            refused = isinstance(error, DataError)
+            answer = {"error": str(error) if refused else reason(error), "refused": refused}
         answer["said"], said.lines = said.lines, []
         try:
             answers.write(json.dumps(answer).encode() + b"\n")

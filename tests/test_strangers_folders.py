@@ -1,0 +1,250 @@
+"""A run or sweep folder that somebody sent does nothing but what a sentence says: every attack against every command.
+
+What an attack must not reach lies in `home`; a listener on a second loopback address must hear nothing. `SECURITY.md`
+says what is trusted.
+"""
+
+import json
+import os
+import shutil
+import socket
+import sqlite3
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.conftest import TINY, Done, Forks, Once, command
+
+SECRET = b"the user's own line\nand one that does not end"
+COMMANDS: dict[str, list[str]] = {
+    "resume": ["resume={run}"],
+    "sync": ["mode=sync", "mode.run={run}"],
+    "test": ["mode=test", "checkpoint={run}", "logger=none"],
+    "predict": ["mode=predict", "checkpoint={run}", "logger=none"],
+    "work_precision": ["mode=work_precision", "checkpoint={run}", "logger=none"],
+    "combine": ["mode=combine", "mode.members={sweep}", "logger=none"],
+    "train from it": [*TINY, "trainer.max_epochs=1", "checkpoint={run}", "logger=none"],
+    "train into it": [*TINY, "trainer.max_epochs=1", "logger=none", "hydra.run.dir={run}"],
+    "sweep": ["-m", *TINY, "trainer.max_epochs=1", "seed=0", "logger=none", "hydra.sweep.dir={sweep}"],
+    "sweep with a store": ["-m", *TINY, "trainer.max_epochs=1", "seed=0", "hydra.sweep.dir={sweep}"],
+}
+"""Those that read a run folder, or write into it."""
+
+
+@dataclass
+class Sent:
+    """An unpacked archive with a sweep of two jobs, and what it must not reach."""
+
+    run: Path
+    home: Path
+    port: int
+
+    def edit(self, name: str, change: Callable[[dict], object]) -> None:
+        """Change what a JSON or YAML file of the run says."""
+        path = self.run / name
+        content = yaml.safe_load(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content) if name.endswith("json") else yaml.safe_dump(content))
+
+    def goes_to(self, uri: str, status: str = "KILLED") -> None:
+        """Let the run's files name a store."""
+        self.edit("run.json", lambda info: info.update(uri=uri, status=status, run_id="0" * 32, sent=0))
+        self.edit(
+            "config.yaml",
+            lambda config: config.update(logger={"name": "mlflow", "uri": uri, "experiment": None}),
+        )
+
+
+def journal_linked(sent: Sent) -> None:
+    (sent.run / "journal.jsonl").unlink()
+    (sent.run / "journal.jsonl").symlink_to(sent.home / "secret.txt")
+
+
+def results_of_two_names(sent: Sent) -> None:
+    (sent.run / "results.json").unlink()
+    (sent.run / "results.json").hardlink_to(sent.home / "secret.txt")
+
+
+def checkpoints_linked(sent: Sent) -> None:
+    shutil.move(sent.run / "checkpoints", sent.home / "checkpoints")
+    (sent.run / "checkpoints").symlink_to(sent.home / "checkpoints")
+
+
+def record_piped(sent: Sent) -> None:
+    (sent.run / "run.json").unlink()
+    os.mkfifo(sent.run / "run.json")
+
+
+def sweep_linked(sent: Sent) -> None:
+    for name in ("multirun.yaml", ".numbers.lock", "comparison.csv"):
+        (sent.run.parent / name).symlink_to(sent.home / "made through a link")
+
+
+LINKS = [journal_linked, results_of_two_names, checkpoints_linked, record_piped, sweep_linked]
+
+
+def server(sent: Sent) -> None:
+    sent.goes_to(f"http://127.0.0.2:{sent.port}")
+
+
+def server_of_a_finished_run(sent: Sent) -> None:
+    sent.goes_to(f"http://127.0.0.2:{sent.port}", "FINISHED")
+
+
+def server_that_looks_local(sent: Sent) -> None:
+    sent.goes_to(f"http://127.0.0.2:{sent.port}\\@localhost", "FINISHED")
+
+
+def database(sent: Sent) -> None:
+    sent.goes_to(f"postgresql://localhost/db?host=127.0.0.2&port={sent.port}", "RUNNING")
+
+
+def store_of_the_users(sent: Sent) -> None:
+    sent.goes_to(f"sqlite:///{sent.home}/mlflow.db", "FINISHED")
+
+
+def own_store_that_writes_elsewhere(sent: Sent) -> None:
+    """The store in the place of the default one, whose files lie in the user's home."""
+    outputs = sent.run.parents[1]
+    with closing(sqlite3.connect(outputs / "mlflow.db")) as store, store:
+        store.execute("update experiments set artifact_location = ?", [str(sent.home / "planted")])
+    sent.goes_to(f"sqlite:///{outputs}/mlflow.db", "FINISHED")
+    line = {"n": 10_000, "time": 1.0, "artifact": "results.json", "folder": ""}
+    with (sent.run / "journal.jsonl").open("a") as journal:
+        journal.write(json.dumps(line) + "\n")
+
+
+def own_store_that_is_a_link(sent: Sent) -> None:
+    outputs = sent.run.parents[1]
+    (outputs / "mlflow.db").unlink()
+    (outputs / "mlflow.db").symlink_to(sent.home / "mlflow.db")
+    sent.goes_to(f"sqlite:///{outputs}/mlflow.db", "FINISHED")
+
+
+STORES = [
+    *(server, server_of_a_finished_run, server_that_looks_local, database),
+    *(store_of_the_users, own_store_that_writes_elsewhere, own_store_that_is_a_link),
+]
+
+
+def target_in_its_config(sent: Sent) -> None:
+    sent.edit("config.yaml", lambda config: config["data"].update(a={"_target_": "os.system"}))
+
+
+def mode_in_its_config(sent: Sent) -> None:
+    mode = {"name": "encode", "files": str(sent.home), "into": str(sent.home / "planted")}
+    sent.edit("config.yaml", lambda config: config.update(mode=mode))
+
+
+def folder_in_its_config(sent: Sent) -> None:
+    sent.edit(
+        "config.yaml", lambda config: config["trainer"].update(default_root_dir=str(sent.home / "planted"))
+    )
+
+
+CONFIGS = [target_in_its_config, mode_in_its_config, folder_in_its_config]
+CASES = [
+    *(
+        (attack, name)
+        for attack in LINKS
+        for name in COMMANDS
+        if attack is not sweep_linked or "sweep" in name
+    ),
+    *((attack, name) for attack in STORES for name in ("resume", "sync")),
+    *((attack, "sweep with a store") for attack in (database, own_store_that_is_a_link)),
+    *((attack, "resume") for attack in CONFIGS),
+]
+SURVIVED = {("results_of_two_names", name) for name in ("test", "predict", "train from it")} | {
+    (attack, name)
+    for attack in ("journal_linked", "record_piped")
+    for name in ("test", "predict", "train from it")
+}
+"""Commands that have no use for the file: they do what they are asked, and leave it alone."""
+
+
+@pytest.fixture(scope="session")
+def mlflow_database(once: Once) -> Path:
+    """An SQLite store with an experiment, which takes MLflow seconds to make."""
+
+    def make(folder: Path) -> None:
+        made = f"c = MlflowClient('sqlite:///{folder}/mlflow.db'); c.create_experiment('default', '{folder}/artifacts')"
+        code = f"from mlflow import MlflowClient; {made}"
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=200, cwd=folder)
+
+    return once("database", make) / "mlflow.db"
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.socket() as found:
+        found.bind(("127.0.0.2", 0))
+        found.listen()
+        found.setblocking(False)
+        yield found
+
+
+@pytest.fixture
+def sent(whole: Done, tmp_path: Path, mlflow_database: Path, listener: socket.socket) -> Sent:
+    sweep = tmp_path / "unpacked" / "outputs" / "sweep"
+    for number in "01":
+        shutil.copytree(whole.folder, sweep / number)
+        overrides = [*TINY, "trainer.max_epochs=1", f"seed={number}"]
+        record = {"number": int(number), "key": number, "status": "completed", "overrides": overrides}
+        (sweep / number / "job.json").write_text(json.dumps(record))
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "secret.txt").write_bytes(SECRET)
+    shutil.copy(mlflow_database, home / "mlflow.db")
+    shutil.copy(mlflow_database, sweep.parent / "mlflow.db")
+    found = Sent(sweep / "0", home, listener.getsockname()[1])
+    found.edit("run.json", lambda info: info.update(status="KILLED"))
+    return found
+
+
+def state(folder: Path) -> dict[str, tuple[int, int, bytes]]:
+    """Mode, time of the last change and content of everything below a folder."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        status = path.lstat()
+        content = path.read_bytes() if stat.S_ISREG(status.st_mode) else b""
+        found[str(path.relative_to(folder))] = status.st_mode, status.st_mtime_ns, content
+    return found
+
+
+@pytest.mark.parametrize(
+    ("attack", "name"), CASES, ids=lambda one: one if isinstance(one, str) else one.__name__
+)
+def test_a_strangers_folder_does_nothing_but_say_a_sentence(
+    attack: Callable[[Sent], None],
+    name: str,
+    sent: Sent,
+    listener: socket.socket,
+    forks: Forks,
+    stranger_site: Path,
+    tmp_path: Path,
+) -> None:
+    attack(sent)
+    before, base = state(sent.home), tmp_path / "work"
+    base.mkdir()
+    words = [word.format(run=sent.run, sweep=sent.run.parent) for word in COMMANDS[name]]
+    more = {"MLFLOW_TRACKING_USERNAME": "user", "MLFLOW_TRACKING_PASSWORD": "secret"}
+    done = command(forks, stranger_site, base)(*words, folder="run", more=more)
+    assert "Traceback" not in done.out, done.out
+    if (attack.__name__, name) in SURVIVED:
+        assert done.code == 0, done.out
+    elif (
+        attack is not database or name != "sweep with a store"
+    ):  # that compares the jobs, and says what it left out
+        assert done.code in (1, 2), done.out
+        assert "error: " in done.out
+    assert state(sent.home) == before
+    assert not (sent.home / "made through a link").exists()
+    with pytest.raises(BlockingIOError):
+        listener.accept()
