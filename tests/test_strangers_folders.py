@@ -4,6 +4,7 @@ What an attack must not reach lies in `home`; a listener on a second loopback ad
 says what is trusted.
 """
 
+import importlib
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from framework.errors import UserError
 from tests.conftest import TINY, Done, Forks, Once, command
 
 SECRET = b"the user's own line\nand one that does not end"
@@ -246,5 +248,43 @@ def test_a_strangers_folder_does_nothing_but_say_a_sentence(
         assert "error: " in done.out
     assert state(sent.home) == before
     assert not (sent.home / "made through a link").exists()
+    with pytest.raises(BlockingIOError):
+        listener.accept()
+
+
+PLUGIN_COMMANDS = {
+    "plugins.data.bodies": ["{run}", "{run}/results.json", "--folder={out}"],
+    "plugins.data.bodies.animate": ["{run}", "--out={out}/film.gif"],
+    "plugins.data.bodies.correspond": ["{run}", "--out={out}"],
+    "plugins.data.bodies.repose": ["{run}", "--out={out}", "--body={run}/results.json", "--random=1"],
+    "plugins.data.bodies.photograph_meshes": ["{run}", "{out}/root"],
+    "plugins.renderer.rasterizer": ["{run}/results.json", "--out={out}/picture.png"],
+}
+"""Every command of a plugin, given a stranger's folder."""
+
+
+def test_these_are_all_commands_of_plugins() -> None:
+    root = Path(__file__).parent.parent
+    commands = set()
+    for file in (root / "plugins").rglob("*.py"):
+        if (
+            '__name__ == "__main__"' in file.read_text(encoding="utf-8")
+            and file.name != "fit_coefficients.py"
+        ):
+            commands.add(".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__main__"))
+    assert commands == PLUGIN_COMMANDS.keys()
+
+
+@pytest.mark.parametrize("attack", LINKS, ids=lambda one: one.__name__)
+@pytest.mark.parametrize("name", PLUGIN_COMMANDS)
+def test_a_plugins_command_does_nothing_but_say_a_sentence(
+    name: str, attack: Callable[[Sent], None], sent: Sent, listener: socket.socket, tmp_path: Path
+) -> None:
+    attack(sent)
+    before, module = state(sent.home), name if name.count(".") > 2 else f"{name}.__main__"
+    main = importlib.import_module(module).main
+    with pytest.raises(UserError):
+        main([word.format(run=sent.run, out=tmp_path / "out") for word in PLUGIN_COMMANDS[name]])
+    assert state(sent.home) == before
     with pytest.raises(BlockingIOError):
         listener.accept()
