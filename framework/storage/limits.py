@@ -70,3 +70,20 @@ MOST_OF_SPECTRA, MOST_VOXELS = 2**24, 2**22
 """Numbers in a volume of spectra, and its voxels, or as many as its file has bytes: 128 kB of zeros would unfold to 134
 million.
 """
+
+# scenes
+
+MOST_PARTS, MOST_MATERIALS = 10_000, 10_000
+"""Parts of a scene, each of one material; each takes a millisecond."""
+MOST_TEXELS, FEW_TEXELS, TEXELS_PER_BYTE = 2**25, 2**24, 16
+"""Of all textures of a scene together, two of 4096 × 4096; one where they have more than so many for each byte of their
+files, as photographs have not. Drawn, each takes 44 bytes.
+"""
+SCENE_BYTES = 2**25
+"""Bytes that a small glTF file may become: where several nodes show a mesh, it is there for each. A larger file may
+become as much as a compressed one.
+"""
+MOST_JOINT_SETS = 4
+"""Sets of four joints that a vertex follows."""
+MOST_SAMPLES = 2**25
+"""Of a picture, a camera file's say: 2560 × 1440 pixels of 9 samples. With colours and depth they take 1 GB."""

@@ -17,6 +17,7 @@ from framework.errors import ConfigError, DataError, UserError, did_you_mean, qu
 from framework.geometry.camera import Camera
 from framework.renderer import Report
 from framework.storage.files import unwritable
+from framework.storage.limits import MOST_SAMPLES
 from framework.storage.progress import tracked
 from plugins.renderer.rasterizer import pictures, turntable
 from plugins.renderer.rasterizer.parts import Axis
@@ -36,8 +37,6 @@ examples:
 """
 VIEW = {"azimuth": 30.0, "elevation": 15.0, "tilt": 0.0, "distance": "auto", "fov": 40.0, "size": (480, 640)}
 """What no camera file says."""
-MOST_SAMPLES = 2**26
-"""Of a picture: with colours and depth they take 2 GB."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from framework.errors import DataError, quoted, shown
 from framework.renderer import Wrap
+from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
 from framework.storage.reading import guarded
 from plugins.renderer.rasterizer.gltf_document import WIDTHS, Document, opened, whole
-from plugins.renderer.rasterizer.parts import MOST_PARTS, Part, Subject, subject
+from plugins.renderer.rasterizer.parts import Part, Subject, subject
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
@@ -166,7 +167,12 @@ def _skinned(
     moved = np.zeros_like(part.vertices)
     attributes = primitive["attributes"]
     ones = np.ones((len(part.vertices), 1))
-    for number in range(sum(name.startswith("JOINTS_") for name in attributes)):
+    sets = sum(name.startswith("JOINTS_") for name in attributes)
+    if sets > MOST_JOINT_SETS:
+        raise ValueError(
+            f"a part follows {4 * sets} joints at each vertex; wanted at most {4 * MOST_JOINT_SETS}"
+        )
+    for number in range(sets):
         chosen = document.numbers(attributes[f"JOINTS_{number}"], 4)
         weights = document.numbers(attributes[f"WEIGHTS_{number}"], 4, shares=True)
         for corner in range(4):

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from framework.errors import quoted
-from framework.storage.reading import guarded, read_bytes, room
+from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
+from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer.parts import Pictures, beside
 
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -124,7 +125,7 @@ class Document:
 
     def bounded(self, needed: int) -> None:
         """Raises: ValueError: so many bytes are more than a file of this size may become."""
-        if needed > room(self.size):
+        if needed > max(SCENE_BYTES, UNFOLDED_TIMES * self.size):
             raise ValueError(f"{self.size} bytes would become {needed}; it repeats itself, or is damaged")
 
 

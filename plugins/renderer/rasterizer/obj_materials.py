@@ -11,10 +11,10 @@ from framework.errors import DataError, quoted, shown
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import text_lines
 from framework.renderer import Wrap
+from framework.storage.limits import MOST_MATERIALS
 from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer.parts import Part, Pictures, beside
 
-MOST_MATERIALS = 10_000
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
 """Options of a texture that do not change where it lies or what it repeats, and how many words follow each."""
 NAMES = (b"usemtl", b"mtllib", b"newmtl", b"map_Kd")

@@ -12,20 +12,18 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 from torch import Tensor
 
-from framework.datasets.images import FORMATS, LONGEST_SIDE
+from framework.datasets.images import FORMATS, STRIP
 from framework.errors import DataError, quoted
 from framework.geometry.camera import look_from
 from framework.geometry.light import linear
 from framework.renderer import Scene, Texture, Wrap, joined
+from framework.storage.limits import FEW_TEXELS, LONGEST_SIDE, MOST_TEXELS, TEXELS_PER_BYTE
 
 Axis = Literal["y", "z"]
 GREY = 0.55
 """Light of a surface whose colour its file does not say."""
-MOST_TEXELS = 2**26
-"""Of all textures of a scene together: 0.8 GB as light."""
 FARTHEST = 1e30
 """Coordinates beyond have depths that float32 cannot say."""
-MOST_PARTS = 10_000
 NOWHERE = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
 EDGE = 1e-4
 """Places in a texture that lie so little beyond its edge are rounding, and need no rule of what lies there."""
@@ -145,7 +143,7 @@ class Pictures:
 
     def __init__(self) -> None:
         self._decoded: dict[object, Float[Tensor, "height width 3"]] = {}
-        self._left = MOST_TEXELS
+        self._texels, self._bytes = 0, 0
 
     def known(self, key: object) -> Float[Tensor, "height width 3"] | None:
         return self._decoded.get(key)
@@ -158,30 +156,33 @@ class Pictures:
         """
         try:
             with Image.open(BytesIO(content), formats=FORMATS) as image:
-                self._left -= image.width * image.height
-                if self._left < 0 or max(image.size) > LONGEST_SIDE:
+                self._texels += image.width * image.height
+                self._bytes += len(content)
+                most = min(MOST_TEXELS, max(FEW_TEXELS, TEXELS_PER_BYTE * self._bytes))
+                if self._texels > most or max(image.size) > LONGEST_SIDE:
                     raise DataError(
                         f"the texture {name} has {image.width} x {image.height} pixels; wanted up to {LONGEST_SIDE} "
-                        f"along a side, and {MOST_TEXELS} of all textures together. Make it smaller."
+                        f"along a side, and {most} of all textures together. Make it smaller."
                     )
-                plain = image.convert("RGBA") if "transparency" in image.info else image
-                pixels = np.asarray(plain.convert("RGB"))
+                light = np.empty((image.height, image.width, 3), np.float32)
+                for top in range(
+                    0, image.height, STRIP
+                ):  # beside the whole image, whole steps would take twice it
+                    strip = image.crop((0, top, image.width, min(top + STRIP, image.height)))
+                    plain = strip.convert("RGBA") if "transparency" in image.info else strip
+                    light[top : top + STRIP] = _light(np.asarray(plain.convert("RGB")))
         except DataError:
             raise
         except Exception as error:
             raise DataError(
                 f"the texture {name} cannot be read as an image ({type(error).__name__}). Restore it."
             ) from error
-        self._decoded[key] = torch.from_numpy(_light(pixels))
+        self._decoded[key] = torch.from_numpy(light)
         return self._decoded[key]
 
 
 def _light(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    known = linear(torch.arange(256, dtype=torch.uint8)).numpy()
-    found = np.empty(pixels.size, np.float32)
-    for first in range(0, pixels.size, 2**20):  # the whole picture as an index would take twice its memory
-        found[first : first + 2**20] = known[pixels.reshape(-1)[first : first + 2**20]]
-    return found.reshape(pixels.shape)
+    return linear(torch.arange(256, dtype=torch.uint8)).numpy()[pixels]
 
 
 def beside(folder: Path, name: str) -> Path:
