@@ -28,6 +28,12 @@ SECONDS = 2.0
 BLOCKED = 20.0
 """Seconds without any progress until a process counts as blocked."""
 LONGEST_MESSAGE = 1500
+OUT_OF_MEMORY = re.compile(
+    r"not enough memory|unable to allocate|can't allocate|bad_alloc|out of memory", re.IGNORECASE
+)
+"""What libraries say who wanted more than MEMORY; a sentence that is made of it is no bound."""
+CANARY = (16, 64, 256, 1024, 4096, 16384) * 8
+"""Sizes of arrays that nothing else than an access out of bounds changes."""
 EXTREME = (
     0,
     1,
@@ -59,6 +65,11 @@ WORDS = (
     b"",
 )
 
+
+class Silent(Exception):
+    """What was damaged is taken as if it were whole, and answers with other numbers."""
+
+
 Damage = Callable[[bytes, np.random.Generator], bytes]
 
 
@@ -69,22 +80,30 @@ class Reader:
     Attributes:
         name: of the format and who reads it.
         file: what the file is called.
-        samples: whole files.
+        made: whole files, or what makes them.
         read: reads one, wholly.
         inner: damage that keeps what the format checks first (checksums, compression); used for half of the files.
         crafted: files that were made to do harm; read before the damaged ones.
         told: what a refusal must name; None: the file.
         optional: whether a pipe, a device or a folder in its place is left out, with a note.
+        share: of the damaged files that are asked for; there are many readers of one kind.
+        all_inner: whether each damage is one of the inner ones.
     """
 
     name: str
     file: str
-    samples: Sequence[bytes]
+    made: Sequence[bytes] | Callable[[], Sequence[bytes]]
     read: Callable[[Path], object]
     inner: Sequence[Damage] = ()
     crafted: Sequence[bytes] = ()
     told: str | None = None
     optional: bool = False
+    share: float = 1.0
+    all_inner: bool = False
+
+    @property
+    def samples(self) -> Sequence[bytes]:
+        return self.made() if callable(self.made) else self.made
 
 
 @dataclass
@@ -95,6 +114,7 @@ class Tally:
     read: int = 0
     refused: int = 0
     unclean: int = 0
+    silent: int = 0
     crashes: int = 0
     hangs: int = 0
     slowest: float = 0.0
@@ -102,7 +122,7 @@ class Tally:
 
     @property
     def bad(self) -> int:
-        return self.unclean + self.crashes + self.hangs
+        return self.unclean + self.silent + self.crashes + self.hangs
 
 
 def damaged(reader: Reader, number: int) -> bytes:
@@ -111,7 +131,7 @@ def damaged(reader: Reader, number: int) -> bytes:
         return reader.crafted[number]
     random = np.random.default_rng([SEED, zlib.crc32(reader.name.encode()), number])
     whole = reader.samples[int(random.integers(len(reader.samples)))]
-    if reader.inner and random.random() < 0.5:
+    if reader.inner and (reader.all_inner or random.random() < 0.5):
         return reader.inner[int(random.integers(len(reader.inner)))](whole, random)
     return spoilt(whole, random)
 
@@ -205,9 +225,9 @@ def fuzz(reader: Reader, count: int, folder: Path) -> Tally:
         if child == 0:
             _child(reader, first, count, folder, shared, log)
         status = _waited(child, shared)
-        number, *counts = struct.unpack_from("<4q", shared)
-        (slowest,) = struct.unpack_from("<d", shared, 32)
-        for name, found in zip(("read", "refused", "unclean"), counts, strict=True):
+        number, *counts = struct.unpack_from("<5q", shared)
+        (slowest,) = struct.unpack_from("<d", shared, 40)
+        for name, found in zip(("read", "refused", "unclean", "silent"), counts, strict=True):
             setattr(tally, name, getattr(tally, name) + found)
         tally.slowest = max(tally.slowest, slowest)
         if status == 0:
@@ -245,42 +265,52 @@ def _child(reader: Reader, first: int, count: int, folder: Path, shared: mmap.mm
     try:
         _limit()
         file = folder / reader.file
-        counts, slowest, seen = [0, 0, 0], 0.0, set()
+        counts, slowest, seen = [0, 0, 0, 0], 0.0, set()
+        canary = [np.full(size, number, np.uint8) for number, size in enumerate(CANARY)]
         for number in range(first, count):
-            struct.pack_into("<4q", shared, 0, number, *counts)
-            struct.pack_into("<d", shared, 32, slowest)
+            struct.pack_into("<5q", shared, 0, number, *counts)
+            struct.pack_into("<d", shared, 40, slowest)
             file.write_bytes(damaged(reader, number))
             before = time.process_time()
             signal.setitimer(signal.ITIMER_PROF, SECONDS)
             outcome, text = outcome_of(reader, file)
             signal.setitimer(signal.ITIMER_PROF, 0)
             slowest = max(slowest, time.process_time() - before)
+            for value, array in enumerate(canary):
+                if (array != value).any():
+                    outcome, text = 3, "an array that has nothing to do with the file changed"
+                    array.fill(value)
             counts[outcome] += 1
             key = re.sub(r"\d+", "0", text)[:60]
-            if outcome == 2 and key not in seen and len(seen) < 30:
+            if outcome >= 2 and key not in seen and len(seen) < 30:
                 seen.add(key)
                 with log.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps([number, text[:400]]) + "\n")
-        struct.pack_into("<4q", shared, 0, count, *counts)
-        struct.pack_into("<d", shared, 32, slowest)
+        struct.pack_into("<5q", shared, 0, count, *counts)
+        struct.pack_into("<d", shared, 40, slowest)
         code = 0
     finally:
         os._exit(code)
 
 
 def outcome_of(reader: Reader, file: Path) -> tuple[int, str]:
-    """0: read; 1: refused with a sentence that names the file; 2: anything else, and what."""
+    """0: read; 1: refused with a sentence that names the file; 2: anything else; 3: other numbers; and what."""
     try:
         reader.read(file)
     except UserError as error:
         text = str(error)
+        wanted = reader.file if reader.told is None else reader.told
         if len(text) - len(str(file)) > LONGEST_MESSAGE:
             return 2, f"a message of {len(text)} characters: {text}"
-        return (
-            (1, "")
-            if (reader.file if reader.told is None else reader.told) in text
-            else (2, f"a message without the file: {text}")
-        )
+        if not text.isprintable():
+            return 2, f"a message with control characters: {text!r}"
+        if wanted not in text:
+            return 2, f"a message without the file: {text}"
+        if wanted_memory(error):
+            return 2, f"more than {MEMORY / 2**30:g} GiB: {text}"
+        return 1, ""
+    except Silent as error:
+        return 3, str(error)
     except BaseException as error:
         frames = []
         trace = error.__traceback__
@@ -289,6 +319,19 @@ def outcome_of(reader: Reader, file: Path) -> tuple[int, str]:
             trace = trace.tb_next
         return 2, f"{type(error).__name__}: {error}"[:250] + f" at {' '.join(frames[-4:])}"
     return 0, ""
+
+
+def wanted_memory(error: BaseException | None) -> bool:
+    """Whether an error came of more memory than MEMORY; Python's parser says so of what is nested too deep."""
+    while error is not None:
+        trace = error.__traceback__
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        parser = trace is not None and Path(trace.tb_frame.f_code.co_filename).name == "ast.py"
+        if (isinstance(error, MemoryError) and not parser) or OUT_OF_MEMORY.search(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _limit() -> None:

@@ -31,6 +31,7 @@ from benchmarks.damaged_files import (
     signed,
     written,
 )
+from benchmarks.damaged_states import states
 from framework import modes
 from framework.configuration import loading
 from framework.configuration.config import Config
@@ -105,6 +106,7 @@ def readers() -> Iterator[Reader]:
     yield from spectra()
     yield from flights()
     yield from models()
+    yield from states()
     yield from runs()
 
 

@@ -6,8 +6,8 @@ reads it, and the tensors afterwards.
 """
 
 import math
+import mmap
 import os
-import pickletools
 import zipfile
 from collections.abc import Iterator
 from typing import Any, BinaryIO
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from framework.errors import shown
-from framework.storage.plain_values import Foreign, require_plain_pickle
+from framework.storage.plain_values import Foreign, instructions, require_plain_pickle
 
 TENSORS = ("_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")
 NUMBERS = {
@@ -65,6 +65,7 @@ MOST_SHARED = 1000
 """All tensors together may have so many times the numbers that a file holds: members may share weights."""
 PICKLES_BEFORE_ZIP = 5
 """In files of torch before 1.6: a mark, a version, the system, the values, and the names of the storages."""
+LENGTH_OF_MARK = 20
 
 
 def load(file: BinaryIO) -> Any:
@@ -117,14 +118,14 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
-    file.seek(0)
-    for _ in range(PICKLES_BEFORE_ZIP):
-        start = file.tell()
-        for _ in pickletools.genops(file):
-            pass
-        end = file.tell()
-        file.seek(start)
-        yield file.read(end - start)
+    # of a file itself, a length that is announced would be allocated before it is read
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        for number in range(PICKLES_BEFORE_ZIP):
+            start = content.tell()
+            for _, _, place in instructions(content):
+                if number == 0 and (place or 0) > LENGTH_OF_MARK:
+                    raise ValueError("it does not begin as a file of torch does")
+            yield content[start : content.tell()]
 
 
 def require_dense(content: Any, size: int | float = math.inf) -> None:

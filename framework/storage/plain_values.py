@@ -2,7 +2,7 @@
 
 import json
 import pickletools
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,6 +78,14 @@ ADDS = {"APPEND": 1, "SETITEM": 2, "BUILD": 1, "APPENDS": 0, "SETITEMS": 0, "ADD
 OTHERS = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID", "DUP"}
 OTHERS |= {"NEXT_BUFFER", "READONLY_BUFFER"}
 """Instructions that `torch.save` does not write, nor torch read."""
+VALUES = frozenset(
+    opcode.name
+    for opcode in pickletools.opcodes
+    if not opcode.stack_before
+    and len(opcode.stack_after) == 1
+    and opcode.name not in {*GETS, *OTHERS, "MARK", "GLOBAL"}
+)
+"""Instructions that put a new value on the stack: a number, a text, an empty list."""
 RENAMED = {"__builtin__": "builtins"}
 """Modules of Python 2, as pickles of protocol 2 name them, and of Python 3."""
 ENCODE = "_codecs encode"
@@ -85,6 +93,8 @@ ENCODE = "_codecs encode"
 TIMES_ITSELF = 4
 """What is made by calls may be so many times the pickle."""
 HIGHEST = 2**62
+MOST_INSTRUCTIONS = 1_000_000
+"""Of a pickle: a tensor takes 30, a number 1 or 2."""
 
 
 def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Collection[str] = ()) -> None:
@@ -106,12 +116,18 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
     stack: list[_Item] = []
     memo: dict[int, _Item] = {}
     left = TIMES_ITSELF * len(pickled) + 1000
-    for opcode, argument, _ in pickletools.genops(pickled):
+    for opcode, argument, _ in instructions(pickled):
         name = opcode.name
         if name in PUTS:
             memo[len(memo) if argument is None else int(argument)] = stack[-1]
         elif name in GETS:
             stack.append(memo[int(argument or 0)])
+        elif name in VALUES:
+            if isinstance(argument, str | bytes):
+                short = argument if isinstance(argument, str) and len(argument) < 32 else ""
+                stack.append(_Item(1 + len(argument), text=short))
+            else:
+                stack.append(_Item())
         elif name in TUPLES:
             inner = (
                 _above_mark(stack) if name == "TUPLE" else [stack.pop() for _ in range(int(name[-1]))][::-1]
@@ -150,11 +166,20 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
             if pickletools.markobject in taken:
                 _above_mark(stack)
                 taken = taken[: taken.index(pickletools.markobject)]
-            size = 1 + sum(stack.pop().size for _ in taken)
-            text = argument if isinstance(argument, str | bytes) else ""
-            short = text if isinstance(text, str) and len(text) < 32 else ""
-            for _ in opcode.stack_after:
-                stack.append(_Item(min(size + len(text), HIGHEST), text=short))
+            size = sum(stack.pop().size for _ in taken)
+            stack += [_Item(min(1 + size, HIGHEST)) for _ in opcode.stack_after]
+
+
+def instructions(pickled: Any) -> Iterator[tuple[pickletools.OpcodeInfo, Any, int | None]]:
+    """Those of one pickle, as `pickletools.genops`.
+
+    Raises:
+        ValueError: there are more than MOST_INSTRUCTIONS: they would take seconds.
+    """
+    for number, found in enumerate(pickletools.genops(pickled)):
+        if number == MOST_INSTRUCTIONS:
+            raise ValueError(f"a pickle of more than {MOST_INSTRUCTIONS} instructions")
+        yield found
 
 
 def _above_mark(stack: list[_Item]) -> list[_Item]:

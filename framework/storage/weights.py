@@ -174,11 +174,11 @@ FINITE, FROM_0, ABOVE_0 = (-LARGEST, LARGEST), (0.0, LARGEST), (torch.finfo(torc
 """What the numbers of a buffer may be: least and most."""
 
 
-def require_state(module: nn.Module, **bounds: tuple[float, float]) -> None:
+def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tensor, Tensor]) -> None:
     """Let `load_state_dict` refuse buffers of the module that are not what was fitted: of another shape, out of bounds.
 
     Args:
-        bounds: the least and the most that a buffer's numbers may be, by its name; NaN is neither.
+        bounds: the least and the most that a buffer's numbers may be, all or each, by its name; NaN is neither.
     """
     module.register_load_state_dict_pre_hook(partial(_require_state, bounds))
 
@@ -195,12 +195,17 @@ def _require_state(
         if found is None:
             continue  # torch says what is missing
         mismatch = describe_mismatch({name: buffer}, {name: found})
-        if mismatch is None and not ((found >= least) & (found <= most)).all():
-            mismatch = f"{name} has numbers that are not between {least:.4g} and {most:.4g}."
+        if mismatch is None and not ((found.double() >= least) & (found.double() <= most)).all():
+            mismatch = f"{name} has numbers that are not between {_told(least)} and {_told(most)}."
         if mismatch:
             raise CheckpointError(
                 f"The state of {type(module).__name__} is damaged: {mismatch} Load another checkpoint, or train anew."
             )
+
+
+def _told(bound: float | Tensor) -> str:
+    numbers = bound.tolist() if isinstance(bound, Tensor) else [bound]
+    return _some([f"{number:.4g}" for number in numbers])
 
 
 def _same_kind(wanted: Tensor, found: Tensor) -> bool:

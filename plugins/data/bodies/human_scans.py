@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, shown
 from framework.geometry import clouds
 from framework.geometry.camera import Camera, canonical_camera
 from framework.geometry.light import encoded, linear
@@ -23,6 +23,7 @@ from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.geometry.meshes import READERS, read
 from framework.renderer import Renderer
 from framework.storage.generated import read_mark
+from framework.storage.limits import MOST_INPUT
 from framework.target import Target
 from plugins.data.bodies import scan_layout
 from plugins.data.bodies.scan_generator import Crowd, Drawing, scans_root
@@ -181,7 +182,14 @@ class HumanScans(Data):
                 f"human_scans keeps the size of its images, but was given {', '.join(state) or 'nothing'}. Give the "
                 "data that the model was trained on."
             )
-        self.size = (int(state["height"]), int(state["width"]))
+        height, width = state["height"], state["width"]
+        whole = type(height) is int and type(width) is int
+        if not whole or min(height, width) < 1 or height * width > MOST_INPUT:
+            raise DataError(
+                f"human_scans keeps the size of its images, but was given {shown(height)} by {shown(width)}; wanted "
+                f"two whole numbers of pixels, {MOST_INPUT:,} in all at most. Load another checkpoint, or train anew."
+            )
+        self.size = (height, width)
 
     def augment(self, batch: Batch) -> Batch:
         """Seen in a mirror, and with other colours, as drawn for each sample."""

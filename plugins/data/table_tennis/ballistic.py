@@ -19,7 +19,7 @@ from framework.storage.weights import ABOVE_0, require_state
 from framework.target import Target
 from plugins.data.table_tennis.estimation import Estimate, Prior, Seen, estimated, root, seen_of
 from plugins.data.table_tennis.flying import flown, flown_with_slopes
-from plugins.data.table_tennis.identification import found_of, identified, with_found
+from plugins.data.table_tennis.identification import bounds_of, found_of, identified, with_found
 from plugins.data.table_tennis.physics import Constants
 from plugins.data.table_tennis.windows import PARTS
 
@@ -94,7 +94,7 @@ class BallisticHead(DensityHead, Fitted):
         self.register_buffer("found", found_of(constants))
         self.register_buffer("noise", torch.tensor(noise).double())
         self.register_buffer("spread", torch.ones(3 * self.future, dtype=torch.float64))
-        require_state(self, found=(-100.0, 100.0), noise=ABOVE_0, spread=ABOVE_0)
+        require_state(self, found=bounds_of(constants), noise=ABOVE_0, spread=ABOVE_0)
 
     @property
     def constants(self) -> Constants:

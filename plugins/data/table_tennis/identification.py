@@ -32,6 +32,15 @@ def found_of(constants: Constants) -> Float[Tensor, "constant"]:
     return torch.tensor([asdict(constants)[name] for name in FITTED], dtype=torch.float64)
 
 
+def bounds_of(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
+    """Least and most of those of `FITTED` that may be stored: what `identified` may find, or these of the config."""
+    given = found_of(constants)
+    middle = torch.zeros_like(given)
+    middle[-1] = given[-1]
+    low, high = (middle + torch.tensor(bound, dtype=torch.float64) for bound in (LOW, HIGH))
+    return torch.minimum(low, given), torch.maximum(high, given)
+
+
 def identified(
     seen: Seen, given: Constants, states: Float[Tensor, "flight 9"], noise: float, prior: Prior
 ) -> tuple[Float[Tensor, "constant"], Float[Tensor, "flight 9"]]:

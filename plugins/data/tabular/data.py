@@ -13,7 +13,17 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.errors import DataError
 from plugins.data.tabular.picture import bars
-from plugins.data.tabular.table import Kind, Missing, Question, Reading, Scaling, Table, load, of_rows, read
+from plugins.data.tabular.table import (
+    Kind,
+    Missing,
+    Question,
+    Reading,
+    Table,
+    load,
+    of_rows,
+    read,
+    stored_reading,
+)
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
@@ -113,8 +123,7 @@ class Tabular(Data):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if state:
-            numbers = (np.array(state[name], np.float64) for name in Scaling._fields)
-            self._trained = Reading(tuple(state["columns"]), Scaling(*numbers))
+            self._trained = stored_reading(state)
 
     def augment(self, batch: Batch) -> Batch:
         return batch

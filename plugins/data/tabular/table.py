@@ -60,6 +60,31 @@ class Reading(NamedTuple):
     scaling: Scaling
 
 
+def stored_reading(state: Mapping[str, Any]) -> Reading:
+    """How a model's training data became inputs, out of a checkpoint.
+
+    Raises:
+        DataError: it is not one finite number for each column, or something that would divide by 0.
+    """
+    columns: Sequence[Any] = state["columns"] if isinstance(state.get("columns"), list | tuple) else ()
+    named = bool(columns) and all(isinstance(name, str) for name in columns)
+    try:
+        numbers = Scaling(*(np.array(state[name], np.float64) for name in Scaling._fields))
+    except (KeyError, TypeError, ValueError):
+        numbers = Scaling(*(np.zeros(0) for _ in Scaling._fields))
+    if (
+        not named
+        or any(part.shape != (len(columns),) or not np.isfinite(part).all() for part in numbers)
+        or (numbers.largest <= 0).any()
+        or (numbers.deviation <= 0).any()
+    ):
+        raise DataError(
+            f"tabular keeps {', '.join(Scaling._fields)} of each column of its training table, but was given something "
+            "else. Load another checkpoint, or train anew."
+        )
+    return Reading(tuple(columns), numbers)
+
+
 class Table(NamedTuple):
     """A table's answer."""
 
