@@ -13,7 +13,7 @@ from typing import Any
 
 PLACES = {
     "start": None,
-    "first step": ("framework.training.module", "KeepCheckpoints", "on_train_batch_start", 1),
+    "before the first step": ("framework.training.module", "Training", "configure_optimizers", 1),
     "collective": ("framework.training.module", None, "share", 5),
     "between epochs": ("framework.training.module", "StopAtBatch", "on_train_epoch_end", 1),
     "in a checkpoint": ("torch", None, "save", 5),

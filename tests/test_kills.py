@@ -11,13 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import ALLOWED, ROOT, Command, differences, status
+from benchmarks.kills import ROOT, Command, differences, status
 from framework.tracking.ended import mark_dead
 from tests.test_pool import App
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere nothing tells a process that its parent has died"
 )
+LOADED = 25.0
+"""Seconds for what takes at most 10 on a machine that does nothing else (benchmarks/kills.md)."""
 RUN = """
 import json, os, signal, sys, threading, time
 from pathlib import Path
@@ -81,7 +83,7 @@ class Lives:
         if kill:
             until(lambda: self.killed.exists() or command.process.poll() is not None, 200)
             assert self.killed.exists(), self.output()
-        seconds = command.seconds_until_gone(ALLOWED if kill else 200)
+        seconds = command.seconds_until_gone(LOADED if kill else 200)
         assert seconds < math.inf, f"{kill}: a process was left"
         return command.process.wait()
 
@@ -128,7 +130,7 @@ def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Pat
     if "two" in how:
         while status(tmp_path) == "RUNNING":
             mark_dead(tmp_path)
-    assert command.seconds_until_gone(60) < ALLOWED
+    assert command.seconds_until_gone(LOADED) < math.inf
     assert status(tmp_path) == ("FINISHED" if how == "closes" else "KILLED")
     lines = [json.loads(line) for line in (tmp_path / "journal.jsonl").read_text("utf-8").splitlines()]
     assert [line.get("status") for line in lines] == [None] if how == "closes" else [None, "KILLED"]
@@ -149,7 +151,7 @@ def test_a_killed_script_leaves_nothing_of_its_sweep(tmp_path: Path) -> None:
     )  # fmt: skip
     app.until_ready(0, 1)
     os.kill(command.process.pid, signal.SIGKILL)
-    assert command.seconds_until_gone(60) < ALLOWED
+    assert command.seconds_until_gone(LOADED) < math.inf
     assert [app.record(number)["error"] for number in range(2)] == [
         "stopped by SIGTERM",
         "killed by SIGKILL, as the system does when memory runs out",

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, final
@@ -27,8 +28,10 @@ _GRACE = 4.0
 """Seconds that this rank has to leave the training by itself, after another one has died."""
 _CLOSING = 3.0
 """Seconds for closing the run where this rank has not left by itself."""
-_MOMENT = 2.0
-"""Seconds within which a rank that has caused an error of this one has ended."""
+_MOMENT = 5.0
+"""Seconds within which a rank that has closed its connections has ended."""
+_TOLD = ("gloo", "NCCL", "c10d", "ProcessGroup", "Connection")
+"""Words of an error that a collective raises from compiled code."""
 _PAUSE = 0.1
 
 
@@ -123,8 +126,8 @@ def sharing_one_fate(
     guard.start()
     try:
         yield
-    except RuntimeError as error:  # as collectives raise
-        cause = guard.cause(_MOMENT)
+    except RuntimeError as error:
+        cause = guard.cause(_MOMENT) if _of_a_collective(error) else None
         guard.leave(cause)
         if cause is None:
             raise
@@ -133,6 +136,15 @@ def sharing_one_fate(
         guard.leave(None)
         raise
     guard.end()
+
+
+def _of_a_collective(error: BaseException) -> bool:
+    """Return whether an error says that another rank is away."""
+    frames = traceback.walk_tb(error.__traceback__)
+    names = (str(frame.f_globals.get("__name__")) for frame, _ in frames)
+    return any(word in str(error) for word in _TOLD) or any(
+        name.startswith("torch.distributed") for name in names
+    )
 
 
 @final
