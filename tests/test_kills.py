@@ -1,5 +1,6 @@
 """Whichever process of a run or a sweep is killed, no other is left, and the run is closed."""
 
+import ast
 import json
 import math
 import os
@@ -156,3 +157,25 @@ def test_a_killed_script_leaves_nothing_of_its_sweep(tmp_path: Path) -> None:
         "stopped by SIGTERM",
         "killed by SIGKILL, as the system does when memory runs out",
     ]
+
+
+END_BY_THEMSELVES = {
+    "watch.py": "when the run's process has ended",
+    "store_process.py": "with their input",
+    "repository.py": "within seconds, in which they read one commit",
+}
+"""Files that start other processes, and when those end."""
+
+
+def test_every_process_that_the_framework_starts_ends_with_it() -> None:
+    bound: dict[str, list[bool]] = {}
+    for path in [*ROOT.glob("framework/**/*.py"), *ROOT.glob("hydra_plugins/**/*.py")]:
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(call, ast.Call) and ast.unparse(call.func) in (
+                "subprocess.Popen",
+                "subprocess.run",
+            ):
+                ends = any(word.arg == "preexec_fn" for word in call.keywords)
+                bound.setdefault(path.name, []).append(ends)
+    assert {"processes.py", "rehearsal.py", "rank_processes.py"} <= bound.keys()
+    assert {name for name, ends in bound.items() if not all(ends)} <= END_BY_THEMSELVES.keys()

@@ -1,6 +1,7 @@
 """Finds the mistakes in a sweep's jobs before any of them runs, in a process of its own that may import torch."""
 
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 
 from framework.configuration.config import Config
 from framework.errors import ConfigError, UserError
+from framework.tracking.signals import ending_with_parent
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework.sweeps.rehearsal")
 
@@ -32,7 +34,14 @@ def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> 
             raise ConfigError(_told(overrides, str(error))) from error
     if not training:
         return
-    done = subprocess.run(COMMAND, input=json.dumps(training), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        COMMAND,
+        input=json.dumps(training),
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=ending_with_parent(signal.SIGKILL),
+    )
     if done.returncode == 2:
         raise ConfigError(done.stdout)
     # anything else that went wrong is for the jobs to say
