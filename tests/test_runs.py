@@ -543,7 +543,6 @@ def test_a_sweep_that_was_killed_closes_its_parent_when_it_is_repeated(
     first.wait()
     parent = Done(0, "", sweep)
     assert (status(parent), stored_statuses(parent)[0]) == ("RUNNING", "RUNNING")
-    (sweep / "parent.json").unlink()  # as if killed before that was written
     subprocess.run(command, check=True, timeout=300, **options)
     assert (status(parent), stored_statuses(parent)) == ("FINISHED", ["FINISHED", "FINISHED"])
     with closing(sqlite3.connect(store_of(parent))) as store:
