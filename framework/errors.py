@@ -9,12 +9,23 @@ from itertools import islice
 class UserError(Exception):
     """Something the user can mend. Printed as a sentence, without a stack trace.
 
+    What steers a terminal is written out: a message may quote a file of somebody else.
+
     One that is raised in a worker of a `DataLoader` torch raises anew, of the same class, with the worker's stack trace
     for a message: of that the sentence alone is kept.
     """
 
     def __init__(self, *said: object) -> None:
-        super().__init__(*(_sentence(one, type(self)) if isinstance(one, str) else one for one in said))
+        super().__init__(
+            *(printable(_sentence(one, type(self))) if isinstance(one, str) else one for one in said)
+        )
+
+
+def printable(text: str) -> str:
+    """Return a text of several lines in which nothing steers a terminal."""
+    return "".join(
+        letter if letter.isprintable() or letter in "\n\t" else repr(letter)[1:-1] for letter in text
+    )
 
 
 def _sentence(said: str, kind: type[UserError]) -> str:

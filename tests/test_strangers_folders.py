@@ -14,7 +14,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ import pytest
 import yaml
 
 from framework.errors import UserError
+from framework.sweeps import comparison
 from tests.conftest import TINY, Done, Forks, Once, command
 
 SECRET = b"the user's own line\nand one that does not end"
@@ -288,3 +289,59 @@ def test_a_plugins_command_does_nothing_but_say_a_sentence(
     assert state(sent.home) == before
     with pytest.raises(BlockingIOError):
         listener.accept()
+
+
+WRONG = [None, -1, "", "\x1b[2J$\\frac{", [], {"a": {"b": [None]}}]
+RESULTS = {
+    "method": "m",
+    "data": "d",
+    "seed": 0,
+    "milliseconds_per_sample": 1.0,
+    "device": "cpu",
+    "threads": 1,
+    "columns": {"nll": "NLL"},
+    "better": {"nll": "lower"},
+    "nll": 1.0,
+    "synthetic": True,
+    "folder": "/etc",
+}
+RECORD = {
+    "number": 0,
+    "overrides": ["x=1"],
+    "key": "k",
+    "config": "c",
+    "command": ["x"],
+    "pid": 1,
+    "tries": 1,
+    "error": None,
+    "started": 1.0,
+    "ended": 2.0,
+    "processor_seconds": 1.0,
+    "status": "completed",
+}
+
+
+@pytest.mark.parametrize("key", [*RESULTS, *(f"record {key}" for key in RECORD)])
+def test_a_job_that_says_nonsense_is_left_out_of_the_table(
+    key: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Each key of results.json and job.json with values of every kind, or without; nothing steers the terminal."""
+    if key.startswith("record "):
+        monkeypatch.setattr(comparison, "_picture", lambda *_: [])  # which no record has part in
+    for value in [*WRONG, "missing"]:
+        files = {"results.json": dict(RESULTS), "job.json": dict(RECORD)}
+        told = files["job.json" if key.startswith("record ") else "results.json"]
+        told[key.removeprefix("record ")] = value
+        if value == "missing":
+            del told[key.removeprefix("record ")]
+        for name, content in files.items():
+            (tmp_path / "0").mkdir(exist_ok=True)
+            (tmp_path / "0" / name).write_text(json.dumps(content))
+        with suppress(UserError):
+            comparison.summarise(tmp_path, [], {})
+        out = capsys.readouterr().out + caplog.text
+        assert all(letter.isprintable() or letter == "\n" for letter in out), f"{value}: {out!r}"

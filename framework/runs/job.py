@@ -3,8 +3,11 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
+from framework.errors import DataError, quoted
 from framework.storage.files import write_whole
+from framework.storage.plain_values import read_json
 
 PARENT = "FRAMEWORK_SWEEP_PARENT"
 """Environment variable that tells a job the tracking run its sweep is recorded under."""
@@ -14,6 +17,37 @@ RECORD = "job.json"
 VALUE = "value.json"
 _COMMAND = "multirun.yaml"
 """What Hydra leaves in the folder of a sweep."""
+
+
+_NUMBER, _TEXT = (int, float), (str, type(None))
+_KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("overrides", "command"), (list,)),
+    **dict.fromkeys(("key", "status"), (str,)),
+    **dict.fromkeys(("error", "config"), _TEXT),
+    **dict.fromkeys(("started", "ended", "processor_seconds", "pid"), (*_NUMBER, type(None))),
+    **dict.fromkeys(("number", "tries"), (int,)),
+}
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the record of the job in a folder (`framework.sweeps.jobs.Job`); it may be a stranger's.
+
+    Raises:
+        DataError: there is none, or it is not what a sweep writes.
+    """
+    path, remedy = folder / RECORD, "Delete it, and the job runs anew."
+    record = read_json(path, "the record of a job", remedy)
+    wrong = [key for key, kinds in _KINDS.items() if key in record and not isinstance(record[key], kinds)]
+    if "overrides" not in record or (
+        not wrong and not all(isinstance(one, str) for one in record["overrides"])
+    ):
+        wrong.append("overrides")
+    if "key" in record and "number" not in record:
+        wrong.append("number")
+    if wrong:
+        found = quoted(record.get(wrong[0]))
+        raise DataError(f"{path} says {wrong[0]} = {found}; wanted what a sweep writes. {remedy}")
+    return record
 
 
 def by_number(folder: Path) -> list[tuple[int, str]]:

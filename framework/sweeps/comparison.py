@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from framework.configuration.settings import store_experiment
-from framework.errors import ConfigError, DataError, did_you_mean
+from framework.errors import ConfigError, DataError, did_you_mean, quoted, shown
 from framework.reports.table import (
     COST_BETTER,
     COST_COLUMNS,
@@ -19,7 +19,7 @@ from framework.reports.table import (
     markdown,
     results_table,
 )
-from framework.runs.job import RECORD, recorded
+from framework.runs.job import read_record, recorded
 from framework.runs.run import stored_config
 from framework.storage.plain_values import read_json
 from framework.storage.progress import output
@@ -194,10 +194,35 @@ def _results(job: Path) -> dict[str, Any]:
         results = read_json(path, "the results of a job")
         if lacking := [key for key in _HEADER if key not in results]:
             raise DataError(f"{path} lacks {', '.join(lacking)}. {RESTORE}")
+        return _checked(results, path)
     except DataError as error:
         _log.warning("The table lacks a job: %s", error)
         return {}
-    return results
+
+
+def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return what a job found, its texts as they may be printed: the file may be a stranger's.
+
+    Raises:
+        DataError: it is not what a test writes.
+    """
+    columns, better = results["columns"], results["better"]
+    wanted = {
+        "method": isinstance(results["method"], str),
+        "data": isinstance(results["data"], str),
+        "seed": isinstance(results.get("seed"), int | str | None),
+        "device": isinstance(results.get("device"), str | None),
+        "threads": isinstance(results.get("threads"), int) or "device" not in results,
+        "columns": isinstance(columns, dict) and all(isinstance(one, str) for one in columns.values()),
+        "better": isinstance(better, dict) and all(one in ("higher", "lower") for one in better.values()),
+        **{key: isinstance(results[key], int | float | None) for key in COST_COLUMNS if key in results},
+    }
+    if isinstance(columns, dict):
+        wanted |= {key: isinstance(results[key], int | float | None) for key in columns if key in results}
+    if wrong := [key for key, right in wanted.items() if not right]:
+        raise DataError(f"{path} says {shown(wrong[0])} = {quoted(results.get(wrong[0]))}. {RESTORE}")
+    plain = {key: shown(value) if isinstance(value, str) else value for key, value in results.items()}
+    return {**plain, "columns": {key: shown(heading) for key, heading in columns.items()}}
 
 
 def _trial_row(
@@ -240,17 +265,17 @@ def _better(
 
 
 def _status(folder: Path) -> str:
-    return read_json(folder / RECORD, "the record of a job").get("status", "")
+    return read_record(folder).get("status", "")
 
 
 def _row(job: Path) -> dict[str, Any] | None:
     """What a completed job found; None for another, and for one of which that cannot be read."""
-    record = read_json(job / RECORD, "the record of a job")
+    record = read_record(job)
     results = _results(job) if record.get("status") == "completed" else {}
     if not results:
         return None
     swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
-    row = {**swept, **results, "overrides": record["overrides"]}
+    row = {**swept, **results, "overrides": record["overrides"], "folder": str(job)}
     if "batch_size" in swept:
         # in results it is that at which the cost was measured, which a small test split limits
         row["batch_size"] = swept["batch_size"]
@@ -314,8 +339,9 @@ def _picture(
         machine="; ".join(dict.fromkeys(machine(row["device"], row["threads"]) for row in rows)),
         group=data if several else None,
     )
-    stored = stored_config(Path(rows[0]["folder"])) or {}
-    return [saved(figure, folder / "comparison", stored.get("pictures", True))]
+    stored = stored_config(Path(rows[0]["folder"]))
+    wanted = stored.get("pictures", True) if isinstance(stored, dict) else True
+    return [saved(figure, folder / "comparison", wanted if wanted in ("png", "pdf", "svg", False) else True)]
 
 
 def _parent(

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, UserError
-from framework.runs.job import PARENT, RECORD, VALUE, recorded
+from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
 from framework.storage.files import write_whole
-from framework.storage.plain_values import read_json
 from framework.storage.reading import guarded, read_bytes
 from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
@@ -69,7 +68,7 @@ class Job:
 
     def reread(self) -> bool:
         """Take the record from the disk, where another sweep may have changed it; False where it is another job's."""
-        found = read_json(self.folder / RECORD, "the record of a job")
+        found = read_record(self.folder)
         if found.get("key") == self.key:
             self.record = found
             return True
@@ -99,7 +98,7 @@ def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
     """Folder and record of every job an earlier sweep in `folder` knew, by key (overrides may repeat)."""
     found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
     for path in recorded(folder):
-        record = read_json(path / RECORD, "the record of a job", "Delete it, and the job runs anew.")
+        record = read_record(path)
         found.setdefault(str(record.get("key")), []).append((path, record))
     return found
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import final
 
-from framework.errors import CheckpointError, DataError
+from framework.errors import CheckpointError, DataError, shown
 from framework.storage.cache import folder as cache_folder
 from framework.storage.enclosed import require_enclosed, require_plain_within
 from framework.storage.files import alone, remove_leftovers, replacing
@@ -124,7 +124,9 @@ class MlflowStore(Store):
             if file.is_dir():
                 require_enclosed(file)
         except DataError as error:
-            _log.warning("%s leads out of the run folder %s (%s): it is not sent.", file, self._folder, error)
+            _log.warning(
+                "%s leads out of the run folder %s (%s): it is not sent.", shown(file), self._folder, error
+            )
             return
         self._require_own_files(self._files)
         if place == MODEL and file.is_file():
@@ -136,7 +138,7 @@ class MlflowStore(Store):
         elif file.exists():
             self._client.log_artifact(self._run_id, str(file), place or None)
         else:
-            _log.warning("%s is gone before it could be stored.", file)
+            _log.warning("%s is gone before it could be stored.", shown(file))
 
     def _send_model(self, file: Path) -> None:
         """Make the checkpoint a model of MLflow, which serves it; what was sent before is replaced."""
@@ -170,7 +172,7 @@ class MlflowStore(Store):
                 if error.error_code != "RESOURCE_DOES_NOT_EXIST":
                     raise
             uri = without_password(info.uri)
-            _log.warning("%s knows no run %s: the run is stored there anew.", uri, info.run_id)
+            _log.warning("%s knows no run %s: the run is stored there anew.", shown(uri), shown(info.run_id))
         found = self._client.search_runs([experiment_id], f"tags.`{_KEY}` = '{info.key}'", max_results=1)
         return found[0] if found else None
 
@@ -260,7 +262,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         CheckpointError: the store has no such run, or the run has no checkpoints.
     """
     store = address(uri, Path.cwd() / "outputs" / "any")
-    shown = without_password(store.uri)
+    told = without_password(store.uri)
     path = sqlite_path(store.uri)
     if path is not None and not path.is_file():  # MLflow would make one
         raise CheckpointError(f"There is no tracking store {path}. Give its address (logger.uri=...).")
@@ -279,7 +281,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         models = _models(run)
         if not models and not client.list_artifacts(run_id, "checkpoints"):
             raise CheckpointError(
-                f"Run {run_id} of {shown} has no checkpoints, and its folder {made} is gone."
+                f"Run {run_id} of {told} has no checkpoints, and its folder {made} is gone."
             )
         copy = cache_folder("runs") / run_id
         copy.mkdir(exist_ok=True)
@@ -290,7 +292,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
             return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=store.uri))
         client.download_artifacts(run_id, "checkpoints", str(copy))  # a run of version 0.1
     except MlflowException as error:
-        raise CheckpointError(f"Run {run_id} cannot be had from {shown}: {reason(error)}.") from error
+        raise CheckpointError(f"Run {run_id} cannot be had from {told}: {reason(error)}.") from error
     return copy
 
 
