@@ -207,6 +207,7 @@ _FORMULAS: dict[str, Callable[[Mapping[str, Any]], int | float]] = {
     "randperm": lambda called: called["n"],
     "tril_indices": lambda called: 2 * called["row"] * called["col"],
     "triu_indices": lambda called: 2 * called["row"] * called["col"],
+    "_euclidean_dist": lambda called: math.prod(called["x1"].shape[:-1]) * called["x2"].shape[-2],
     "_cdist_forward": lambda called: math.prod(called["x1"].shape[:-1]) * called["x2"].shape[-2],
     "im2col": lambda called: called["self"].numel() * math.prod(called["kernel_size"]),
     "diag_embed": lambda called: called["self"].numel() * called["self"].shape[-1],
