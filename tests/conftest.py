@@ -3,17 +3,20 @@
 import json
 import os
 import select
+import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from filelock import FileLock
 
+from framework.configuration.paths import paths_of, words
 from framework.storage.cache import folder as cache_folder
 
 Once = Callable[[str, Callable[[Path], None]], Path]
@@ -169,14 +172,28 @@ def forks() -> Iterator[Forks]:
 Framework = Callable[..., Done]
 
 
+def paths_again(arguments: Sequence[str]) -> list[str]:
+    """What a command that goes on with a run says of the paths in its config."""
+    for argument in arguments:
+        config = Path(argument.removeprefix("resume=")) / "config.yaml"
+        if argument.startswith("resume=") and config.is_file():
+            stored = paths_of(yaml.safe_load(config.read_text(encoding="utf-8")))
+            return [word for word in shlex.split(" ".join(words(stored))) if word not in arguments]
+    return []
+
+
 def command(forks: Forks, site: Path, base: Path) -> Framework:
-    """Call `python -m framework` in `base`; `folder` names the run folder if there is one, `more` extra environment."""
+    """Call `python -m framework` in `base`; `folder` names the run folder if there is one, `more` extra environment.
+
+    Beside `resume=<folder>` the paths of that run are said again, unless a test looks at what is told without them.
+    """
 
     def call(
         *arguments: str,
         folder: str | None = "run",
         more: Mapping[str, str] | None = None,
         paths: tuple[Path, ...] = (),
+        say_again: bool = True,
     ) -> Done:
         environment = {
             **os.environ,
@@ -190,7 +207,11 @@ def command(forks: Forks, site: Path, base: Path) -> Framework:
         run, output = base / (folder or ""), base / "output.txt"
         own = folder is None or any(item.startswith(("resume=", "hydra.", "-")) for item in arguments)
         code = forks(
-            arguments=[*arguments, *([] if own else [f"hydra.run.dir={run}"])],
+            arguments=[
+                *arguments,
+                *(paths_again(arguments) if say_again else ()),
+                *([] if own else [f"hydra.run.dir={run}"]),
+            ],
             environment=environment,
             folder=base,
             packages=(site, *paths),

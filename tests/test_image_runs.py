@@ -10,19 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 from torch.utils.data import default_collate
 
 import framework as package
 from framework.configuration.assembly import build_data, build_predictor, resolve_all
 from framework.configuration.composition import plain
+from framework.configuration.paths import paths_of
 from framework.deployment.served import _load_pyfunc
 from framework.encoder import Encoder
 from framework.errors import DataError
 from framework.geometry.light import eight_bit, light_of
 from plugins.data.bodies.rows import body_file, colored, colored_meshes, scanned
 from plugins.data.bodies.scan_layout import write_registration
-from tests.conftest import Done, Framework
+from tests.conftest import Done, Framework, paths_again
 from tests.test_composition import composed
 
 SQUARES = (
@@ -175,7 +177,10 @@ def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: 
     assert "epoch 1" not in done.out
     results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
     assert results["psnr_db"] > 15
-    tested = framework("mode=test", f"checkpoint={done.folder}", "logger=none", folder="tested")
+    test = ("mode=test", f"checkpoint={done.folder}", "logger=none")
+    unsaid = framework(*test, folder="unsaid")
+    assert unsaid.code == 2 and "encoder.rasterised.body=" in unsaid.out, unsaid.out
+    tested = framework(*test, *paths_again([f"resume={done.folder}"]), folder="tested")
     assert tested.code == 0, tested.out
     refused = framework("experiment=smplpix/rasterised", *run, "objective=[random_features]", folder="no")
     assert refused.code == 2
@@ -198,14 +203,15 @@ def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(
     )
     done = framework("experiment=smplpix/textured", *run, folder="drawn")
     assert done.code == 0, done.out
-    models = package.load(done.folder), package.freeze(done.folder).density
+    paths = paths_of(yaml.safe_load((done.folder / "config.yaml").read_text(encoding="utf-8")))
+    models = package.load(done.folder, paths=paths), package.freeze(done.folder, paths=paths).density
     mesh, *_ = colored_meshes(tmp_path)  # who has the colours of the first subject
     assert torch.equal(models[0](mesh).mean, models[1](mesh).mean)
     write_registration(mesh, colored(9))
     for model in models:
         with pytest.raises(DataError, match="has the vertex colours of no subject in"):
             model(mesh)
-    models = package.load(done.folder), package.freeze(done.folder)
+    models = package.load(done.folder, paths=paths), package.freeze(done.folder, paths=paths)
     scans.rename(tmp_path / "moved")
     for model in models:
         with pytest.raises(DataError, match="no such folder; wanted that of the subjects"):

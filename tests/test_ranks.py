@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.kills import differences, status
 from framework.training.ranks import Share, WholeBatch
-from tests.conftest import TINY, Done, Forks, Framework, command
+from tests.conftest import TINY, Done, Forks, Framework, command, paths_again
 from tests.test_kills import Lives
 
 TWO = ("trainer=ddp", "trainer.devices=2", "trainer.accelerator=cpu")
@@ -142,8 +142,9 @@ def test_ranks_that_were_stopped_go_on_under_another_launcher_to_the_same_bits(
     assert marker.exists()
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     environment = {**os.environ, "PYTHONPATH": str(stranger_site), "OMP_NUM_THREADS": "1"}
+    resume = f"resume={broken.folder}"
     done = subprocess.run(
-        [*launch, "-m", "framework", f"resume={broken.folder}"],
+        [*launch, "-m", "framework", resume, *paths_again([resume])],
         cwd=tmp_path,
         env=environment,
         capture_output=True,

@@ -11,6 +11,7 @@ from hydra.errors import HydraException
 
 from framework.configuration.composition import folder, groups, in_quotes, options, register
 from framework.configuration.foreign_configs import require_harmless
+from framework.configuration.stored_keys import as_stored
 from framework.errors import ConfigError, did_you_mean
 from framework.tracking.stores import require_no_password
 
@@ -31,7 +32,7 @@ def command_line(arguments: list[str]) -> list[str]:
             )
     _refuse_code_and_passwords(arguments)
     require_harmless(arguments, groups())
-    return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(arguments)))
+    return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(as_stored(arguments))))
 
 
 def _preset_for_the_data(arguments: list[str]) -> list[str]:

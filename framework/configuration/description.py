@@ -7,6 +7,7 @@ from importlib.metadata import version
 from typing import Any, get_args
 
 from framework.configuration.assembly import Resolved
+from framework.configuration.paths import MODEL, UNUSED, require_said, without_paths
 from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
@@ -31,6 +32,8 @@ class Description:
         settings: of its run, those `INHERITED`; none in checkpoints of version 0.1.
         data_state: `Data.state_dict` of the data it was trained on.
         path: of the checkpoint it was read from.
+        dropped: paths that the stored config names and the user has not said again, by dotted keys; in `config` they
+            have their defaults.
     """
 
     config: Resolved
@@ -42,6 +45,7 @@ class Description:
     settings: Mapping[str, Any] = field(default_factory=dict)
     data_state: Mapping[str, Any] = field(default_factory=dict)
     path: str = ""
+    dropped: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, parts: Resolved, data: Data, method: str, settings: Settings) -> "Description":
@@ -74,16 +78,22 @@ class Description:
         return {
             "format": 1,
             "version": version("robust-visual-learning"),
-            **{key: value for key, value in asdict(self).items() if key != "path"},
+            **{key: value for key, value in asdict(self).items() if key not in ("path", "dropped")},
         }
 
     @classmethod
-    def read(cls, content: Mapping[str, Any], path: str) -> "Description":
+    def read(
+        cls, content: Mapping[str, Any], path: str, paths: Mapping[str, Any] | None = None
+    ) -> "Description":
         """Out of a checkpoint's contents; the config is checked again: it can only choose among installed plugins.
+
+        Args:
+            content, path: of the checkpoint.
+            paths: what the user says again of its config's paths (`framework.configuration.paths`).
 
         Raises:
             CheckpointError: there is none.
-            ConfigError: a part of the config is unknown here.
+            ConfigError: a part of the config is unknown here, or a path of the model is not said again.
             LookupError, TypeError, ValueError: it is not whole.
         """
         stored = content.get("framework")
@@ -93,8 +103,10 @@ class Description:
                 "Give a run folder, or a checkpoint from its checkpoints/."
             )
         target = stored_target(stored["target"])
+        config, dropped = without_paths(stored["config"], paths or {}, UNUSED)
+        require_said(dropped, MODEL, path)
         return cls(
-            checked(stored["config"]),
+            checked(config),
             target,
             stored_shape(stored["input_shape"]),
             stored_names(stored.get("columns", ()), "columns"),
@@ -103,6 +115,7 @@ class Description:
             stored_settings(stored.get("settings", {}), target),
             dict(stored.get("data_state", {})),
             path,
+            dropped,
         )
 
 

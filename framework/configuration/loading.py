@@ -13,11 +13,12 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
 from framework.configuration.description import Description
+from framework.configuration.paths import require_said
 from framework.configuration.schema import resolve
 from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
 from framework.distributions.moved import Moved
-from framework.errors import CheckpointError
+from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
@@ -30,7 +31,9 @@ PREFIX = "predictor."
 """What Lightning's checkpoints put before the predictor's own parameter names."""
 
 
-def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
+def load(
+    run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
+) -> Predictor:
     """The trained model in evaluation mode, on the CPU; it takes what its user has, and answers in the user's unit.
 
     `model(given)` is the density over the target, with batch_shape (batch,): of files, arrays, or what else the data
@@ -41,11 +44,14 @@ def load(run_or_checkpoint: str | Path, *, uri: str | None = None) -> Predictor:
     Args:
         run_or_checkpoint: a run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
         uri: tracking store for a run id; the local one under `outputs/` by default.
+        paths: files and folders by their keys in the model's config, {"encoder.rasterised.body": "/my/body.npz"}. A
+            path that the checkpoint names itself is used for nothing: it may come from anybody.
 
     Raises:
         CheckpointError: nothing is there, it is damaged, or it does not fit the model it describes.
+        ConfigError: the model needs a path that `paths` does not give.
     """
-    predictor, description = load_with_description(run_or_checkpoint, uri=uri)
+    predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
     predictor.description = description
     user = User(reader(description))
     predictor.register_forward_pre_hook(user.asks, prepend=True)  # before what looks at inputs
@@ -91,7 +97,11 @@ def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
 def reader(description: Description) -> Data:
     """The data set of a model, not prepared: it makes inputs of what a user gives."""
     with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
-        data = build_data({"data": resolve("data", description.config["data"])})
+        try:
+            data = build_data({"data": resolve("data", description.config["data"])})
+        except ConfigError:
+            require_said(description.dropped, ("data",), description.path)
+            raise
         data.target, data.input_shape = description.target, description.input_shape
         data.columns, data.synthetic = description.columns, description.synthetic
         data.load_state_dict(description.data_state)
@@ -99,21 +109,21 @@ def reader(description: Description) -> Data:
 
 
 def load_with_description(
-    run_or_checkpoint: str | Path, *, uri: str | None = None
+    run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Predictor, Description]:
     """The trained predictor, as `load`, with what the checkpoint says of itself."""
-    description, state = stored(run_or_checkpoint, uri=uri)
+    description, state = stored(run_or_checkpoint, uri=uri, paths=paths)
     return rebuilt(description, state), description
 
 
 def stored(
-    run_or_checkpoint: str | Path, *, uri: str | None = None
+    run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Description, dict[str, torch.Tensor]]:
     """What a checkpoint says of its model, and the model's weights; as `load`."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
     with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
-        return Description.read(content, str(path)), weights(content)
+        return Description.read(content, str(path), paths), weights(content)
 
 
 def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:

@@ -29,6 +29,8 @@ def _devices(value: Any) -> Any:
     raise ValueError("wanted how many, from 1 on, a list of their numbers, or auto")
 
 
+MOST_AT_ONCE = 1024
+"""Threads, or data-loading processes, of one run."""
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
@@ -157,14 +159,16 @@ class Settings(_Strict):
     """Everything of a composed config that is not a plugin's."""
 
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    threads: Positive | None = None
+    threads: Annotated[int, Field(gt=0, le=MOST_AT_ONCE)] | None = None
     batch_size: Positive = 64
-    workers: NotNegative = 0
+    workers: Annotated[int, Field(ge=0, le=MOST_AT_ONCE)] = 0
     samples: Positive = 1000
     pictures: Literal[True, False, "png", "pdf", "svg"] = True
     """True is png."""
     checkpoint: str | None = None
     resume: str | None = "auto"
+    stored: dict[str, Any] = {}
+    """What a command says again of a stored config: `data.root=...` beside `checkpoint=`, by groups and keys."""
     experiment_name: str | None = None
     optimizer: OptimizerSettings = OptimizerSettings()
     logger: LoggerSettings = LoggerSettings()

@@ -7,7 +7,7 @@ is gone, and what runs is NumPy and one compiled function. Anything else is run 
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
@@ -26,16 +26,18 @@ from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor
 
 
-def freeze(run_or_checkpoint: str | Path, *, uri: str | None = None) -> "Frozen":
+def freeze(
+    run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
+) -> "Frozen":
     """The deployable form of a trained model.
 
     Args:
-        run_or_checkpoint, uri: as of `framework.load`.
+        run_or_checkpoint, uri, paths: as of `framework.load`.
 
     Raises:
-        CheckpointError: as `framework.load`.
+        CheckpointError, ConfigError: as `framework.load`.
     """
-    predictor, description = load_with_description(run_or_checkpoint, uri=uri)
+    predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
     return Frozen(predictor, description.input_shape, reader(description))
 
 

@@ -65,13 +65,15 @@ def _stored(
     folder: Path, given: dict[str, Any], overrides: Sequence[str]
 ) -> tuple[dict[str, Any], list[str]]:
     """The config and overrides the run in `folder` was started with, but for how it is run now, which is `given`."""
+    from framework.configuration.paths import flat, paths_of, require_repeated
     from framework.runs.run import HOW
     from framework.storage.plain_values import read_yaml
     from framework.tracking.run_info import read_run_info
     from framework.tracking.stores import confirmed
 
     keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
-    others = [item for item, key in keys.items() if key not in ("resume", *HOW)]
+    again = ("resume", "checkpoint", *HOW)  # and `stored.…`: paths that are said again
+    others = [item for item, key in keys.items() if key not in again and not key.startswith("stored.")]
     if others:
         raise ConfigError(
             f"resume={folder} goes on with that run's own config; {' '.join(others)} would change it. "
@@ -97,6 +99,9 @@ def _stored(
     if recorded is not None and "logger.uri" not in keys.values():
         store = confirmed(str(recorded), None, folder, folder / "config.yaml")
         values["logger"]["uri"] = store.uri if store.named else None
+    said = flat(given.get("stored") or {})
+    said |= {"checkpoint": given["checkpoint"]} if "checkpoint" in keys.values() else {}
+    require_repeated(paths_of(values), said, folder)
     values["resume"] = "auto"  # also where it was begun with resume=never
     for key in HOW:
         if key in keys.values():

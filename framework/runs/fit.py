@@ -1,6 +1,5 @@
 """Fits the session's predictor: by gradient with Lightning, or at once where its head has no gradient."""
 
-import shlex
 import sys
 import time
 from functools import partial
@@ -14,7 +13,7 @@ from framework.configuration.loading import fill, weights
 from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
-from framework.runs.run import Run
+from framework.runs.run import Run, going_on
 from framework.runs.session import Session
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
@@ -115,7 +114,7 @@ def _give_up(run: Run, error: BaseException) -> None:
     """Close the run of a process that cannot go on and will not come back."""
     stopped = isinstance(error, Stopped)
     sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
-    sys.stderr.write(f"{sentence}; go on with: python -m framework {shlex.quote(f'resume={run.folder}')}\n")
+    sys.stderr.write(f"{sentence}; go on with: python -m framework {going_on(run)}\n")
     run.tracker.set_tags({"error": sentence})
     run.tracker.close("KILLED" if stopped else "FAILED")
 

@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from framework.configuration.config import Config
+from framework.configuration.paths import paths_of, words
 from framework.configuration.settings import Settings, store_experiment
 from framework.errors import DataError, UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
@@ -115,18 +116,18 @@ def opened(config: Config) -> Iterator[Run]:
             killed = isinstance(error, KeyboardInterrupt | Stopped)
             tracker.close("KILLED" if killed else "FAILED")
             if killed:
-                sys.stderr.write(f"stopped; go on with: python -m framework {_resume(run)}\n")
+                sys.stderr.write(f"stopped; go on with: python -m framework {going_on(run)}\n")
             if refused := unwritable(error):
-                raise DataError(f"{refused} What was written is whole: {_resume(run)} goes on.") from error
+                raise DataError(f"{refused} What was written is whole: {going_on(run)} goes on.") from error
             raise
         tracker.close("FINISHED")
 
 
-def _resume(run: Run) -> str:
-    """What goes on with it, as typed into a shell."""
-    store = run.settings.logger.uri  # a stored address is used only where the user says it again
-    words = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
-    return " ".join(map(shlex.quote, words))
+def going_on(run: Run) -> str:
+    """Return what goes on with a run, as typed into a shell."""
+    store = run.settings.logger.uri  # a stored address or path is used only where the user says it again
+    own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
+    return " ".join([*map(shlex.quote, own), *words(paths_of(run.config.values))])
 
 
 def _begin_folder(config: Config) -> None:

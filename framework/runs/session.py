@@ -23,6 +23,7 @@ from framework.configuration.assembly import (
     build_predictor,
     citations,
     entries,
+    reading_outliers,
     require_outliers,
 )
 from framework.configuration.config import Config
@@ -35,6 +36,7 @@ from framework.configuration.loading import (
     reader,
     weights,
 )
+from framework.configuration.paths import flat, require_said, without_paths
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings
 from framework.data import Batch, Data
@@ -306,15 +308,31 @@ def for_trained(config: Config, *, prepare: bool = True) -> Session:
         raise ConfigError(
             f"mode={config.mode} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
         )
-    predictor, description = load_with_description(config.settings.checkpoint, uri=config.settings.logger.uri)
+    predictor, description = load_with_description(
+        config.settings.checkpoint, uri=config.settings.logger.uri, paths=flat(config.settings.stored)
+    )
     return around(config, predictor, description, console, prepare=prepare)
 
 
 def around(
     config: Config, predictor: Predictor, description: Description, console: Console, *, prepare: bool = True
 ) -> Session:
-    """The session of a predictor that is there already and described by a checkpoint; see `for_trained`."""
+    """The session of a predictor that is there already and described by a checkpoint; see `for_trained`.
+
+    Raises:
+        ConfigError: `prepare`, and a path of the stored data, outliers or metrics is not said again.
+    """
     parts: Resolved = {**description.config}
+    chosen = {group for group in ("data", "outliers", "metric") if config.values.get(group)}
+    used = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
+    again = {
+        key: value for key, value in flat(config.settings.stored).items() if key.partition(".")[0] in used
+    }
+    used, dropped = without_paths(used, again)
+    parts |= used
+    dropped |= {
+        key: value for key, value in description.dropped.items() if key.partition(".")[0] not in chosen
+    }
     config = inherited(config, description)
     for group in ("data", "outliers"):
         if config.values.get(group):
@@ -322,7 +340,11 @@ def around(
     if config.values.get("metric"):
         chosen = config.values["metric"]
         parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
-    data = reader(replace(description, config=parts))
+    if prepare:
+        tests = config.mode != "predict"  # which reads no metrics
+        outliers = tests and "outliers" not in chosen and bool(reading_outliers(parts))
+        require_said(dropped, ["data", *["metric"] * tests, *["outliers"] * outliers], description.path)
+    data = reader(replace(description, config=parts, dropped=dropped))
     if prepare:
         data.prepare()
         require_fit(data, description)

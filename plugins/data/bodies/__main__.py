@@ -2,11 +2,13 @@
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 
 from framework.configuration.loading import load_with_description
+from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.errors import ConfigError, UserError
@@ -29,22 +31,26 @@ def main(arguments: list[str]) -> None:
     parser.add_argument(
         "--folder", type=Path, default=Path("outputs"), help="where to write; default: outputs"
     )
-    given = parser.parse_args(arguments)
+    add_option(parser)
+    given = parser.parse_intermixed_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
-    for file in register(given.checkpoint, given.scans, given.folder):
+    for file in register(given.checkpoint, given.scans, given.folder, said(given.path)):
         sys.stdout.write(f"{file}\n")
 
 
 @torch.no_grad()
-def register(checkpoint: str, scans: list[Path], folder: Path) -> list[Path]:
-    """The files written, two a scan."""
-    predictor, description = load_with_description(checkpoint)
+def register(
+    checkpoint: str, scans: list[Path], folder: Path, paths: Mapping[str, str] | None = None
+) -> list[Path]:
+    """The files written, two a scan; `paths` as of `framework.load`."""
+    predictor, description = load_with_description(checkpoint, paths=paths)
     part = description.config["data"]
     if part["name"] != "registration":
         raise ConfigError(
             f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration`, which says "
             "what body its vertices are of."
         )
+    require_said(description.dropped, ("data",), description.path)
     data: Registration = build("data", resolve("data", part))
     faces = chosen_body(data.body)[0].faces
     written = []

@@ -10,7 +10,7 @@ import math
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from PIL import Image
 
 from framework.configuration.description import Description
 from framework.configuration.loading import stored
+from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError, UserError, did_you_mean
 from framework.renderer import Renderer
@@ -64,25 +65,36 @@ def main(arguments: list[str]) -> None:
         default=Path("outputs/animation.gif"),
         help=f"file: {', '.join(KINDS)}; default: %(default)s",
     )
+    add_option(parser)
     given = parser.parse_intermixed_args(arguments)
     if given.out.suffix.lower() not in KINDS or given.frames < 1:
         raise ConfigError(
             f"--out {given.out} --frames {given.frames}: wanted a {', '.join(KINDS)} and 1 frame or more."
         )
-    sheets = animated(given.run, given.who, given.motion, given.frames, given.start, given.azimuth)
+    sheets = animated(
+        given.run, given.who, given.motion, given.frames, given.start, given.azimuth, said(given.path)
+    )
     given.out.parent.mkdir(parents=True, exist_ok=True)
     write(given.out, sheets)
     sys.stdout.write(f"{given.out}\n")
 
 
 def animated(
-    run: str, who: str | None, file: Path | None, frames: int, start: float = 0.0, azimuth: float = 35.0
+    run: str,
+    who: str | None,
+    file: Path | None,
+    frames: int,
+    start: float = 0.0,
+    azimuth: float = 35.0,
+    paths: Mapping[str, str] | None = None,
 ) -> list[Image.Image]:
-    """The pictures; arguments as those of the command."""
-    description, _ = stored(run)
+    """The pictures; arguments as those of the command, `paths` as of `framework.load`."""
+    description, _ = stored(run, paths=paths)
     data = data_of(description)
     mesh: Renderer = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 4}))
-    network: Renderer = build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": run}))
+    network: Renderer = build(
+        "renderer", resolve("renderer", {"name": "smplpix", "checkpoint": run, "paths": paths})
+    )
     shown, moments = cast(data, who, file, frames, start)
     turning = [2 * math.pi * number / frames for number in range(frames)]
     azimuths = turning if file is None else [math.radians(azimuth)] * frames
@@ -100,6 +112,7 @@ def data_of(description: Description) -> HumanScans:
             f"{description.path} was trained on data {part['name']!r}; wanted a model trained on `human_scans`, which "
             "paints people."
         )
+    require_said(description.dropped, ("data",), description.path)
     return build("data", resolve("data", part))
 
 

@@ -5,7 +5,7 @@ Without a folder people are generated in FAUST's layout (synthetic), whose true 
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 
 from framework.configuration.loading import load_with_description
+from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
@@ -55,8 +56,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
     parser.add_argument("root", nargs="?", help="the folder that holds FAUST's `test`; none: generated")
     parser.add_argument("--out", type=Path, default=Path("outputs/faust"), help="default: outputs/faust")
-    given = parser.parse_args(arguments)
-    registered, generated = model(given.checkpoint)
+    add_option(parser)
+    given = parser.parse_intermixed_args(arguments)
+    registered, generated = model(given.checkpoint, said(given.path))
     folder = generated() if given.root is None else Path(given.root).expanduser()
     marked = "" if read_mark(folder) is None else " (synthetic)"
     for challenge in CHALLENGES:
@@ -69,15 +71,16 @@ def main(arguments: list[str]) -> None:
         sys.stdout.write(f"{challenge}: {found.pairs} pairs in {found.file}; error {error}\n")
 
 
-def model(
-    checkpoint: str,
-) -> tuple[Registered, Callable[[], Path]]:
+def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Registered, Callable[[], Path]]:
     """A trained model, and what gives the root of people in FAUST's layout: they are generated, once, of its body.
+
+    Args:
+        checkpoint, paths: as of `framework.load`.
 
     Raises:
         ConfigError: a checkpoint of another data set.
     """
-    predictor, description = load_with_description(checkpoint)
+    predictor, description = load_with_description(checkpoint, paths=paths)
     part = description.config["data"]
     if part["name"] not in ("registration", "faust"):
         raise ConfigError(
@@ -92,7 +95,11 @@ def model(
         local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
         return denormalised(local, batch["centre"], batch["scale"])[0].float().numpy()
 
-    return registered, lambda: people_root(part.get("body"))
+    def generated() -> Path:
+        require_said(description.dropped, ("data",), description.path)
+        return people_root(part.get("body"))
+
+    return registered, generated
 
 
 def answered(registered: Registered, root: Path, challenge: Challenge, out: Path) -> Answered:

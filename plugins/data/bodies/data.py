@@ -11,6 +11,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from framework.configuration.paths import FilePath
 from framework.data import Splits
 from framework.datasets.fields import Fields
 from framework.errors import DataError
@@ -79,7 +80,7 @@ class Registration(Bodies):
         sizes: Sizes,
         scanner: Scanner,
         kinds: Kinds,
-        body: str | None = None,
+        body: FilePath | None = None,
         shape_spread: Annotated[float, Field(ge=0, le=5, allow_inf_nan=False)] = 1.0,
         data_seed: Seed = 0,
     ) -> None:
@@ -158,8 +159,8 @@ class Faust(Bodies):
     def __init__(
         self,
         *,
-        root: str | None = None,
-        body: str | None = None,
+        root: FilePath | None = None,
+        body: FilePath | None = None,
         points: Points = 10_000,
         validation: Subjects = [7],  # noqa: B006 - never written
         test: Subjects = [8, 9],  # noqa: B006 - never written

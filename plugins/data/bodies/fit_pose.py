@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
+from framework.configuration.paths import FilePath
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.protocol import images, median
 from framework.errors import ConfigError
@@ -126,7 +127,7 @@ class FitPoseHead(DensityHead, Fitted):
         enough: Annotated[float, Field(gt=0, le=1)] = 0.003,
         height: Side = 128,
         width: Side = 96,
-        body: str | None = None,
+        body: FilePath | None = None,
     ) -> None:
         super().__init__()
         target.require("real", by="density_head fit_pose")

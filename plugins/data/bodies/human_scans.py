@@ -13,6 +13,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError, DataError, shown
@@ -93,7 +94,7 @@ class HumanScans(Data):
         self,
         *,
         renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
-        root: str | None = None,
+        root: FilePath | None = None,
         topology: Word = "7k",
         shows: Shows = "photograph",
         counts: Counts,

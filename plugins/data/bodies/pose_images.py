@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
 from framework.datasets.images import opened
@@ -95,7 +96,7 @@ class PoseFromImage(Data):
         apart: Apart,
         height: Side = 128,
         width: Side = 96,
-        body: str | None = None,
+        body: FilePath | None = None,
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
     ) -> None:
         if "color" not in renderer.channels or renderer.background:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from framework.configuration.paths import FilePath
 from framework.data import Data
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
@@ -54,8 +55,8 @@ class Registered:
     """Which mesh the points are the vertices of: as the data's parameters of these names say."""
 
     topology: Name = "7k"
-    root: str | None = None
-    body: str | None = None
+    root: FilePath | None = None
+    body: FilePath | None = None
 
 
 class Rasterised(Encoder):

@@ -15,6 +15,7 @@ from PIL import Image
 from pydantic import Field
 from torch import Tensor
 
+from framework.configuration.paths import FilePath
 from framework.errors import ConfigError
 from framework.geometry.light import linear
 from framework.renderer import Renderer, Scene
@@ -57,8 +58,8 @@ class Drawing:
     topologies: Annotated[tuple[Name, ...], Field(min_length=1)] = ("7k", "27k")
     posed: Annotated[float, Field(ge=0, le=1)] = 0.0
     texture_side: Annotated[int, Field(ge=0, le=8192)] = 512
-    skins: str | None = None
-    body: str | None = None
+    skins: FilePath | None = None
+    body: FilePath | None = None
 
 
 def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> Path:

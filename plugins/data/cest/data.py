@@ -15,6 +15,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Mapped, Splits
 from framework.datasets.fields import Fields
 from framework.errors import DataError
@@ -85,7 +86,7 @@ class CEST(Data, Mapped):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         preset: Preset = "ten",
         offsets: list[float] | None = None,
         band: Annotated[int, Field(ge=2, le=1000)] = 6,

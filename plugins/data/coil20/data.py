@@ -12,6 +12,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
 from framework.datasets.fields import Fields
@@ -47,7 +48,7 @@ class COIL20(Data):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         every: Literal[15, 20, 30, 40, 45, 60, 90] = 20,
         image_size: Annotated[int, Field(ge=8, le=128)] = 32,
         interpolate: bool = True,

@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from framework.configuration.paths import FilePath
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
@@ -49,7 +50,7 @@ class Caviar(Heads):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         reading: Reading = AS_PUBLISHED,
         images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400,
         generator_seed: Annotated[int, Field(ge=0)] = 0,

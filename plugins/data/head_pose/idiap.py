@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from framework.configuration.paths import FilePath
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
@@ -49,7 +50,7 @@ class Idiap(Heads):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         angles: list[Literal["pan", "tilt", "roll"]] | None = None,
         angles_in: Literal["radians", "degrees"] = "radians",
         reading: Reading = AS_PUBLISHED,

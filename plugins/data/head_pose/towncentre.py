@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image
 from pydantic import Field
 
+from framework.configuration.paths import FilePath
 from framework.storage.generated import draw_all
 from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
@@ -50,7 +51,7 @@ class TownCentre(Heads):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         reading: Reading = AS_PUBLISHED,
         mirror: bool = True,
         images: Annotated[int, Field(ge=200, le=1_000_000)] = 2400,

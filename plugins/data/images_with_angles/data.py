@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
 from framework.datasets.images import Crop
@@ -35,13 +36,13 @@ class ImagesWithAngles(Data):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         csv: str = "angles.csv",
-        angle_columns: list[str] | None = None,
+        angle_columns: list[Words] | None = None,
         angles_in: Literal["degrees", "radians"] | None = None,
         image_size: Annotated[int, Field(ge=8, le=1024)] = 48,
         grayscale: bool = False,
-        mirror: list[str] | None = None,
+        mirror: list[Words] | None = None,
         jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08,
         skip_unreadable: bool = False,
     ) -> None:

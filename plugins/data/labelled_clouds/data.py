@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from framework.configuration.paths import FilePath, Words
 from framework.errors import DataError
 from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.geometry.meshes import stream
@@ -68,7 +69,7 @@ class ModelNet40(LabelledClouds):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         surfaces: Surfaces,
         classes: list[str] | None = None,
         validation_share: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15,
@@ -141,9 +142,9 @@ class PointCloudFolder(LabelledClouds):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         points: Annotated[int, Field(ge=1, le=100_000_000)] | None = None,
-        columns: list[str] | None = None,
+        columns: list[Words] | None = None,
         validation: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15,
         test: Share = 0.15,
         centred: bool = False,
@@ -232,7 +233,7 @@ class Dales(LabelledClouds):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         fold: Annotated[int, Field(ge=0, lt=FOLDS)] = 0,
         points: Annotated[int, Field(ge=1, le=100_000_000)] | None = None,
         validation_share: Share = 0.15,

@@ -13,6 +13,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
 from framework.datasets.images import Box, Crop
@@ -101,7 +102,7 @@ class Pascal3D(Data):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         selection: Selection,
         framing: Framing,
         skip_unreadable: bool = False,

@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
 from framework.errors import DataError
@@ -54,7 +55,7 @@ class TableTennis(Data):
     def __init__(
         self,
         *,
-        root: str | None = None,
+        root: FilePath | None = None,
         grid: Grid,
         validation: Share = 0.1,
         test: Share = 0.2,

@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
 from framework.errors import DataError
 from plugins.data.tabular.picture import bars
@@ -57,10 +58,10 @@ class Tabular(Data):
     def __init__(
         self,
         *,
-        path: str | None = None,
-        target: str | list[str] = "target",
+        path: FilePath | None = None,
+        target: Words | list[Words] = "target",
         kind: Kind = "class",
-        columns: list[str] | None = None,
+        columns: list[Words] | None = None,
         validation: Share = 0.15,
         test: Share = 0.15,
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from framework.configuration.paths import FilePath
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.storage.weights import fill_from_file
@@ -54,7 +55,7 @@ class InceptionResNetV2(Encoder):
         self,
         input_shape: tuple[int, ...],
         *,
-        weights: str | None = None,
+        weights: FilePath | None = None,
         dropout: Annotated[float, Field(ge=0, lt=1)] = 0.2,
     ) -> None:
         super().__init__()

@@ -8,6 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from framework.configuration.paths import Words
 from framework.distributions.class_probabilities import require_labels
 from framework.errors import ConfigError, did_you_mean
 from framework.metric import Metric
@@ -76,10 +77,10 @@ class DecisionCost(Metric):
         target: Target,
         *,
         costs: list[list[float]] | None = None,
-        actions: list[str] | None = None,
+        actions: list[Words] | None = None,
         edges: list[float] | None = None,
         edges_deg: list[float] | None = None,
-        number: str | None = None,
+        number: Words | None = None,
         samples: Annotated[int, Field(ge=1, le=10**6)] = 1000,
     ) -> None:
         super().__init__()

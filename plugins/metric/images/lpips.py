@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from framework.configuration.paths import FilePath
 from framework.errors import DataError
 from plugins.metric.images.metric import compared
 from plugins.metric.images.per_image import PerImage
@@ -44,7 +45,7 @@ class LPIPS(PerImage):
     picture: ClassVar[str] = "lpips"
 
     def __init__(
-        self, *, backbone: Backbone = "alex", weights: str | None = None, masked: bool = True
+        self, *, backbone: Backbone = "alex", weights: FilePath | None = None, masked: bool = True
     ) -> None:
         super().__init__()
         self.least = LEAST_SIDE[backbone]

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from framework.configuration.paths import FilePath
 from framework.data import Batch
 from framework.errors import ConfigError
 from framework.model import Predictor, each_alone
@@ -109,7 +110,7 @@ class Perceptual(FeatureDistance):
         self,
         *,
         weight: Weight = 1.0,
-        weights: str | None = None,
+        weights: FilePath | None = None,
         layers: Depth = 16,
         cache: Cache = 1024,
     ) -> None:

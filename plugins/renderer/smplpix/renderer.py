@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.configuration.loading import rebuilt, stored
+from framework.configuration.paths import FilePath, flat
 from framework.distributions.protocol import images
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.geometry.light import encoded
@@ -36,6 +37,8 @@ class SMPLpix(Renderer):
 
     Args:
         checkpoint: folder of a run, its model.ckpt, or an MLflow run id.
+        paths: files and folders of that run's config, which are used only where they are said again:
+            `renderer.paths={encoder: {rasterised: {body: ...}}}`.
         precision: of evaluation, as of `unet.UNet`; "trained": as the run's config says.
         crop: margin around the subject's box, pixels, that is computed; "whole": all is; "trained" likewise.
 
@@ -51,7 +54,8 @@ class SMPLpix(Renderer):
     def __init__(
         self,
         *,
-        checkpoint: str | None = None,
+        checkpoint: FilePath | None = None,
+        paths: dict[str, Any] | None = None,
         precision: Precision | Literal["trained"] = "trained",
         crop: Annotated[int, Field(ge=0)] | Literal["trained", "whole"] = "trained",
     ) -> None:
@@ -60,7 +64,7 @@ class SMPLpix(Renderer):
                 "renderer smplpix draws with a trained network, but renderer.checkpoint is null. Train one (`python -m "
                 "framework experiment=smplpix/quick`) and give the run folder it prints."
             )
-        self.description, self._weights = stored(checkpoint)
+        self.description, self._weights = stored(checkpoint, paths=flat(paths or {}))
         target, columns = self.description.target, self.description.columns
         if target.kind != "image" or len(target.names) != 3 or columns[: len(COLUMNS)] != COLUMNS:
             raise ConfigError(

@@ -26,6 +26,11 @@ def renderer(run, **config):
     return build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": str(run), **config}))
 
 
+def own_paths(encoders):
+    """What the user of a run says of its paths: none is used for being in its checkpoint."""
+    return {"encoder.rasterised.root": encoders[0]["root"]} if "root" in encoders[0] else {}
+
+
 def seen_from(size, azimuth=0.4):
     """A camera of unequal focal lengths, off the middle, far from any canonical one."""
     camera = look_from(azimuth, 0.3, -0.2, distance=3.5, field_of_view=0.8, size=size)
@@ -66,9 +71,10 @@ def given(scene):
 def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path):
     wrapped = {"uncertainty": [{"name": "ensemble", "members": members}]} if members > 1 else {}
     points = len(MESH.vertices)
-    drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, points, **wrapped))
+    paths = own_paths(encoders)
+    drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, points, **wrapped), paths=paths)
     sized = [{**encoders[0], "height": size[0], "width": size[1]}, encoders[1]]
-    loaded = framework.load(checkpoint(tmp_path / "sized.ckpt", sized, size, points, **wrapped))
+    loaded = framework.load(checkpoint(tmp_path / "sized.ckpt", sized, size, points, **wrapped), paths=paths)
     for azimuth in (0.4, 2.0):
         scene = replace(MESH, camera=seen_from(size, azimuth))
         before = torch.random.get_rng_state()
@@ -132,8 +138,18 @@ def test_without_a_run_it_says_what_to_do(run, kind, message):
         build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": run}))
 
 
+def test_a_path_of_its_checkpoint_is_said_again_or_refused(encoders, tmp_path):
+    run = checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
+    for key, path in own_paths(encoders).items():
+        with pytest.raises(ConfigError, match=r"encoder\.rasterised\.root="):
+            renderer(run)
+        assert key == "encoder.rasterised.root"
+        renderer(run, paths={"encoder": {"rasterised": {"root": path}}})  # as a command line has it
+
+
 def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
-    drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices)))
+    run = checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
+    drawn = renderer(run, paths=own_paths(encoders))
     scene = replace(MESH, camera=seen_from(SIZE))
     assert scene.colors is not None
     with pytest.raises(ValueError, match="red, green and blue"):

@@ -1,0 +1,324 @@
+"""Paths that a stored config names: used where the user says them again, or not at all (DESIGN, law 15).
+
+A checkpoint or a run folder may come from anybody. A path counts as one by its parameter's annotation (`FilePath`,
+`pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`), or by its looks, so that a plugin that says nothing is safe.
+"""
+
+import argparse
+import inspect
+import re
+import shlex
+import typing
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import PurePath
+from typing import Annotated, Any
+
+from pydantic import BaseModel
+
+from framework.configuration.registry import GROUPS, load
+from framework.configuration.signature import parts, signature
+from framework.errors import ConfigError, did_you_mean, quoted, shown
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """What an annotation says of a text."""
+
+    path: bool
+
+
+FilePath = Annotated[str, _Mark(path=True)]
+"""Annotation of a parameter that names a file or folder."""
+Words = Annotated[str, _Mark(path=False)]
+"""Annotation of a parameter whose text is never used as a path, as "km/h" of a column."""
+
+MODEL = ("encoder", "density_head", "uncertainty")
+"""Groups of what a model predicts with."""
+SINGLE = ("data", "outliers", "density_head", "renderer")
+"""Groups of which a config names one plugin; of others it names several."""
+OPTIONS = ("files", "into", "members", "run")
+"""Options of modes that name files, folders or runs."""
+UNUSED = ("metric", "objective", "outliers", "renderer")
+"""Groups that loading a model does not import: there any parameter is looked at as text alone."""
+
+
+@dataclass
+class _Part:
+    """A plugin's config that can be changed: where it stands, and its class where that is known."""
+
+    key: str
+    values: dict[str, Any]
+    cls: type | None
+
+    def annotation(self, name: str) -> Any:
+        return signature(self.cls)[name][0] if self.cls and name in signature(self.cls) else Any
+
+    def default(self, name: str) -> Any:
+        return signature(self.cls)[name][1] if self.cls and name in signature(self.cls) else None
+
+    def take_default(self, name: str) -> None:
+        default = self.default(name)
+        self.values[name] = default
+        if self.cls is None or not (default is None or isinstance(default, str)):  # which the schema fills in
+            del self.values[name]
+
+    def paths(self) -> Iterator[str]:
+        """Names of the parameters whose value holds a path, other than their default."""
+        for name, value in self.values.items():
+            if name == "name" or (self.cls and name in parts(self.cls)):
+                continue
+            if not _equal(value, self.default(name)) and holds_path(self.annotation(name), value):
+                yield name
+
+
+def without_paths(
+    config: Mapping[str, Any], said: Mapping[str, Any], unused: Collection[str] = ()
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Take out of a stored config every path that the user does not say again.
+
+    Args:
+        config: plugins by group, as a checkpoint or a run folder holds them; not checked yet.
+        said: values of the user by dotted keys: "data.root", "encoder.<name>.weights".
+        unused: groups whose plugins are not imported for this.
+
+    Returns:
+        A copy with what is said, and without the other paths, so that they take their defaults; and those paths by
+        their keys. What training alone starts from (`Encoder.initial`) is left out without a word.
+
+    Raises:
+        ConfigError: nothing of the config stands under a key of `said`, or it is no path of the model.
+    """
+    found = deepcopy(dict(config))
+    dropped: dict[str, Any] = {}
+    left = dict(said)
+    known = list(_parts(found, unused))
+    for part in known:
+        paths = list(part.paths())
+        for name in paths:
+            if f"{part.key}.{name}" not in said:
+                if name not in getattr(part.cls, "initial", ()):
+                    dropped[f"{part.key}.{name}"] = part.values[name]
+                part.take_default(name)
+        for key in [key for key in said if key.rpartition(".")[0] == part.key]:
+            name = key.rpartition(".")[2]
+            if (
+                part.key.partition(".")[0] in MODEL
+                and name not in paths
+                and not _marked(part.annotation(name))
+            ):
+                raise ConfigError(
+                    f"{shown(key)} = {quoted(said[key])} would change a trained model, of which only paths can be said "
+                    "again. Leave it out."
+                )
+            value = said[key]
+            part.values[name] = str(value) if isinstance(value, PurePath) else value
+            left.pop(key, None)
+    for key in left:
+        near = [f"{part.key}.{name}" for part in known for name in (*part.values, *part.paths())]
+        raise ConfigError(
+            f"{shown(key)} = {quoted(left[key])}: the stored config has no such part."
+            f"{did_you_mean(key, [*near, *dropped])} "
+            f"It has: {', '.join(shown(part.key) for part in known)}."
+        )
+    return found, dropped
+
+
+def paths_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Every path of a composed config by the key under which a command says it."""
+    config = deepcopy({group: values.get(group) for group in (*GROUPS, "outliers")})
+    found = {f"{part.key}.{name}": part.values[name] for part in _parts(config, ()) for name in part.paths()}
+    mode = values.get("mode")
+    for name, value in mode.items() if isinstance(mode, Mapping) else ():
+        if name != "name" and holds_path(FilePath if name in OPTIONS else Any, value):
+            found[f"mode.{name}"] = value
+    said = values.get("stored")
+    found |= flat(said) if isinstance(said, Mapping) else {}
+    checkpoint = values.get("checkpoint")
+    return found if checkpoint is None else {**found, "checkpoint": checkpoint}
+
+
+def flat(said: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said below nested keys, by dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in said.items():
+        inner = flat(value) if isinstance(value, Mapping) else None
+        found |= {str(key): value} if inner is None else {f"{key}.{rest}": one for rest, one in inner.items()}
+    return found
+
+
+def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: str) -> None:
+    """Refuse to go on without the paths of some groups.
+
+    Raises:
+        ConfigError: some were `dropped`; says which, and what to write.
+    """
+    needed = {key: value for key, value in dropped.items() if key.partition(".")[0] in groups}
+    if needed:
+        named = ", ".join(f"{shown(key)} = {quoted(value)}" for key, value in needed.items())
+        example = ", ".join(f'"{shown(key)}": ...' for key in needed)
+        raise ConfigError(
+            f"{shown(source)} names a path: {named}. A checkpoint may come from anybody, so a path in it is used only "
+            f"where you say it again, or another. Add to a command: {' '.join(words(needed))}; to framework.load or "
+            f"freeze: paths={{{example}}}."
+        )
+
+
+def require_repeated(stored: Mapping[str, Any], said: Mapping[str, Any], folder: object) -> None:
+    """Refuse to go on with a run whose paths the command does not say again.
+
+    Raises:
+        ConfigError: a path is missing, or is another; says what to write.
+    """
+    for key, value in said.items():
+        if key not in stored or not _equal(stored[key], value):
+            has = quoted(stored[key]) if key in stored else "none"
+            raise ConfigError(
+                f"resume={folder} goes on with that run's own config; {shown(key)} = {quoted(value)} would change it, "
+                f"which has {has}. Give the same, or start a new run."
+            )
+    missing = {key: value for key, value in stored.items() if key not in said}
+    if missing:
+        named = ", ".join(f"{shown(key)} = {quoted(value)}" for key, value in missing.items())
+        raise ConfigError(
+            f"resume={folder}: its config names a path: {named}. A run folder may come from anybody, so a path in it "
+            f"is used only where the command says it again. Add: {' '.join(words(missing))}"
+        )
+
+
+def words(paths: Mapping[str, Any]) -> list[str]:
+    """What says these paths on a command line, as typed into a shell."""
+    return [shlex.quote(f"{shown(key)}={_typed(value)}") for key, value in paths.items()]
+
+
+def _typed(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{_typed(key)}:{_typed(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple | set):
+        return "[" + ",".join(map(_typed, value)) + "]"
+    text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))
+    if isinstance(value, str) and not re.fullmatch(
+        r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
+    ):  # no number, nor null
+        from framework.configuration.composition import in_quotes  # Hydra, which loading does without
+
+        return in_quotes(text)
+    return text
+
+
+def add_option(parser: argparse.ArgumentParser) -> None:
+    """Let a command of a plugin take `--path KEY=PATH`, which `said` reads."""
+    parser.add_argument(
+        "--path",
+        action="append",
+        default=[],
+        metavar="KEY=PATH",
+        help="a path that the run's config names, said again: data.root=<folder>",
+    )
+
+
+def said(options: Sequence[str]) -> dict[str, str]:
+    """What `--path` gives."""
+    return {key: path for key, _, path in (option.partition("=") for option in options)}
+
+
+def _parts(config: dict[str, Any], unused: Collection[str]) -> Iterator[_Part]:
+    """Every plugin in a config, and every plugin in one."""
+    for group in (*GROUPS, "outliers"):
+        chosen = config.get(group)
+        named: list[tuple[str, Any]] = []
+        if isinstance(chosen, Mapping):
+            named = [(group, chosen)] if "name" in chosen or group in SINGLE else []
+            named = named or [(f"{group}.{key}", part) for key, part in chosen.items()]
+        elif isinstance(chosen, list | tuple):
+            named = [(f"{group}.{_name(part)}", part) for part in chosen]
+        for key, part in named:
+            if isinstance(part, dict):
+                yield from _within("data" if group == "outliers" else group, key, part, group in unused)
+
+
+def _within(group: str, key: str, values: dict[str, Any], unused: bool) -> Iterator[_Part]:
+    cls = None
+    if not unused and isinstance(values.get("name"), str):
+        try:
+            cls = load(group, values["name"])
+        except ConfigError:
+            cls = None  # where it is used that is said
+    inner = parts(cls) if cls else {}
+    yield _Part(key, values, cls)
+    for name, part in inner.items():
+        value = values.get(name)
+        several = list(value) if isinstance(value, list | tuple) else [value]
+        for number, one in enumerate(several):
+            if isinstance(one, dict):
+                yield from _within(
+                    part.group, f"{key}.{name}" + f".{number}" * (value is not one), one, unused
+                )
+
+
+def _name(part: Any) -> str:
+    return str(part.get("name")) if isinstance(part, Mapping) else str(part)
+
+
+def holds_path(annotation: Any, value: Any) -> bool:
+    """Whether the value of a parameter holds the path of a file or folder, to the best of our knowledge."""
+    if isinstance(value, str):
+        if value in _literals(annotation):
+            return False
+        mark = _mark(annotation)
+        return bool(value) and (
+            mark if mark is not None else "/" in value or "\\" in value or value[0] == "~"
+        )
+    if isinstance(value, Mapping):
+        fields = _fields(annotation)
+        return any(
+            holds_path(fields.get(key, annotation), item) or holds_path(annotation, key)
+            for key, item in value.items()
+        )
+    if isinstance(value, list | tuple | set | frozenset):
+        return any(holds_path(annotation, item) for item in value)
+    return False
+
+
+def _marked(annotation: Any) -> bool:
+    return bool(_mark(annotation))
+
+
+def _mark(annotation: Any) -> bool | None:
+    """What an annotation says of texts: they are paths, they never are, or nothing."""
+    marks = [each.path for each in getattr(annotation, "__metadata__", ()) if isinstance(each, _Mark)]
+    if isinstance(annotation, type) and issubclass(annotation, PurePath):
+        marks.append(True)
+    marks += [mark for inner in typing.get_args(annotation) if (mark := _mark(inner)) is not None]
+    return None if not marks else any(marks)
+
+
+def _literals(annotation: Any) -> set[Any]:
+    if typing.get_origin(annotation) is typing.Literal:
+        return {one for one in typing.get_args(annotation) if isinstance(one, str)}
+    return {one for inner in typing.get_args(annotation) for one in _literals(inner)}
+
+
+def _fields(annotation: Any) -> dict[str, Any]:
+    """Annotations of the fields of the dataclasses and pydantic models that stand in an annotation."""
+    found: dict[str, Any] = {}
+    if isinstance(annotation, type) and (is_dataclass(annotation) or issubclass(annotation, BaseModel)):
+        try:
+            found = typing.get_type_hints(annotation, include_extras=True)
+        except Exception:  # a name for type checkers alone
+            found = {}
+    for inner in typing.get_args(annotation):
+        found |= _fields(inner)
+    return found
+
+
+def _equal(value: Any, default: Any) -> bool:
+    if default is inspect.Parameter.empty:
+        return False
+    plain = str(default) if isinstance(default, PurePath) else default
+    if is_dataclass(plain) and not isinstance(plain, type):
+        plain = asdict(plain)
+    if isinstance(value, list | tuple) and isinstance(plain, list | tuple):
+        return list(map(str, value)) == list(map(str, plain))
+    return bool(value == plain)

@@ -1,0 +1,27 @@
+"""Keys of a config that is stored already: `data.root=...` beside `checkpoint=` or `resume=<folder>`."""
+
+import re
+from collections.abc import Sequence
+
+from framework.configuration.registry import GROUPS
+
+READING = ("test", "predict", "work_precision", "combine")
+"""Modes that take the plugins of a stored model where the command chooses none."""
+
+
+def as_stored(arguments: Sequence[str]) -> list[str]:
+    """Write keys of a plugin that the command does not choose as keys of `stored`.
+
+    Hydra refuses `data.root=<folder>` where no data is chosen. Beside a checkpoint, or the folder of a run to go on
+    with, it is a key of the data that is stored there.
+    """
+    given = {key.lstrip("+"): value for key, _, value in (one.partition("=") for one in arguments)}
+    resumed = given.get("resume", "") not in ("auto", "never", "null", "")
+    mode, checkpoint = given.get("mode", "train"), given.get("checkpoint", "null")
+    reads = set(mode.split(",")) <= set(READING) and (checkpoint not in ("null", "") or mode == "combine")
+    if "experiment" in given or not (resumed or reads):
+        return list(arguments)
+    chosen = {key.partition("@")[2] or key for key in given}
+    groups = {*GROUPS, "outliers", *(("mode",) if resumed else ())} - chosen
+    key = re.compile(rf"\+{{0,2}}((?:{'|'.join(sorted(groups))})\.[^=]*=.*)", re.DOTALL)
+    return [f"+stored.{found[1]}" if (found := key.fullmatch(one)) else one for one in arguments]
