@@ -2,10 +2,12 @@
 
 import json
 import os
+import pickle
 import shlex
 import subprocess
 import sys
 import typing
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.configuration import paths, registry
+from framework.configuration.loading import load_with_description, reader
 from framework.configuration.paths import FilePath, Words, holds_path, words
 from framework.configuration.signature import parts, signature
 from framework.configuration.stored_keys import as_stored
@@ -274,6 +277,11 @@ def test_a_path_said_again_is_used(framework: Framework, tmp_path: Path) -> None
     assert tested.code == 0, tested.out
     numbers = [json.loads((one.folder / "results.json").read_text())["nll"] for one in (run, tested)]
     assert numbers[0] == numbers[1]
+    for said in ({}, {"data.path": table}):
+        _, description = load_with_description(run.folder, paths=said)
+        data = pickle.loads(pickle.dumps(reader(description)))
+        with nullcontext() if said else pytest.raises(ConfigError, match=r"data\.path="):
+            data.prepare()
     wrong = framework(*test, "data.pat=x", folder="test")
     assert wrong.code == 2 and "data.pat" in wrong.out
     changed = framework(*test, *again, "encoder.mlp.widths=[3]", folder="test")

@@ -1,6 +1,7 @@
 """Gives a trained model back, from a run folder, a checkpoint file or an MLflow run id; no Hydra needed."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from threading import get_ident
 from typing import Any
@@ -95,7 +96,10 @@ def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
 
 
 def reader(description: Description) -> Data:
-    """The data set of a model, not prepared: it makes inputs of what a user gives."""
+    """The data set of a model, not prepared: it makes inputs of what a user gives.
+
+    Where a path of it was not said again, preparing it is refused: it would be other data.
+    """
     with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         try:
             data = build_data({"data": resolve("data", description.config["data"])})
@@ -105,6 +109,9 @@ def reader(description: Description) -> Data:
         data.target, data.input_shape = description.target, description.input_shape
         data.columns, data.synthetic = description.columns, description.synthetic
         data.load_state_dict(description.data_state)
+    if any(key.startswith("data.") for key in description.dropped):
+        refuse = partial(require_said, description.dropped, ("data",), description.path)
+        data.prepare = refuse  # type: ignore[method-assign]
     return data
 
 
