@@ -338,7 +338,7 @@ def page(lines: Sequence[str], kills: int, seed: int) -> str:
             "|---|---|---:|---:|---:|---:|",
             *lines,
             "",
-            machine("torch", "pytorch-lightning", "hydra-core"),
+            f"{machine('torch', 'pytorch-lightning', 'hydra-core')} Load average at the end: {os.getloadavg()[2]:.0f}.",
             "",
         ]
     )
