@@ -15,7 +15,7 @@ from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals, JointNormal
 from framework.errors import ConfigError
 from framework.heads.parameters import require_finite
-from framework.storage.weights import ABOVE_0, require_state
+from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.data.table_tennis.estimation import Estimate, Prior, Seen, estimated, root, seen_of
 from plugins.data.table_tennis.flying import flown, flown_with_slopes
@@ -25,8 +25,10 @@ from plugins.data.table_tennis.windows import PARTS
 
 WINDOWS = 32
 """From which `fit` finds the constants at most, evenly chosen."""
-LEAST_NOISE = 1e-4
+LEAST_NOISE, MOST_NOISE = 1e-4, 1.0
 """Metres."""
+SPREAD = (0.1, 1e3)
+"""Least and most of the factors that `calibrate` finds."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -94,7 +96,8 @@ class BallisticHead(DensityHead, Fitted):
         self.register_buffer("found", found_of(constants))
         self.register_buffer("noise", torch.tensor(noise).double())
         self.register_buffer("spread", torch.ones(3 * self.future, dtype=torch.float64))
-        require_state(self, found=bounds_of(constants), noise=ABOVE_0, spread=ABOVE_0)
+        within = min(LEAST_NOISE, noise), max(MOST_NOISE, noise)
+        require_state(self, found=bounds_of(constants), noise=within, spread=SPREAD)
 
     @property
     def constants(self) -> Constants:
@@ -123,7 +126,7 @@ class BallisticHead(DensityHead, Fitted):
         apart = flown(states, seen.times, self.constants)[..., :3] - seen.places
         left = apart[~apart.isnan()].abs()
         if len(left):  # the median of |r| is 0.6745 of a normal's standard deviation
-            self.noise.copy_((left.median() / 0.6745).clamp(LEAST_NOISE, 1.0))
+            self.noise.copy_((left.median() / 0.6745).clamp(LEAST_NOISE, MOST_NOISE))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         raw = require_finite(raw, self.size)
@@ -149,7 +152,7 @@ class BallisticHead(DensityHead, Fitted):
         if len(ratio):
             # a count of squares has a relative error √(2/n); of few windows the factor of all counts with
             weight = len(ratio) / (len(ratio) + 20)
-            self.spread.copy_((weight * ratio.mean(0) + (1 - weight) * ratio.mean()).sqrt().clamp(0.1, 1e3))
+            self.spread.copy_((weight * ratio.mean(0) + (1 - weight) * ratio.mean()).sqrt().clamp(*SPREAD))
 
     def _after(self, seen: Seen) -> Float[Tensor, "flight time"]:
         moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
