@@ -1,5 +1,6 @@
 """Checkpoints of every plugin that stores arrays, and whatever may be wrong with one of the arrays."""
 
+import contextlib
 import io
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from benchmarks.damage import Reader, Silent, spoilt
 from benchmarks.damaged_files import saved, signed, written
 from framework.configuration import loading
 from framework.configuration.assembly import build_predictor
+from framework.configuration.paths import paths_of
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
@@ -39,6 +41,8 @@ HEADS = {"class": "categorical", "real": "gaussian", "angle": "von_mises"}
 SMALL = {"name": "mlp", "widths": [4], "dropout": 0.1}
 HEAVY = {"inception_resnet_v2"}
 """Networks of 200 MB: their weights are read as every other network's are."""
+OURS: set[str] = set()
+"""Paths that the rows' configs name."""
 TOLD = "fuzz"
 """Key of a checkpoint under which stands what was done to it, and what the whole model answers."""
 
@@ -82,6 +86,7 @@ class Subject:
             "columns": self.columns,
             "synthetic": True,
         }
+        OURS.update(path for path in paths_of(self.parts).values() if isinstance(path, str))
         state = {f"{loading.PREFIX}{name}": value for name, value in predictor.state_dict().items()}
         told = {"inputs": self.inputs, "answer": answer(predictor, self.target, self.inputs)}
         content = {"framework": described, "state_dict": state, TOLD: told}
@@ -357,8 +362,9 @@ def states() -> Iterator[Reader]:
 
 def predicted(file: Path) -> object:
     """What a stored model answers."""
-    predictor, description = loading.load_with_description(file)
-    told = told_of(file)
+    content = checkpoints.read(file)
+    predictor, description = loading.load_with_description(file, paths=said_again(content))
+    told = content[TOLD] if isinstance(content.get(TOLD), dict) else {}
     found = None
     try:
         inputs = torch.rand(4, *description.input_shape)
@@ -385,9 +391,11 @@ def compare(told: Mapping[str, Any], found: Tensor | None) -> None:
         raise Silent(f"other numbers of {told['array']} ({told['kind']})")
 
 
-def told_of(file: Path) -> Mapping[str, Any]:
-    told = checkpoints.read(file).get(TOLD)
-    return told if isinstance(told, dict) else {}
+def said_again(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Paths of the rows' own models, which whoever loads one says again."""
+    with contextlib.suppress(Exception):  # of a damaged config
+        return {key: path for key, path in paths_of(content["framework"]["config"]).items() if path in OURS}
+    return {}
 
 
 def network() -> nn.Module:

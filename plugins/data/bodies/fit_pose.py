@@ -17,13 +17,13 @@ from framework.errors import ConfigError
 from framework.geometry.camera import Camera
 from framework.heads.parameters import require_finite
 from framework.renderer import Renderer
-from framework.storage.weights import ABOVE_0, require_state
+from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.data.bodies.descent import Descent, Fit
 from plugins.data.bodies.figure import Figure, figure_of
 from plugins.data.bodies.pose_images import Side
 
-FLOOR = 1e-5
+FLOOR, WIDEST = 1e-5, 1e9
 """Least standard deviation of a number."""
 SLACK = 1e-3
 """By how much a picture's numbers may be outside of [0, 1]."""
@@ -150,7 +150,8 @@ class FitPoseHead(DensityHead, Fitted):
         spread = torch.tensor(target.scale or (1.0,) * numbers, dtype=torch.float64)
         self.register_buffer("prior", spread)
         self.register_buffer("spread", spread.expand(2, -1).clone())
-        require_state(self, prior=ABOVE_0, spread=ABOVE_0)
+        within = min(FLOOR, float(spread.min())), max(WIDEST, float(spread.max()))
+        require_state(self, prior=within, spread=within)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         self.prior.copy_(target.double().square().mean(0).sqrt().clamp(min=FLOOR))

@@ -11,7 +11,7 @@ from torch.nn.functional import hardtanh
 
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
-from framework.storage.weights import ABOVE_0, require_state
+from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.bernoulli_image.density import BernoulliImage
 
@@ -49,7 +49,7 @@ class BernoulliImageHead(DensityHead):
         self.shape = (len(target.names), *target.size)
         self.size = math.prod(self.shape)
         self.register_buffer("factor", torch.ones((), dtype=torch.float64))
-        require_state(self, factor=ABOVE_0)
+        require_state(self, factor=(LEAST / 2, 2 * MOST))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> BernoulliImage:
         logits = self._logits(raw)

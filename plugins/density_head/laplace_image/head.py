@@ -12,7 +12,7 @@ from torch.nn.functional import hardtanh
 
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
-from framework.storage.weights import ABOVE_0, require_state
+from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.laplace_image.density import LaplaceImage
 
@@ -87,7 +87,7 @@ class LaplaceImageHead(DensityHead):
         self.floor = floor
         self.foreground = foreground
         self.register_buffer("factor", torch.ones((), dtype=torch.float64))
-        require_state(self, factor=ABOVE_0)
+        require_state(self, factor=(SMALLEST_SCALE, LARGEST_SCALE))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> LaplaceImage:
         location, scale = self._parts(raw)

@@ -235,7 +235,6 @@ def _rest(hidden: int, numbers: int) -> nn.Sequential:
 
 
 def _gaussian(number: Tensor) -> Gaussian:
-    if number.dtype in (torch.float16, torch.bfloat16):  # under autocast
-        number = number.float()
+    number = require_finite(number, number.shape[-1])  # which under autocast is of half precision
     mean, log_scale = number.chunk(2, -1)
     return Gaussian(mean, LARGEST_LOG_SCALE * torch.tanh(log_scale / LARGEST_LOG_SCALE))
