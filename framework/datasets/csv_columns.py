@@ -57,7 +57,8 @@ def read_columns(file: Path) -> Columns:
     with csv_rows(file, "wanted a CSV table. Mend the path.") as reader:
         header = [cell.strip() for cell in next(reader, [])]
         _check_header(file, header)
-        rows, lines = [], []
+        columns: list[list[str]] = [[] for _ in header]  # a list for each row would take most of the memory
+        lines: list[int] = []
         for cells in reader:
             # a spreadsheet's `,,,`; in a table of one column an empty cell is a row that misses its number
             if not cells or (len(cells) > 1 and not any(map(str.strip, cells))):
@@ -67,11 +68,11 @@ def read_columns(file: Path) -> Columns:
                     f"{file} line {reader.line_num}: {len(cells)} cells; wanted {len(header)}, as many as the "
                     "first line names. Mend that line."
                 )
-            rows.append(cells)
+            for column, cell in zip(columns, cells, strict=True):
+                column.append(cell.strip())
             lines.append(reader.line_num)
-    if not rows:
+    if not lines:
         raise DataError(f"{file} has no row below its first line; wanted one for each sample. Add them.")
-    columns = ([*map(str.strip, column)] for column in zip(*rows, strict=True))
     return Columns(file, dict(zip(header, columns, strict=True)), lines)
 
 

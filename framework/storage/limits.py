@@ -62,7 +62,9 @@ MOST_ANNOUNCED = 2**31
 MOST_COLUMNS = 1000
 """Numbers that a vertex may have."""
 MOST_NUMBERS = 2**24
-"""Numbers that a compressed archive may unfold to, or as many as it has bytes; each takes 8 bytes when it is read."""
+"""Numbers that a compressed archive of points or of a body may unfold to, or as many as it has bytes; each takes 8
+bytes when it is read.
+"""
 
 # volumes
 

@@ -16,7 +16,8 @@ import numpy as np
 from framework.errors import DataError, shown
 from framework.storage.arrays import archive
 from framework.storage.files import replacing
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.limits import MOST_NUMBERS
+from framework.storage.reading import guarded, read_bytes, require_numbers
 from plugins.data.bodies import restricted_pickle
 from plugins.data.bodies.body import Body
 
@@ -36,7 +37,10 @@ def read(file: Path) -> Body:
     """
     with guarded(file, "a body model", missing="wanted a body model. Mend the path."):
         if file.suffix == ".npz":
-            return _body(file, archive(read_bytes(file), (*NEEDED, "posedirs")))
+            content = read_bytes(file)
+            found = archive(content, (*NEEDED, "posedirs"))
+            require_numbers(sum(array.size for array in found.values()), MOST_NUMBERS, len(content))
+            return _body(file, found)
         if file.suffix == ".pkl":
             return _body(file, _unpickled(file))
     raise DataError(f"{file}: wanted a body model whose name ends in .npz or .pkl.")
