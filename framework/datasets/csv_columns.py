@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.storage.limits import MOST_TABLE_COLUMNS as MOST_COLUMNS
 from framework.storage.reading import guarded, opened
 
 MISSING = {"", "na", "n/a", "nan", "null", "none", "?"}
 """What stands in a cell, in small letters, that has no number."""
-MOST_COLUMNS = 100_000
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 

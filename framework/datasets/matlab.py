@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from framework.errors import DataError
+from framework.storage.limits import DEEPEST_ARRAYS as DEEPEST
+from framework.storage.limits import MOST_ARRAYS
 from framework.storage.reading import RESTORE, guarded, inflated, read_bytes, room
 
 HEADER_BYTES = 128
@@ -26,7 +28,6 @@ CELL, STRUCT, CHAR, NUMERIC, OPAQUE = 1, 2, 4, range(6, 16), 17
 COMPLEX = 0x0800
 NAME_WITHIN = 512
 """The bytes at the beginning of a variable that hold its flags, at most 32 sides and its name."""
-MOST_ARRAYS, DEEPEST = 300_000, 32
 
 
 def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:

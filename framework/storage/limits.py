@@ -89,3 +89,14 @@ MOST_JOINT_SETS = 4
 """Sets of four joints that a vertex follows."""
 MOST_SAMPLES = 2**25
 """Of a picture, a camera file's say: 2560 × 1440 pixels of 9 samples. With colours and depth they take 1 GB."""
+
+# other files
+
+MOST_ARRAYS, DEEPEST_ARRAYS = 300_000, 32
+"""Arrays in a MATLAB file, cells and fields of structs among them, and how many hold one another."""
+MOST_TABLE_COLUMNS = 100_000
+"""Columns of a CSV table."""
+MOST_FRAMES = 1_000_000
+"""Frames of a motion: two hours at 120 a second."""
+MOST_DISPLACEMENTS = 2**24
+"""Numbers of the joints' displacements of a body, joints × 3 × coefficients; published bodies have below 2**17."""

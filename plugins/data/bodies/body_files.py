@@ -16,6 +16,7 @@ import numpy as np
 from framework.errors import DataError, shown
 from framework.storage.arrays import archive
 from framework.storage.files import replacing
+from framework.storage.limits import MOST_DISPLACEMENTS as LARGEST
 from framework.storage.limits import MOST_NUMBERS
 from framework.storage.reading import guarded, read_bytes, require_numbers
 from plugins.data.bodies import restricted_pickle
@@ -23,8 +24,6 @@ from plugins.data.bodies.body import Body
 
 NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
-LARGEST = 2**24
-"""Numbers of the joints' displacements, joints x 3 x coefficients; published bodies have below 2**17."""
 WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from framework.errors import DataError, shown
+from framework.storage.limits import MOST_FRAMES as LONGEST
 from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies.body import Body
 from plugins.data.bodies.poses import skeleton
@@ -32,8 +33,6 @@ in one file the first."""
 ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
 """Where bones end whose direction is taken; the others turn as they do in the file."""
 CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
-LONGEST = 1_000_000
-"""Frames of a file, at most."""
 SLOWEST = 1_000
 """Seconds of a frame, less than."""
 
