@@ -287,3 +287,15 @@ def test_what_data_keep_with_a_model_is_checked(name: str) -> None:
                 with pytest.raises(DataError, match="tabular keeps"):
                     data.load_state_dict({**state, key: value})
     assert data.state_dict() == state
+
+
+def test_no_more_of_a_file_is_read_than_it_has(tmp_path: Path) -> None:
+    """A chunk that announces 64 TB is no reason to allocate them, as Python's own files do."""
+    file = tmp_path / "one.x"
+    file.write_bytes(b"abcdef")
+    with reading.opened(file) as stream:
+        assert [stream.read(2), stream.read(0), stream.read(2**46), stream.read(2**46), stream.read()] == [
+            *(b"ab", b"", b"cdef", b"", b"")
+        ]
+        stream.seek(1)
+        assert stream.read() == b"bcdef" and stream.seek(9) == 9 and stream.read(5) == b""

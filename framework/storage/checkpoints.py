@@ -16,6 +16,7 @@ from framework.errors import CheckpointError, shown
 from framework.storage.files import full, remove_leftovers, replacing
 from framework.storage.plain_tensors import load, require_admitted_pickles, require_dense
 from framework.storage.plain_values import Foreign
+from framework.storage.reading import opened
 
 # A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
 # all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
@@ -62,7 +63,7 @@ def read(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise CheckpointError(f"There is no checkpoint {path}. {_remedy(path)}")
-    with path.open("rb") as file:
+    with opened(path) as file:
         fault = _fault(file)
         if fault is not None:
             raise CheckpointError(f"The checkpoint {path} cannot be used: {fault}. {_remedy(path)}")

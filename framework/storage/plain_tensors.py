@@ -6,7 +6,6 @@ reads it, and the tensors afterwards.
 """
 
 import math
-import mmap
 import os
 import zipfile
 from collections.abc import Iterator
@@ -71,6 +70,9 @@ LENGTH_OF_MARK = 20
 def load(file: BinaryIO) -> Any:
     """What `torch.save` wrote, on the CPU.
 
+    Args:
+        file: as `framework.storage.reading.opened` gives it.
+
     Raises:
         Foreign: it is made of something else than plain values and dense tensors.
         Exception: it is damaged; torch, pickle and zipfile raise a dozen kinds.
@@ -118,14 +120,15 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
-    # of a file itself, a length that is announced would be allocated before it is read
-    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        for number in range(PICKLES_BEFORE_ZIP):
-            start = content.tell()
-            for _, _, place in instructions(content):
-                if number == 0 and (place or 0) > LENGTH_OF_MARK:
-                    raise ValueError("it does not begin as a file of torch does")
-            yield content[start : content.tell()]
+    file.seek(0)
+    for number in range(PICKLES_BEFORE_ZIP):
+        start = file.tell()
+        for _, _, place in instructions(file):
+            if number == 0 and (place or 0) > LENGTH_OF_MARK:
+                raise ValueError("it does not begin as a file of torch does")
+        end = file.tell()
+        file.seek(start)
+        yield file.read(end - start)
 
 
 def require_dense(content: Any, size: int | float = math.inf) -> None:

@@ -3,6 +3,7 @@
 What a file may unfold to is bounded by its size, before anything is allocated: `room`.
 """
 
+import io
 import os
 import stat
 import zlib
@@ -48,11 +49,23 @@ def opened(file: Path) -> BinaryIO:
     Raises:
         OSError: it is missing, or no regular file: a pipe could block for ever, a device go on without end.
     """
-    stream = open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK))  # noqa: SIM115
+    stream = Bounded(io.FileIO(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
         raise OSError("no regular file")
     return stream
+
+
+class Bounded(io.BufferedReader):
+    """A file of which no more is read than it has: Python allocates what is asked for before it reads.
+
+    A chunk of an image, or a text of a pickle, announces 4 GB in four bytes.
+    """
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or size < 0:
+            return super().read()
+        return super().read(min(size, max(0, os.fstat(self.fileno()).st_size - self.tell())))
 
 
 def read_bytes(file: Path) -> bytes:
