@@ -208,7 +208,7 @@ def stored_fields(folder: Path) -> None:
     target, many = asdict(model.target), [f"x{number}" for number in range(110_000)]
     for name, fields in {
         "a long input": {"input_shape": (10**9,)},
-        "an input that weighs 400 MB": {"input_shape": (10**8,)},
+        "an input of a million": {"input_shape": (1_000_000,)},
         "a large image": {"input_shape": (3, 20_000, 20_000)},
         "an input of many sides": {"input_shape": [1] * 100_000},
         "a negative side": {"input_shape": (-(10**9), -6)},
