@@ -85,14 +85,6 @@ def test_the_contracts_checks_are_for_rows_and_tests() -> None:
     assert not faults(code, lambda path: re.findall("framework.testing", path.read_text(encoding="utf-8")))
 
 
-def test_files_are_short() -> None:
-    def length(path: Path) -> list[int]:
-        lines = len(path.read_text(encoding="utf-8").splitlines())
-        return [lines] if lines > 400 else []
-
-    assert not faults(CORE, length)
-
-
 def test_nothing_instantiates_from_a_config_or_loads_pickles() -> None:
     bad = "hydra.utils import|weights_only=False|allow_pickle=True"
     assert not faults(CORE + PLUGINS, lambda path: re.findall(bad, path.read_text(encoding="utf-8")))
@@ -106,8 +98,8 @@ def test_plugin_folders_explain_themselves() -> None:
 
     def wanting(folder: Path) -> Iterator[str]:
         readme = folder / "README.md"
-        if not readme.is_file() or not 3 <= len(readme.read_text(encoding="utf-8").splitlines()) <= 40:
-            yield "README.md of 3 to 40 lines"
+        if not readme.is_file():
+            yield "README.md"
         else:
             said = readme.read_text(encoding="utf-8")
             told = re.findall(r"^\*\*Differs from the thesis\*\*: (?=\S)", said, re.MULTILINE)

@@ -75,7 +75,6 @@ def test_there_are_many() -> None:
 
 def test_the_readme_leads_to_every_plugin_and_every_benchmark() -> None:
     text = READMES[0].read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 120
     wanted = [*ROOT.glob("plugins/*/*/README.md"), *ROOT.glob("benchmarks/*.md")]
     assert not [str(page) for page in wanted if f"({page.relative_to(ROOT)})" not in text]
     linked = re.findall(r"\]\(((?!https)[^)]*)\)", text)
