@@ -186,7 +186,7 @@ DAMAGED = {
     "tab": (TOP + b"trainer:\n\tmax_epochs: 1\n", r"mine\.yaml, line 3, column 1: .* found character '\\t'"),
     "twice": (TOP + b"seed: 1\nseed: 2\n", r"mine\.yaml, line 3, column 1: .* found duplicate key seed"),
     "two documents": (b"---\nseed: 1\n---\nseed: 2\n", r"mine\.yaml, line 3, column 1: .*another document"),
-    "alias": (TOP + b"seed: *none\n", r"mine\.yaml, line 2, column 7: found undefined alias"),
+    "alias": (TOP + b"seed: *none\n", r"mine\.yaml: cannot be read as a config \(an alias"),
     "tag": (
         TOP + b"seed: !!python/object:os.system x\n",
         r"mine\.yaml, line 2, column 7: could not determine",

@@ -4,6 +4,7 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
+import yaml
 from hydra._internal.utils import get_args_parser
 
 from framework.configuration.schema import forbid_targets
@@ -54,7 +55,12 @@ def _group(file: Path, folder: Path) -> str:
 
 
 def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None:
-    content = read_yaml(file, "a config", "Mend it, or take it out of the folder.", ConfigError)
+    try:
+        content = read_yaml(file, "a config", "Mend it, or take it out of the folder.", ConfigError)
+    except ConfigError as error:
+        if isinstance(error.__cause__, yaml.YAMLError | UnicodeDecodeError):
+            return  # what is no YAML Hydra cannot read either, and says where
+        raise
     with file.open(encoding="utf-8") as text:
         header = re.findall(r"^#\s*@package\s+(.*)$", text.read(), re.MULTILINE)
     below = file.relative_to(folder).with_suffix("").parts
@@ -76,22 +82,24 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
     for entry in defaults if isinstance(defaults, list) else [defaults]:
         for text, name in entry.items() if isinstance(entry, dict) else [(str(entry), "")]:
             group, _, package = str(text).removeprefix("override ").partition("@")
-            own = any(word in f"{group}@{package}" for word in OWN) and not CHOSEN.fullmatch(
-                group.lstrip("/")
-            )
-            at_top = group.startswith("/") or not _group(file, folder)
-            unknown = (
-                at_top
-                and group not in ("", "_self_")
-                and group.lstrip("/").split("/")[0] not in (*groups, "hydra")
-            )
-            if (
-                own
-                or unknown
-                or ".." in f"{group}{name}"
-                or (CHOSEN.fullmatch(group.lstrip("/")) and package)
-            ):
+            absolute = group.startswith("/") or not _group(file, folder)
+            if _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":
                 raise _refused(file, f"chooses {quoted(entry)}")
+            first = group.lstrip("/").split("/")[0]
+            # what a sweep has left there was not looked at; of what is nowhere Hydra says so
+            if absolute and first not in (*groups, "", "_self_") and _holds(folder, first):
+                raise _refused(file, f"chooses {quoted(entry)}")
+
+
+def _is_own(group: str, package: str) -> bool:
+    """Return whether a choice is one of, or goes into, a part of the config that is the user's own."""
+    if CHOSEN.fullmatch(group):
+        return bool(package)
+    return any(word in f"{group}@{package}" for word in OWN)
+
+
+def _holds(folder: Path, name: str) -> bool:
+    return any((folder / f"{name}{ending}").exists() for ending in ("", ".yaml", ".yml"))
 
 
 def _refused(file: Path, what: str) -> ConfigError:

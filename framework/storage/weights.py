@@ -184,7 +184,7 @@ def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tenso
 
 
 def _require_state(
-    bounds: Mapping[str, tuple[float, float]],
+    bounds: Mapping[str, tuple[float, float] | tuple[Tensor, Tensor]],
     module: nn.Module,
     state: Mapping[str, Any],
     prefix: str,

@@ -113,6 +113,7 @@ class RandomSearch(Sweeper):
         if ranking.best is not None:
             found = f"{ranking.said}; trial {ranking.best.folder.name} of {len(trials)} (seed {self.seed})"
             _best.write(folder, ranking.best.overrides, loader, found)
+        assert self.config is not None
         logger = {"logger": OmegaConf.to_container(self.config.logger)}
         comparison.close_ranking(folder, f"a random search of {len(trials)} trials; {found}", logger)
 
