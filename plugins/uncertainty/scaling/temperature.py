@@ -15,7 +15,7 @@ from framework.calibration.validation import densities, repeatable, require_numb
 from framework.data import Batch
 from framework.distributions.tempering import temper
 from framework.model import Predictor
-from framework.storage.weights import ABOVE_0, require_state
+from framework.storage.weights import require_state
 from framework.uncertainty import Uncertainty
 from plugins.uncertainty.scaling.likelihood import Term, minimise, total
 
@@ -65,7 +65,7 @@ class Temperature(Uncertainty):
         self.lower = lower
         self.upper = upper
         self.register_buffer("temperature", torch.ones((), dtype=torch.float64))
-        require_state(self, temperature=ABOVE_0)
+        require_state(self, temperature=(lower, upper))
 
     def forward(self, inputs: Tensor) -> Distribution:
         return temper(self.model(inputs), self.temperature)
