@@ -399,7 +399,7 @@ def models() -> Iterator[Reader]:
 
 def runs() -> Iterator[Reader]:
     config = whole.config()
-    job = b'{"key": "a", "status": "completed", "overrides": ["seed=1"], "config": "x"}'
+    job = b'{"key": "a", "number": 0, "status": "completed", "overrides": ["seed=1"], "config": "x"}'
     mark = b'{"version": 1, "images": 20}'
     yield Reader(
         "run.json",

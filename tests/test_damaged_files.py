@@ -93,9 +93,8 @@ OWN_FILES = {
     "framework/datasets/images.py": "within a guard",
     "framework/evaluation/cost.py": "/proc",
     "framework/modes/plugins.py": "the package's own modules",
-    "framework/sweeps/jobs.py": "the console of a job that it started",
-    "framework/sweeps/processes.py": "/proc",
-    "framework/tracking/journal.py": "the run's own journal, line by line",
+    "framework/runs/repository.py": "the copy of an index that it has made",
+    "framework/tracking/watch.py": "/proc",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
     "plugins/renderer/rasterizer/parts.py": "bytes that a guard has read",
 }

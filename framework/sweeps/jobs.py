@@ -18,14 +18,17 @@ from typing import Any
 
 from framework.errors import ConfigError, UserError
 from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
+from framework.storage.enclosed import read_plain, read_stream
 from framework.storage.files import write_whole
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import guarded
 from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """What runs one job; its overrides follow. No config can set it, since it would then run code."""
 CONSOLE = "console.log"
+LONGEST_VALUE = 4096
+"""Bytes of what a job returned."""
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +89,7 @@ class Job:
         """What the job left for the sweeper to minimise (`leave_value`)."""
         path = self.folder / VALUE
         with guarded(path, "a number", "Delete it, and the job runs anew."):
-            return float(json.loads(read_bytes(path))) if path.is_file() else None
+            return float(json.loads(read_plain(path, LONGEST_VALUE))) if path.is_file() else None
 
 
 def hashed(*parts: str) -> str:
@@ -319,7 +322,9 @@ def _end(one: _Running, code: int) -> None:
 
 def _last_line(console: Path) -> str:
     """Where Python, and this framework, say what was wrong."""
-    lines = console.read_bytes()[-4096:].decode("utf-8", "replace").split("\n")
+    with read_stream(console) as stream:
+        stream.seek(max(0, os.fstat(stream.fileno()).st_size - 4096))
+        lines = stream.read(4096).decode("utf-8", "replace").split("\n")
     return next((line.strip() for line in reversed(lines) if line.strip()), "")[:500]
 
 
