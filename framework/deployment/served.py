@@ -5,8 +5,11 @@ A request comes from anywhere: text in it is the content of a file, base64, and 
 
 import base64
 import binascii
+import json
+import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, final
@@ -14,19 +17,24 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 import torch
+from PIL import Image
 
 from framework.configuration.description import Description
 from framework.configuration.loading import asked_of, load_with_description, reader
 from framework.data import Batch, Data
 from framework.datasets.png import png
+from framework.deployment.request_bodies import MOST_CONTENT, MOST_FILES, MOST_INPUTS, MOST_ROWS
+from framework.deployment.request_bounds import TICKET, bound_server
 from framework.distributions.noise import Draw
-from framework.errors import DataError, UserError
+from framework.errors import DataError, UserError, quoted, shown
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
 from framework.prediction import answers, named
 
 CONTENT, NAME = "base64", "name"
 """Columns of a request with files: their bytes, and (if their kind hangs on that) their names."""
+
+_log = logging.getLogger(__name__)
 
 
 @final
@@ -38,12 +46,24 @@ class Served:
 
     def predict(self, given: Any, params: object = None) -> pd.DataFrame:
         """As `answer`; MLflow calls it, and its server tells a client the sentence of an MlflowException alone."""
+        ticket = TICKET.get()
         try:
             return self.answer(given)
         except UserError as error:
-            from mlflow.exceptions import INVALID_PARAMETER_VALUE, MlflowException
+            # the checkpoint lies on the server's machine
+            sentence = shown(str(error).replace(self.description.path, "the served model"), 1000)
+            reason: Exception = error
+        except Exception as error:
+            if ticket is None:
+                raise
+            _log.exception("A request could not be answered.")
+            sentence = "The model cannot predict for what the request holds. Compare its rows with the training data."
+            reason = error
+        if ticket is not None:
+            ticket.sentence = ticket.sentence or sentence
+        from mlflow.exceptions import INVALID_PARAMETER_VALUE, MlflowException
 
-            raise MlflowException(str(error), INVALID_PARAMETER_VALUE) from error
+        raise MlflowException(sentence, INVALID_PARAMETER_VALUE) from reason
 
     @torch.no_grad()
     def answer(self, given: Any) -> pd.DataFrame:
@@ -57,9 +77,13 @@ class Served:
             DataError: it is none of these.
         """
         asked = self._asked(given)
+        require_few(len(asked["input"]), asked["input"].numel())
+        ticket = TICKET.get()
         seed, samples = (self.description.settings.get(key, other) for key, other in _DEFAULTS.items())
         parts = []
         for number, rows in enumerate(torch.arange(len(asked["input"])).split(BLOCK)):
+            if ticket is not None:
+                ticket.require_time()
             block = {name: values[rows] for name, values in asked.items()}
             prediction = predicted(self.predictor, block, samples, Draw(seed, number))
             prediction = prediction.in_frame(self.data.frame(block))
@@ -79,30 +103,157 @@ class Served:
             parts.append(pd.DataFrame({**labels, **{key: column.numpy() for key, column in found.items()}}))
         return pd.concat(parts, ignore_index=True)
 
+    def warm_up(self) -> None:
+        """Predict once for made-up samples, so that no later prediction waits for imports and compilation."""
+        for sample in self.made_up():
+            try:
+                self.answer(sample)
+            except Exception as error:  # a sample that this data set does not take
+                _log.debug("A made-up sample was refused: %s", shown(error))
+
+    def made_up(self) -> Iterator[Any]:
+        """Yield samples as a request may hold them: rows, or files of each kind that the data set reads."""
+        columns, shape = self.data.columns, self.data.input_shape
+        if columns and len(shape) == 1:
+            yield pd.DataFrame([[0.0] * len(columns)] * 2, columns=list(columns))
+        for suffix in self.data.suffixes:
+            content = made_up_file(suffix, columns)
+            if content is not None:
+                yield pd.DataFrame({CONTENT: [base64.b64encode(content).decode()], NAME: [f"sample{suffix}"]})
+
     def _asked(self, given: Any) -> Batch:
         if isinstance(given, pd.DataFrame) and CONTENT in given.columns and CONTENT not in self.data.columns:
+            if not given.columns.is_unique:
+                raise DataError("A column comes twice. Give each once.")
             names = given[NAME] if NAME in given.columns else [""] * len(given)
             return self._of_contents(list(given[CONTENT]), [str(name) for name in names])
         if isinstance(given, str) or (isinstance(given, list | np.ndarray) and _texts(given)):
             texts = [given] if isinstance(given, str) else list(given)
             return self._of_contents(texts, [""] * len(texts))
+        if isinstance(given, pd.DataFrame | np.ndarray | torch.Tensor) and given.ndim:
+            require_few(len(given), int(np.prod(given.shape)))
+        if isinstance(given, list | tuple) and not given:
+            raise DataError("Nothing came; wanted a row at least.")
         return asked_of(self.predictor, self.data, given)
 
     def _of_contents(self, texts: Sequence[Any], names: Sequence[str]) -> Batch:
+        if not 0 < len(texts) <= MOST_FILES:
+            raise DataError(
+                f"{len(texts)} files came; wanted 1 to {MOST_FILES} in one request. Send them in several requests."
+            )
         with TemporaryDirectory() as folder:
-            files = []
+            files: list[Path] = []
             for row, (text, name) in enumerate(zip(texts, names, strict=True)):
-                try:
-                    content = base64.b64decode(text, validate=True)
-                except (binascii.Error, TypeError, ValueError) as error:
-                    raise DataError(
-                        f"row {row}: wanted the content of a file, base64. A file of your own is a pathlib.Path."
-                    ) from error
+                content = _decoded(row, text)
                 # the ending tells the kind of file, and what is drawn of a cloud depends on its name
-                files.append(Path(folder) / str(row) / (re.sub(r"[^\w.-]|^\.+", "_", name)[-100:] or "file"))
+                files.append(Path(folder) / str(row) / (_file_name(name) or "file"))
                 files[-1].parent.mkdir()
                 files[-1].write_bytes(content)
-            return asked_of(self.predictor, self.data, files)
+            try:
+                return self._of_files(files)
+            except UserError as error:
+                raise type(error)(_of_rows(str(error), Path(folder), names)) from error
+
+    def _of_files(self, files: Sequence[Path]) -> Batch:
+        """Read files one by one, so that together they unfold to no more than one request may hold."""
+        ticket = TICKET.get()
+        parts: list[Batch] = []
+        numbers = 0
+        for file in files:
+            if ticket is not None:
+                ticket.require_time()
+            parts.append(asked_of(self.predictor, self.data, [file]))
+            numbers += parts[-1]["input"].numel()
+            require_few(sum(len(part["input"]) for part in parts), numbers)
+        if len({part["input"].shape[1:] for part in parts}) == 1:
+            found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+            return {**found, **({"index": torch.arange(len(found["input"]))} if "index" in found else {})}
+        # clouds of different sizes are padded, which is for the data set to do
+        rows = sum(len(part["input"]) for part in parts)
+        require_few(rows, rows * max(part["input"][0].numel() for part in parts))
+        parts.clear()
+        return asked_of(self.predictor, self.data, files)
+
+
+def require_few(rows: int, numbers: int) -> None:
+    """Refuse what takes more memory and time than one prediction may.
+
+    Raises:
+        DataError: there are too many rows, or numbers in them.
+    """
+    if not 0 < rows <= MOST_ROWS:
+        raise DataError(f"{rows} rows came; wanted 1 to {MOST_ROWS} at once. Give them in several calls.")
+    if numbers > MOST_INPUTS:
+        raise DataError(
+            f"{rows} rows of {numbers} numbers in all came; wanted at most {MOST_INPUTS} numbers at once. Give them in "
+            "several calls."
+        )
+
+
+def made_up_file(suffix: str, columns: Sequence[str]) -> bytes | None:
+    """Return the content of a small file of a kind, by its suffix; None where the kind is not known here."""
+    if suffix == ".csv":
+        return "\n".join([",".join(columns), *[",".join("0" for _ in columns)] * 2, ""]).encode()
+    if suffix in (".png", ".jpg", ".jpeg"):
+        content = BytesIO()
+        ramp = np.arange(3 * 64 * 64).astype(np.uint8).reshape(64, 64, 3)
+        Image.fromarray(ramp).save(content, "PNG" if suffix == ".png" else "JPEG")
+        return content.getvalue()
+    side = 16
+    row, column = np.divmod(np.arange(side**2), side)
+    points = [f"{a} {b} {a * b % 7}" for a, b in zip(row.tolist(), column.tolist(), strict=True)]
+    first = [side * a + b for a in range(side - 1) for b in range(side - 1)]
+    faces = [
+        f"3 {a} {b} {c}" for f in first for a, b, c in ((f, f + side, f + 1), (f + side, f + side + 1, f + 1))
+    ]
+    if suffix == ".xyz":
+        return "\n".join([*points, ""]).encode()
+    if suffix == ".off":
+        return "\n".join(["OFF", f"{len(points)} {len(faces)} 0", *points, *faces, ""]).encode()
+    if suffix == ".ply":
+        colors = ("red", "green", "blue")
+        head = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+        head += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {color}" for color in colors]
+        head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+        return "\n".join([*head, *(f"{point} 90 120 150" for point in points), *faces, ""]).encode()
+    return None
+
+
+def _decoded(row: int, text: Any) -> bytes:
+    if isinstance(text, str) and len(text) > MOST_CONTENT // 3 * 4 + 4:
+        raise DataError(
+            f"row {row}: a file of about {len(text) // 4 * 3} bytes came; wanted at most {MOST_CONTENT}. "
+            "Make it smaller."
+        )
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, TypeError, ValueError) as error:
+        raise DataError(
+            f"row {row}: wanted the content of a file, base64. A file of your own is a pathlib.Path."
+        ) from error
+
+
+def _file_name(name: str) -> str:
+    """Return the end of a name, with letters that stand in every file system, and no longer than one takes."""
+    name = re.sub(r"[^\w.-]|^\.+", "_", name)[-100:]
+    while len(name.encode()) > 240:
+        name = name[1:]
+    return name
+
+
+def _of_rows(said: str, folder: Path, names: Sequence[str]) -> str:
+    """Return what is said of temporary files, with row numbers and the client's names in place of their paths."""
+
+    def row(found: re.Match[str]) -> str:
+        number = found[1]
+        if not number or int(number) >= len(names):
+            return "the request"
+        name = re.split(r"[/\\]", names[int(number)])[-1]
+        return f"row {number}" + (f" ({quoted(name)})" if name else "")
+
+    said = re.sub(rf"{re.escape(str(folder))}(?:/(\d+)(?:/[\w.…-]*[\w…-])?)?", row, said)
+    # a message may have been cut within a path
+    return re.sub(rf"{re.escape(str(folder.parent))}[^\s'\"]*…", "…", said)
 
 
 _DEFAULTS = {"seed": 0, "samples": 1000}
@@ -110,10 +261,15 @@ _DEFAULTS = {"seed": 0, "samples": 1000}
 
 
 def _texts(given: Sequence[Any] | np.ndarray) -> bool:
-    return len(given) > 0 and all(isinstance(item, str) for item in given)
+    flat = isinstance(given, list) or (isinstance(given, np.ndarray) and given.ndim == 1)
+    return flat and len(given) > 0 and all(isinstance(item, str) for item in given)
 
 
 def _load_pyfunc(path: str) -> Served:
-    """What MLflow calls with the path of the checkpoint; errors as `framework.load`."""
+    """Return the model that MLflow asks for with the path of its checkpoint; errors as `framework.load`."""
     predictor, description = load_with_description(path)
-    return Served(predictor, description, reader(description))
+    served = Served(predictor, description, reader(description))
+    served.warm_up()
+    samples = (one.to_dict(orient="split", index=False) for one in served.made_up())
+    bound_server([json.dumps({"dataframe_split": sample}).encode() for sample in samples])
+    return served
