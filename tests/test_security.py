@@ -13,7 +13,7 @@ def test_each_claim_names_its_test() -> None:
     claims = re.split(r"\n- ", trusted)[1:]
     assert len(claims) > 15
     for claim in claims:
-        named = re.findall(r"`(tests/\w+\.py)(?:::(\w+))?`", claim)
+        named = re.findall(r"`((?:tests|plugins)/[\w/]+\.py)(?:::(\w+))?`", claim)
         assert named, f"names no test: {claim}"
         for file, test in named:
             path = ROOT / file

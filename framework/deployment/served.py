@@ -137,7 +137,7 @@ class Served:
         return asked_of(self.predictor, self.data, given)
 
     def _of_contents(self, texts: Sequence[Any], names: Sequence[str]) -> Batch:
-        if not 0 < len(texts) <= MOST_FILES:
+        if not texts or (TICKET.get() is not None and len(texts) > MOST_FILES):
             raise DataError(
                 f"{len(texts)} files came; wanted 1 to {MOST_FILES} in one request. Send them in several requests."
             )
@@ -176,17 +176,19 @@ class Served:
 
 
 def require_few(rows: int, numbers: int) -> None:
-    """Refuse what takes more memory and time than one prediction may.
+    """Refuse what takes more memory and time than one request may; what a notebook gives is its user's own.
 
     Raises:
         DataError: there are too many rows, or numbers in them.
     """
+    if TICKET.get() is None:
+        return
     if not 0 < rows <= MOST_ROWS:
-        raise DataError(f"{rows} rows came; wanted 1 to {MOST_ROWS} at once. Give them in several calls.")
+        raise DataError(f"{rows} rows came; wanted 1 to {MOST_ROWS} at once. Send them in several requests.")
     if numbers > MOST_INPUTS:
         raise DataError(
-            f"{rows} rows of {numbers} numbers in all came; wanted at most {MOST_INPUTS} numbers at once. Give them in "
-            "several calls."
+            f"{rows} rows of {numbers} numbers in all came; wanted at most {MOST_INPUTS} numbers at once. Send them "
+            "in several requests."
         )
 
 
