@@ -515,6 +515,31 @@ def test_no_file_of_a_run_holds_the_password_of_its_store(
     assert "ssw0rd" not in caplog.text + tracker.url
 
 
+@pytest.mark.parametrize("table", ["tags", "runs"])
+def test_the_default_store_names_no_other_folder_to_load_from(
+    table: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may have come with somebody's folder; one that the user names says where its runs are."""
+    tracker = build(folder)
+    tracker.open()
+    log(tracker, [1])
+    tracker.close("FINISHED")
+    elsewhere = tmp_path / "elsewhere"
+    if table == "tags":
+        shutil.move(folder, elsewhere)
+    with sqlite3.connect(folder.parents[1] / "mlflow.db") as store:
+        change = {"tags": "value = ? where key = 'framework.folder'", "runs": "artifact_uri = ?"}[table]
+        store.execute(f"update {table} set {change}", [str(elsewhere)])
+    store.close()
+    monkeypatch.chdir(tmp_path)
+    if table == "runs":
+        shutil.rmtree(folder)
+    with pytest.raises(UserError, match=r"keeps files in|has no checkpoints"):
+        run_folder(str(tracker.run_id))
+    if table == "tags":
+        assert run_folder(str(tracker.run_id), default_uri(folder)) == elsewhere
+
+
 # Few calls, in order
 
 
