@@ -39,8 +39,8 @@ def test_own_data_are_named_and_long_work_says_how_far_it_is(tmp_path: Path) -> 
         "data=tabular data.path=faces.csv data.target=gaze data.kind=degrees encoder=[mlp] density_head=scvae "
         "metric=[log_likelihood,angular_deviation,coverage,risk_coverage] trainer.max_epochs=1 batch_size=16 "
         f"samples=20 pictures=svg hydra.run.dir=one {always}",
-        f"mode=predict checkpoint=one hydra.run.dir=two {always}",
-        "mode=work_precision checkpoint=one mode.values=[1,2] mode.repeats=2 mode.reference=4 "
+        f"mode=predict checkpoint=one data.path=faces.csv hydra.run.dir=two {always}",
+        "mode=work_precision checkpoint=one data.path=faces.csv mode.values=[1,2] mode.repeats=2 mode.reference=4 "
         f"mode.metrics=[error_nats,maad_deg] pictures=svg hydra.run.dir=three {always}",
     ]
     done = subprocess.run(

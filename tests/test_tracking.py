@@ -96,7 +96,6 @@ def folder(tmp_path: Path, empty_store: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # MLflow's server sets it for its process
     for name, seconds in {"_SECONDS": 0.1, "_PAUSE": 0.02, "_FIRST_RETRY": 0.05, "_LAST_RETRY": 0.2}.items():
         monkeypatch.setattr(sender, name, seconds)
 

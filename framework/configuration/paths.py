@@ -160,8 +160,8 @@ def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: st
         example = ", ".join(f'"{shown(key)}": ...' for key in needed)
         raise ConfigError(
             f"{shown(source)} names a path: {named}. A checkpoint may come from anybody, so a path in it is used only "
-            f"where you say it again, or another. Add to a command: {' '.join(words(needed))}; to framework.load or "
-            f"freeze: paths={{{example}}}."
+            f"where you say it again, or another. Add to a command: {' '.join(words(needed))}; to one of a plugin the "
+            f"same behind --path; to framework.load or freeze: paths={{{example}}}."
         )
 
 

@@ -311,7 +311,9 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     points = prepared(file).splits().test.__getitems__([0])
     cloud = denormalised(points["input"], points["centre"], points["scale"])[0, :400].numpy()
     np.save(tmp_path / "me.npy", cloud)
-    code, told = command(tmp_path, "plugins.data.bodies", "run", "me.npy", "--folder", "meshes")
+    code, told = command(
+        tmp_path, "plugins.data.bodies", "run", "me.npy", "--folder", "meshes", "--path", f"data.body={file}"
+    )
     assert code == 0, told
     assert told.split() == ["meshes/me_registered.ply", "meshes/me_registered.png"]
     mesh = read(tmp_path / "meshes" / "me_registered.ply")
@@ -321,7 +323,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     assert np.linalg.norm(body.mean(0) - cloud.mean(0)) < 1
     with Image.open(tmp_path / "meshes" / "me_registered.png") as image:
         assert image.size[1] > 100
-    code, told = command(tmp_path, "plugins.data.bodies", "run", "nobody.ply")
+    code, told = command(tmp_path, "plugins.data.bodies", "run", "nobody.ply", "--path", f"data.body={file}")
     assert code == 1
     assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told
 
