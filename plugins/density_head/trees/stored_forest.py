@@ -4,6 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from plugins.density_head.trees.heads_without_gradient import FLOOR
+
+WIDEST = 1e18
+"""The largest standard deviation that a density is given back with."""
+
 
 def require_forest(arrays: Mapping[str, np.ndarray], classes: int, numbers: int) -> None:
     """Check that every walk through these arrays ends at a leaf, and that every leaf holds something.
@@ -71,8 +76,9 @@ def require_widths(width: np.ndarray, numbers: int) -> None:
     Raises:
         ValueError: they are something else.
     """
-    if width.shape != (numbers,) or not np.isfinite(width).all() or (width <= 0).any():
-        raise ValueError(f"width is no row of {numbers} finite numbers above 0")
+    # below the floor, but for rounding, no fit ends; the square of a wider one is more than float32 holds
+    if width.shape != (numbers,) or not ((width > 0.99 * FLOOR) & (width <= WIDEST)).all():
+        raise ValueError(f"width is no row of {numbers} numbers from {FLOOR} to {WIDEST}")
 
 
 def _votes(arrays: Mapping[str, np.ndarray], leaves: int, classes: int) -> None:

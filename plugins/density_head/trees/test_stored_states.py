@@ -60,7 +60,7 @@ OF_FOREST = {
     "count": [put(0, 0), put(1, -1), put(2, -(2**31))],
     "threshold": [put(0, torch.nan), put(0, torch.inf)],
     "mean": [put(0, torch.nan), put(-1, -torch.inf)],
-    "width": [put(0, 0.0), put(0, -1.0), put(1, torch.nan), put(1, torch.inf)],
+    "width": [put(0, 1e-300), put(0, 1e300), put(0, 0.0), put(0, -1.0), put(1, torch.nan), put(1, torch.inf)],
     "read": [put(0, 0), put(0, 1), put(0, -1), put(0, 2**40)],
 }
 """Whole arrays but for one number. A root moved within its tree leads branches out of the tree before it."""
