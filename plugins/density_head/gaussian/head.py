@@ -13,13 +13,15 @@ from torch.nn.functional import hardtanh, mse_loss
 from framework.density_head import DensityHead
 from framework.heads.parameters import require_finite
 from framework.heads.unit import Unit
-from framework.storage.weights import ABOVE_0, FINITE, require_state
+from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
 
 LARGEST_MEAN = 1e8
 """Means and residuals are cut off here: beyond it squares of standardised residuals overflow float32."""
 LARGEST_SCALE = 1e12
+WIDEST_SCALE = 1e18
+"""The largest standard deviation that is calibrated, and taken from a file."""
 LARGEST_COEFFICIENT = 1e3
 SMALLEST_SCALE = 1e-6
 
@@ -71,7 +73,9 @@ class GaussianHead(DensityHead):
             self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
             side = self.numbers if self.full else 0  # of a diagonal covariance none: numbers may be very many
             self.register_buffer("coefficients", torch.zeros(side, side, dtype=torch.float64))
-            require_state(self, scale=ABOVE_0, coefficients=FINITE)
+            # no calibration ends below the floor, but for rounding; squares above the largest overflow float32
+            coefficient = (-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+            require_state(self, scale=(0.99 * floor, WIDEST_SCALE), coefficients=coefficient)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Gaussian:
         raw = require_finite(raw, self.size)
@@ -103,10 +107,10 @@ class GaussianHead(DensityHead):
             self.unit.standardised(target).double() - self._mean(require_finite(raw, self.size)).double()
         )
         if not self.full:  # each σ by itself
-            self.scale.copy_(residual.square().mean(0).sqrt().clamp(min=self.floor))
+            self.scale.copy_(residual.square().mean(0).sqrt().clamp(self.floor, WIDEST_SCALE))
             return
         scale, coefficients = fit(residual)
-        self.scale.copy_(scale.clamp(min=self.floor))
+        self.scale.copy_(scale.clamp(self.floor, WIDEST_SCALE))
         self.coefficients.copy_(coefficients)
 
     def _mean(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch number"]:

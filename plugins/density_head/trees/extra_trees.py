@@ -18,6 +18,7 @@ from framework.target import Target
 from plugins.density_head.trees.forest import frequencies, leaves
 from plugins.density_head.trees.heads_without_gradient import (
     FLOOR,
+    WIDEST,
     load_any_shape,
     require_fitted,
     require_no_angle,
@@ -125,7 +126,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         for name, array in arrays.items():
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(array)).to(target.device))
         if not self.classes:
-            self.width.copy_(target.std(0, correction=0).clamp(min=FLOOR))
+            self.width.copy_(target.std(0, correction=0).clamp(FLOOR, WIDEST))
         self.read.fill_(features.shape[1])
         self._open()
 
@@ -160,7 +161,8 @@ class ExtraTreesHead(DensityHead, Fitted):
         density = self(raw.double())
         assert isinstance(density, Mixture)
         means, target = map(self.unit.standardised, (density.components.mean, target.double()))
-        self.width.copy_(fitted_width(target.unsqueeze(1) - means))  # (sample, tree, number)
+        width = fitted_width(target.unsqueeze(1) - means)  # of (sample, tree, number)
+        self.width.copy_(width.clamp(max=WIDEST))
 
     def _require(self, arrays: Mapping[str, np.ndarray]) -> None:
         require_forest(arrays, self.classes, self.numbers)

@@ -18,6 +18,7 @@ from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.trees.heads_without_gradient import (
     FLOOR,
+    WIDEST,
     load_any_shape,
     require_fitted,
     require_no_angle,
@@ -150,7 +151,7 @@ class XGBoostHead(DensityHead, Fitted):
 
     def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         residual = self.unit.standardised(target.double()) - self._sums(raw).to(target.device)
-        self.width.copy_(residual.square().mean(0).sqrt().clamp(min=FLOOR))
+        self.width.copy_(residual.square().mean(0).sqrt().clamp(FLOOR, WIDEST))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:
         """Of the trees, float32."""

@@ -15,6 +15,8 @@ from framework.target import Target
 
 FLOOR = 1e-4
 """The least standard deviation of a density over reals, in those of the training targets where `Target` has them."""
+WIDEST = 1e18
+"""The largest standard deviation of such a density: the square of a wider one is more than float32 holds."""
 
 
 def require_no_angle(target: Target, by: str) -> None:

@@ -4,10 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from plugins.density_head.trees.heads_without_gradient import FLOOR
-
-WIDEST = 1e18
-"""The largest standard deviation that a density is given back with."""
+from plugins.density_head.trees.heads_without_gradient import FLOOR, WIDEST
 
 
 def require_forest(arrays: Mapping[str, np.ndarray], classes: int, numbers: int) -> None:
@@ -76,7 +73,7 @@ def require_widths(width: np.ndarray, numbers: int) -> None:
     Raises:
         ValueError: they are something else.
     """
-    # below the floor, but for rounding, no fit ends; the square of a wider one is more than float32 holds
+    # no fit ends below the floor, but for rounding
     if width.shape != (numbers,) or not ((width > 0.99 * FLOOR) & (width <= WIDEST)).all():
         raise ValueError(f"width is no row of {numbers} numbers from {FLOOR} to {WIDEST}")
 
