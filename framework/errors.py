@@ -84,4 +84,4 @@ def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str | Non
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """' Did you mean ...?' with a leading space, or nothing where nothing is near."""
     near = nearest(word, known)
-    return f" Did you mean {near!r}?" if near else ""
+    return f" Did you mean {quoted(near)}?" if near else ""

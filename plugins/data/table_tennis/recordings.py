@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from framework.datasets.csv_columns import numbers, read_columns, require
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError
+from framework.errors import DataError, shown
 
 COLUMNS = ("t", "x", "y", "z")
 TRUE = ("true_x", "true_y", "true_z")
@@ -89,8 +89,8 @@ def _from_matlab(file: Path) -> list[Flight]:
         tables = [_joined(time, ball) for time, ball in pairs]
     else:
         raise DataError(
-            f"{file} holds {', '.join(found) or 'nothing'}; wanted ballTrain with a field data, or time and ball, as "
-            "the WAM laboratory's flights. Or write each flight as CSV with the columns t, x, y, z."
+            f"{file} holds {shown(', '.join(found)) or 'nothing'}; wanted ballTrain with a field data, or time and "
+            "ball, as the WAM laboratory's flights. Or write each flight as CSV with the columns t, x, y, z."
         )
     for number, table in enumerate(tables):
         if table.ndim != 2 or table.shape[1] != 4:
