@@ -21,10 +21,10 @@ class UserError(Exception):
         )
 
 
-def printable(text: str) -> str:
-    """Return a text of several lines in which nothing steers a terminal."""
+def printable(text: str, kept: str = "\n\t") -> str:
+    """Return a text in which nothing steers a terminal: other letters than the `kept` are written out."""
     return "".join(
-        letter if letter.isprintable() or letter in "\n\t" else repr(letter)[1:-1] for letter in text
+        letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in text
     )
 
 
@@ -65,7 +65,7 @@ def shown(damage: object, most: int = 200) -> str:
     """What a file holds, or what a library says of it, for a message: cut, and without what steers a terminal."""
     text = " ".join(line.strip() for line in str(damage).splitlines())
     text = text if len(text) <= most else text[: most - 1] + "…"
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+    return printable(text, kept="")
 
 
 def quoted(damage: object) -> str:

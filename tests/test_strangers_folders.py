@@ -341,6 +341,11 @@ def test_a_job_that_says_nonsense_is_left_out_of_the_table(
         for name, content in files.items():
             (tmp_path / "0").mkdir(exist_ok=True)
             (tmp_path / "0" / name).write_text(json.dumps(content))
+        # a second job, by which the table has a column for what was overridden
+        (tmp_path / "1").mkdir(exist_ok=True)
+        steered = {**RECORD, "overrides": ["x=\x1b[2J", "\x1b[31m=2"]}
+        (tmp_path / "1" / "job.json").write_text(json.dumps(steered))
+        (tmp_path / "1" / "results.json").write_text(json.dumps(RESULTS))
         with suppress(UserError):
             comparison.summarise(tmp_path, [], {})
         out = capsys.readouterr().out + caplog.text

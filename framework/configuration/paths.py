@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from framework.configuration.registry import GROUPS, load
 from framework.configuration.signature import parts, signature
-from framework.errors import ConfigError, did_you_mean, quoted, shown
+from framework.errors import ConfigError, did_you_mean, printable, quoted, shown
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def _typed(value: Any) -> str:
         return "{" + ",".join(f"{_typed(key)}:{_typed(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple | set):
         return "[" + ",".join(map(_typed, value)) + "]"
-    text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))
+    text = printable(str(value), kept="")
     if isinstance(value, str) and not re.fullmatch(
         r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
     ):  # no number, nor null

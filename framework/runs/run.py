@@ -20,7 +20,6 @@ from framework.errors import DataError, UserError
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, package_versions
 from framework.runs.repository import git_commit
-from framework.storage.enclosed import require_enclosed
 from framework.storage.files import unwritable, write_whole
 from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_yaml
@@ -94,7 +93,6 @@ def opened(config: Config) -> Iterator[Run]:
     Continues the run in its folder where that goes on (`goes_on`); otherwise what that run left is set aside. A rank
     other than the first writes nothing: its run is a silent one.
     """
-    require_enclosed(config.folder)
     stopper = Stopper()
     earlier, resumed = read_run_info(config.folder), goes_on(config)
     if not first_rank():

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from framework.configuration.settings import store_experiment
-from framework.errors import ConfigError, DataError, did_you_mean, quoted, shown
+from framework.errors import ConfigError, DataError, did_you_mean, printable, quoted, shown
 from framework.reports.table import (
     COST_BETTER,
     COST_COLUMNS,
@@ -274,8 +274,9 @@ def _row(job: Path) -> dict[str, Any] | None:
     results = _results(job) if record.get("status") == "completed" else {}
     if not results:
         return None
-    swept = dict(override.lstrip("+~").split("=", 1) for override in record["overrides"] if "=" in override)
-    row = {**swept, **results, "overrides": record["overrides"], "folder": str(job)}
+    overrides = [printable(override, kept="") for override in record["overrides"]]
+    swept = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
+    row = {**swept, **results, "overrides": overrides, "folder": str(job)}
     if "batch_size" in swept:
         # in results it is that at which the cost was measured, which a small test split limits
         row["batch_size"] = swept["batch_size"]
