@@ -205,18 +205,7 @@ def structured(array: Tensor, random: np.random.Generator) -> Any:
 
 def retyped(array: Tensor, random: np.random.Generator) -> Tensor:
     """The same numbers of another type."""
-    types = [
-        torch.complex64,
-        torch.complex128,
-        torch.bool,
-        torch.uint8,
-        torch.int8,
-        torch.int16,
-        torch.int32,
-        torch.int64,
-    ]
-    types += [torch.float16, torch.bfloat16, torch.float32, torch.float64]
-    return array.to(types[int(random.integers(len(types)))])
+    return array.to(TYPES[int(random.integers(len(TYPES)))])
 
 
 def reshaped(array: Tensor, random: np.random.Generator) -> Tensor:

@@ -52,6 +52,17 @@ KINDS = {
 HOMES = {"point_cloud_folder": "labelled_clouds", "registration": "bodies"}
 
 
+QUICK = (
+    "encoder.mlp.widths=[8]",
+    "trainer.max_epochs=1",
+    "batch_size=8",
+    "pictures=false",
+    "logger=none",
+    "threads=1",
+)
+"""A small training, whatever the data."""
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_model_takes_files_when_its_training_data_are_gone(
     kind: str, framework: Framework, tmp_path: Path
@@ -64,15 +75,7 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
     assert row.write is not None and row.files is not None
     said = {**row.write(home), **row.config}
     options = [f"data.{key}={str(value).replace(' ', '')}" for key, value in said.items()]
-    quick = [
-        "encoder.mlp.widths=[8]",
-        "trainer.max_epochs=1",
-        "batch_size=8",
-        "pictures=false",
-        "logger=none",
-        "threads=1",
-    ]
-    done = framework(f"data={kind}", *options, *arguments, *quick)
+    done = framework(f"data={kind}", *options, *arguments, *QUICK)
     assert done.code == 0, done.out
     shutil.rmtree(home)
     files = sorted(Path(file) for file in row.files(own))

@@ -28,7 +28,7 @@ from framework.deployment import request_bodies as bounds
 from framework.deployment.request_bounds import Bounded
 from framework.deployment.served import _load_pyfunc
 from tests.conftest import Forks, command
-from tests.test_loaded import KINDS
+from tests.test_loaded import KINDS, QUICK
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # MLflow's, about its own types
@@ -39,14 +39,6 @@ SECONDS = 6
 ROW = {"number": 3.0, "square": 9.0}
 TABULAR, IMAGES = "tabular", "images_with_angles"
 JSON, CSV = "application/json", "text/csv"
-QUICK = (
-    "encoder.mlp.widths=[8]",
-    "trainer.max_epochs=1",
-    "batch_size=8",
-    "pictures=false",
-    "logger=none",
-    "threads=1",
-)
 
 
 @dataclass
