@@ -7,8 +7,11 @@ import shlex
 import signal
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +38,21 @@ TINY = [
     "threads=1",
 ]
 """A run of 27 steps (9 an epoch) on the stranger's data, done in a second after its imports."""
+
+
+@contextmanager
+def importing_mlflow() -> Iterator[None]:
+    """Import MLflow within: without its warnings, and with the standard library's reader of metadata put back.
+
+    MLflow imports importlib_metadata, which removes `PathFinder.find_distributions` for the whole process. Other tests
+    of this process read entry points, and expect the standard library's types.
+    """
+    finders, reader = list(sys.meta_path), PathFinder.__dict__["find_distributions"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+    sys.meta_path[:] = finders
+    PathFinder.find_distributions = reader
 
 
 @dataclass

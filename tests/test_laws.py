@@ -113,3 +113,28 @@ def test_plugin_folders_explain_themselves() -> None:
             yield "conf/**/*.yaml"
 
     assert not faults(folders, wanting)
+
+
+def test_tests_import_mlflow_without_a_change_to_others() -> None:
+    """What a test file imports while it is collected changes the process in which all other tests run."""
+    files = [
+        *sorted((ROOT / "tests").rglob("*.py")),
+        *(path for path in PLUGINS if path.name.startswith("test_")),
+    ]
+
+    def unguarded(path: Path) -> Iterator[str]:
+        for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(statement, ast.With) and "importing_mlflow" in ast.unparse(statement.items[0]):
+                continue
+            if isinstance(statement, ast.Import | ast.ImportFrom | ast.With | ast.Try | ast.If):
+                names = [
+                    alias.name if isinstance(node, ast.Import) else str(node.module)
+                    for node in ast.walk(statement)
+                    if isinstance(node, ast.Import | ast.ImportFrom)
+                    for alias in node.names
+                ]
+                yield from (
+                    name for name in names if name.split(".")[0] == "mlflow" or name.endswith("mlflow_store")
+                )
+
+    assert faults(files, unguarded) == {}

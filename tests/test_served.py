@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import time
-import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,11 +26,10 @@ from PIL import Image
 from framework.deployment import request_bodies as bounds
 from framework.deployment.request_bounds import Bounded
 from framework.deployment.served import _load_pyfunc
-from tests.conftest import Forks, command
+from tests.conftest import Forks, command, importing_mlflow
 from tests.test_loaded import KINDS, QUICK
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # MLflow's, about its own types
+with importing_mlflow():
     from mlflow.pyfunc import load_model, scoring_server
 
 SECONDS = 6

@@ -11,12 +11,10 @@ import subprocess
 import sys
 import threading
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -52,22 +50,9 @@ from framework.tracking.stores import (
 )
 from framework.tracking.tracker import MlflowTracker, NoTracker
 from framework.training.checkpoint import WholeCheckpoints
+from tests.conftest import importing_mlflow
 
-
-@contextmanager
-def metadata_read_as_before() -> Iterator[None]:
-    """Undoes that importlib_metadata, which MLflow imports, takes the place of the standard library's reader.
-
-    Other tests of this process read entry points, and expect the standard library's.
-    """
-    finders, reader = list(sys.meta_path), PathFinder.__dict__["find_distributions"]
-    yield
-    sys.meta_path[:] = finders
-    PathFinder.find_distributions = reader
-
-
-with metadata_read_as_before(), warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # MLflow's, about itself
+with importing_mlflow():
     from mlflow import MlflowClient
     from mlflow.exceptions import MlflowException
     from mlflow.pyfunc import load_model
