@@ -80,6 +80,11 @@ class Model(Predictor):
                     f"{type(head).__name__} is fitted to all features at once and gives encoders no gradient, but "
                     f"{' and '.join(type(encoder).__name__ for encoder in encoders)} learn. Leave those out."
                 )
+            if head.size and math.prod(shape) != head.size:
+                raise ConfigError(
+                    f"{type(head).__name__} reads {head.size:,} numbers a sample, but gets {math.prod(shape):,}, of "
+                    f"shape {tuple(shape)}. Set its sizes to those of the data."
+                )
             self.projection: nn.Module = nn.Flatten()
         elif head.direct:
             if math.prod(shape) != head.size:

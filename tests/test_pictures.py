@@ -329,7 +329,7 @@ def curve(method: str, knob: str, points: list[tuple[float, float, float, float]
 
 
 FIRST = curve("first", "samples", [(n, 0.5 / n, 0.1 / n, 1 + 0.01 * n) for n in (1, 10, 100)])
-SECOND = curve("second", "tolerance", [(1e-3, 0.4, math.nan, 3.0), (1e-6, 0.0, 0.0, 9.0)])
+SECOND = curve("second", "tolerance", [(1e-3, 0.4, 0.01, 3.0), (1e-6, 0.0, 0.0, 9.0)])
 CURVES = [*FIRST, *SECOND, *curve("third", "members", [(4, math.inf, math.nan, 0.5)])]
 
 
@@ -460,7 +460,7 @@ def test_a_narrow_range_of_times_still_has_ticks() -> None:
 # results side by side
 
 ROWS = [
-    {"method": method, "class": name, "error": error, "error_std": 0.5, "ms": time}
+    {"method": method, "class": name, "error": error, "error_std": 0.5, "n": 20, "ms": time}
     for method, name, error, time in [
         ("a", "car", 5.0, 1.0),
         ("b", "car", 4.0, 2.0),
@@ -490,7 +490,7 @@ def test_comparison_gives_methods_colours_and_groups_markers(tmp_path: Path) -> 
         "car",
         "bus",
         "not beaten beyond noise in its class (Pareto)",
-        "noise: errors within 2 joint standard errors, run times within 5 %",
+        "front: every difference significant at 95 %, Welch's t-test; run times within 5 % count as equal",
         "finite error and run time: 1",
         "(synthetic data)",
     ):
@@ -505,6 +505,15 @@ def test_comparison_rings_the_front_of_each_group() -> None:
     assert rings == [[[1, 5], [2, 4]], [[1, 9]]]
     together = diagram(ROWS)
     assert [line.get_xydata().tolist() for line in lines_with(together, markersize=13)] == [[[1, 5], [2, 4]]]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_without_standard_errors_nothing_is_ringed_and_the_panel_says_so(known: bool) -> None:
+    rows = [row if known or place else {**row, "error_std": math.nan} for place, row in enumerate(ROWS)]
+    figure = diagram(rows)
+    assert bool(lines_with(figure, markersize=13)) is known
+    assert ("Pareto" in words(figure)) is known
+    assert ("no front: standard errors not known" in words(figure)) is not known
 
 
 def test_higher_is_better_turns_the_front_and_keeps_a_linear_axis() -> None:

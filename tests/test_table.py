@@ -5,6 +5,7 @@ import io
 import math
 import statistics
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -98,34 +99,39 @@ def test_what_is_missing_is_not_available() -> None:
 def test_the_best_of_a_column_is_bold_where_better_is_known() -> None:
     better = {"log_likelihood": "higher", "maad_deg": "lower"}
     rows = [*ROWS, {"method": "three", "log_likelihood": math.nan, "maad_deg": 20.0}]
+    rows[1] = {**rows[1], "log_likelihood_sem": 0.04}
     lines = markdown(rows, COLUMNS, better=better).splitlines()
-    assert lines[2] == "| one | 0.563 ± 0.012 | 22.8 |"
-    assert lines[3] == "| two | **1.23 ± 0.04** | not available |"
-    assert lines[4] == "| three | not available | **20.0** |"
+    assert lines[2].startswith("| one | 0.563 ± 0.012 | 22.8 |")
+    assert lines[3].startswith("| two | **1.23 ± 0.04** | not available |")
+    assert lines[4].startswith("| three | not available | 20.0 |")  # its error is not known
+    assert lines[-1].endswith("bold: best, every difference significant at 95 %, Welch's t-test")
     assert "\x1b[1m1.23 ± 0.04" in shown(results_table(rows, COLUMNS, title="", better=better), colour=True)
 
 
-def test_what_prints_alike_is_equally_good() -> None:
-    rows = [{"method": name, "error": error} for name, error in (("a", 1.2341), ("b", 1.2342), ("c", 1.3))]
-    text = markdown(rows, {"method": "method", "error": "error"}, better={"error": "lower"})
-    assert text.count("**1.23**") == 2
-    assert "**1.30**" not in text
-
-
-@pytest.mark.parametrize("suffix", ["_std", "_sem"])
-@pytest.mark.parametrize(("spreads", "bold"), [((0.1, 0.1), True), ((0.1, 0.2), False), ((0.3, 0.0), False)])
-def test_nothing_is_best_within_the_error_of_a_difference(
-    suffix: str, spreads: tuple[float, float], bold: bool
+@pytest.mark.parametrize("suffix", ["_std", "_sem", ""])
+@pytest.mark.parametrize("way", ["higher", "lower"])
+@pytest.mark.parametrize("distance", [0.0, 0.5, 30.0])
+def test_the_best_is_bold_where_it_differs_from_all_by_more_than_noise(
+    suffix: str, way: Literal["higher", "lower"], distance: float
 ) -> None:
-    first, second = spreads
+    """A real difference of many standard errors is found, one of half of one is not, and none of unknown ones."""
+    sign = 1 if way == "lower" else -1
     rows = [
-        {"method": "a", "error": 1.0, f"error{suffix}": first},
-        {"method": "b", "error": 1.2, f"error{suffix}": second},
-        {"method": "c", "error": 9.0, f"error{suffix}": 0.1},
+        {"method": name, "n": 3, "error": sign * error, **({f"error{suffix}": 0.1} if suffix else {})}
+        for name, error in (("a", 1.0), ("b", 1.0 + 0.1 * distance), ("c", 9.0))
     ]
     for turned in (rows, rows[::-1]):
-        text = markdown(turned, {"method": "method", "error": "error"}, better={"error": "lower"})
-        assert ("**" in text) == bold
+        lines = markdown(turned, {"method": "method", "error": "error"}, better={"error": way}).splitlines()
+        bold = [line[2] for line in lines if "**" in line]
+        assert bold == (["a"] if suffix and distance > 1 else [])
+
+
+def test_whole_numbers_are_exact_and_equal_ones_are_not_bold() -> None:
+    columns, better = {"method": "method", "parameters": "parameters"}, {"parameters": "lower"}
+    rows = [{"method": name, "parameters": count} for name, count in (("a", 12), ("b", 13), ("c", 14))]
+    assert markdown(rows, columns, better=better).count("**") == 2
+    rows[1] = {"method": "b", "parameters": 12}
+    assert "**" not in markdown(rows, columns, better=better)
 
 
 def test_of_one_row_nothing_is_best() -> None:

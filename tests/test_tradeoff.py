@@ -1,7 +1,7 @@
 """Error against run time along a knob: metrics, and errors of log-likelihoods, against closed forms and brute force."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from csv import DictReader
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,8 @@ from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from framework.evaluation.pareto import ERRORS_APART, TIMES_APART, front, standard_error
+from framework.evaluation.pareto import TIMES_APART, front
+from framework.evaluation.significance import Mean, least_significant, mean
 from framework.evaluation.tradeoff import Curve, Point, first_knob, owners, rows, run_times, tradeoff
 from framework.model import Model
 from framework.reports.table import csv
@@ -288,6 +289,11 @@ def test_every_value_takes_its_turn() -> None:
     assert called == [1, 1, 5, 5] * (1 + 7)
 
 
+def known(errors: Sequence[float], noise: Sequence[float]) -> list[Mean]:
+    """Means of many samples."""
+    return [Mean(error, its, math.inf, "samples") for error, its in zip(errors, noise, strict=True)]
+
+
 some = st.sampled_from([0.0, 1.0, 1.5, 2.0, 3.0, math.inf, math.nan]) | st.floats(0, 10)
 
 
@@ -312,12 +318,14 @@ def test_beyond_noise_no_two_hide_each_other_and_each_hidden_one_is_beaten(
     points: list[tuple[float, float, float]], times_apart: float
 ) -> None:
     errors, times, noise = (list(column) for column in zip(*points, strict=True)) if points else ([], [], [])
-    kept = front(errors, times, noise, times_apart)
+    means = known(errors, noise)
+    kept = front(means, times, times_apart)
+    apart = least_significant(means)
 
     def beats(one: int, other: int) -> bool:
         """Written out: better in one beyond noise, and not worse in the other."""
-        apart = ERRORS_APART * math.sqrt(noise[one] ** 2 + noise[other] ** 2)
-        less, more = errors[one] + apart < errors[other], errors[other] + apart < errors[one]
+        least = apart[one, other]
+        less, more = errors[one] + least < errors[other], errors[other] + least < errors[one]
         faster = times[one] * (1 + times_apart) < times[other]
         slower = times[other] * (1 + times_apart) < times[one]
         return (less and not slower) or (faster and not more)
@@ -330,7 +338,7 @@ def test_beyond_noise_no_two_hide_each_other_and_each_hidden_one_is_beaten(
         beating = [one for one in inside if beats(one, place)]
         assert not (set(beating) & {one for one in finite if beats(place, one)})  # never both
         assert bool(beating) is (place not in inside)
-    again = front(errors[::-1], times[::-1], noise[::-1], times_apart)
+    again = front(means[::-1], times[::-1], times_apart)
     assert again[::-1] == kept  # whatever the order
 
 
@@ -342,27 +350,19 @@ def test_beyond_noise_no_two_hide_each_other_and_each_hidden_one_is_beaten(
         ([(0.10, 0.02, 1.81), (0.12, 0.03, 1.78)], "00"),  # alike: neither hides the other
         ([(5.3, 1.0, 1.65), (0.12, 0.03, 1.69)], "10"),  # 2 % of time is noise, the error is not
         ([(1.0, 0.1, 1.0), (0.8, 0.1, 2.0), (0.6, 0.1, 3.0)], "010"),  # only a beaten one beats the last
-        ([(1.0, math.nan, 1.0), (0.99, math.nan, 2.0)], "00"),  # errors not known
+        ([(1.0, math.nan, 1.0), (0.99, math.nan, 2.0)], "11"),  # errors not known: no front
+        ([(1.0, 0.1, 1.0), (0.5, 0.1, 2.0), (9.0, math.nan, 9.0)], "111"),
     ],
 )
 def test_rings_stand_beyond_noise(points: list[tuple[float, float, float]], wanted: str) -> None:
     """`wanted`: 1 where a point is hidden."""
     errors, noise, times = zip(*points, strict=True)
-    assert front(errors, times, noise, TIMES_APART) == [hidden == "0" for hidden in wanted]
-
-
-def test_the_standard_error_of_a_mean() -> None:
-    assert standard_error({"x_sem": 0.5, "x_std": 9.0}, "x", 4) == 0.5
-    assert standard_error({"x_std": 3.0}, "x", 9) == 1.0
-    assert math.isnan(standard_error({"x_std": 3.0}, "x", None))
-    assert math.isnan(standard_error({"x": 3.0}, "x", 9))
+    assert front(known(errors, noise), times, TIMES_APART) == [hidden == "0" for hidden in wanted]
 
 
 def drawn_from(*points: tuple[int, float, float]) -> Curve:
-    made = [
-        Point(value, {"nll": nll, "nll_std": math.nan, "brier": 1.0}, time) for value, nll, time in points
-    ]
-    return Curve("members", made, None, 1, 60, 20, "cpu", 1)
+    made = [Point(value, {"nll": nll, "nll_std": 1e-9, "brier": 1.0}, time) for value, nll, time in points]
+    return Curve("members", made, None, 2, 60, 20, "cpu", 1)
 
 
 def test_rows_say_which_points_no_other_beats():
@@ -393,8 +393,8 @@ def test_the_file_holds_every_number_under_a_key_with_its_unit(
         assert (line["synthetic"], line["samples"], line["batch_size"]) == ("true", "60", "25")
         assert (line["repeats"], line["reference_value"]) == ("6", "2000")
     times = [point.milliseconds for point in curves["toy"].points]
-    noise = [standard_error(point.numbers, "error_nats", 6) for point in curves["toy"].points]
-    best = front(numbers(curves["toy"], "error_nats"), times, noise, TIMES_APART)
+    means = [mean({**point.numbers, "repeats": 6}, "error_nats", 6) for point in curves["toy"].points]
+    best = front(means, times, TIMES_APART)
     assert [line["error_nats_pareto"] for line in found] == [str(one).lower() for one in best]
 
 

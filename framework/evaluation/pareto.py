@@ -1,41 +1,45 @@
 """The Pareto front of error and run time, beyond noise."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-ERRORS_APART, TIMES_APART = 2.0, 0.05
-"""Two errors differ by more than so many joint standard errors, two run times by more than this share: else it may be
-noise. Errors on the same samples are positively correlated, and so differ more surely than the joint error says."""
-NOISE = (
-    f"noise: errors within {ERRORS_APART:g} joint standard errors, run times within {100 * TIMES_APART:g} %"
-)
-"""The rule, for a picture."""
+from framework.evaluation.significance import RULE, Mean, least_significant
+
+TIMES_APART = 0.05
+"""Share by which two run times must differ: less may be noise."""
+NOISE = f"front: {RULE}; run times within {100 * TIMES_APART:g} % count as equal"
+"""The rule, for a figure."""
 
 
 def front(
-    errors: Sequence[float],
-    times: Sequence[float],
-    standard_errors: Sequence[float] | None = None,
-    times_apart: float = 0.0,
+    errors: Sequence[float] | Sequence[Mean], times: Sequence[float], times_apart: float = 0.0
 ) -> list[bool]:
-    """Which points are on the front; without standard errors those that no other has less error or time than, and no
-    more of the other.
+    """Return which points are on the front of low error and short time.
 
-    One point beats another where it is better in one beyond noise, and in the other not worse beyond noise. The front
-    is the one set of which no point beats another and each point outside is beaten by one inside (the kernel): of two
-    that are alike both are on it, and what only a beaten point beats is on it too. Where unlike errors make points beat
-    each other in a ring, the fastest of them is on it. What is not finite is not.
+    One point beats another where it is better in one of the two beyond noise, and in the other not worse beyond noise.
+    The front is the one set of which no point beats another and each point outside is beaten by one inside (the
+    kernel): of two that are alike both are on it, and what only a beaten point beats is on it too. Where unlike errors
+    make points beat each other in a ring, the fastest of them is on it. What is not finite is not.
+
+    Errors on the same samples are positively correlated, and so differ more surely than the test says.
 
     Args:
-        standard_errors: of the errors; NaN, not known, is taken for 0.
-        times_apart: a share of the shorter time; less is noise.
+        errors: lower is better; plain numbers are exact.
+        times: run times.
+        times_apart: share of the shorter time; a smaller difference is noise.
+
+    Returns:
+        One truth value a point; all False where the standard error of a finite point is not known, since then nobody
+        knows what beats what.
     """
-    error, time = np.array(errors, np.float64), np.array(times, np.float64)
-    noise = np.nan_to_num(np.zeros_like(error) if standard_errors is None else np.array(standard_errors))
-    apart = ERRORS_APART * np.hypot(noise[:, None], noise)
+    means = [one if isinstance(one, Mean) else Mean(float(one), 0.0) for one in errors]
+    error, time = np.array([one.value for one in means], np.float64), np.array(times, np.float64)
     left = np.isfinite(error) & np.isfinite(time)
+    apart = least_significant(means)
+    np.fill_diagonal(apart, 0.0)  # a point alone is on the front, whatever its error
+    if np.isnan(apart[np.ix_(left, left)]).any():
+        return [False] * len(means)
     with np.errstate(invalid="ignore"):  # infinite ones are compared and then left out
         less, faster = (error[:, None] + apart < error), (time[:, None] * (1 + times_apart) < time)
     beats = (less & ~faster.T) | (faster & ~less.T)
@@ -47,13 +51,3 @@ def front(
         kept |= free
         left &= ~free & ~beats[free].any(0)
     return kept.tolist()
-
-
-def standard_error(numbers: Mapping[str, object], key: str, runs: object) -> float:
-    """Of the mean `key`: its "<key>_sem", or of "<key>_std" over so many runs; NaN where neither is known."""
-    own, spread = numbers.get(f"{key}_sem"), numbers.get(f"{key}_std")
-    if isinstance(own, int | float) and math.isfinite(own):
-        return float(own)
-    if isinstance(spread, int | float) and isinstance(runs, int) and runs > 0:
-        return spread / math.sqrt(runs)
-    return math.nan

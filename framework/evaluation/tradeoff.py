@@ -4,7 +4,7 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from time import perf_counter
 from typing import Literal
@@ -17,8 +17,9 @@ from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
 from framework.evaluation.cost import device_name, seconds
-from framework.evaluation.pareto import TIMES_APART, front, standard_error
+from framework.evaluation.pareto import TIMES_APART, front
 from framework.evaluation.reference import COLUMNS, LogProbs, Reference, errors, reference_value
+from framework.evaluation.significance import mean
 from framework.evaluation.splits import evaluate
 from framework.metric import Metric
 from framework.model import Model, Predictor
@@ -224,14 +225,14 @@ def rows(
     told = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
     found: list[dict[str, object]] = []
     for method, curve in curves.items():
-        times = [point.milliseconds for point in curve.points]
+        times, repeats = [point.milliseconds for point in curve.points], curve.repeats
         best = {}
         for key, way in better.items():
             sign = 1 if way == "lower" else -1
-            found_errors = [sign * point.numbers[key] for point in curve.points]
-            noise = [standard_error(point.numbers, key, curve.repeats) for point in curve.points]
-            best[f"{key}_pareto"] = front(found_errors, times, noise, TIMES_APART)
-        circumstances: dict[str, object] = {"repeats": curve.repeats}
+            means = [mean({**point.numbers, "repeats": repeats}, key, repeats) for point in curve.points]
+            signed = [replace(one, value=sign * one.value) for one in means]
+            best[f"{key}_pareto"] = front(signed, times, TIMES_APART)
+        circumstances: dict[str, object] = {"repeats": repeats}
         if curve.reference is not None:
             circumstances["reference_value"] = curve.reference.value
             circumstances["reference_log_likelihood_nats"] = curve.reference.mean

@@ -47,7 +47,7 @@ def report_test(run: Run, session: Session) -> None:
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
     results = _results(run, session, found, spent, columns, better)
-    results["synthetic"] = synthetic
+    results |= {"synthetic": synthetic, "test_samples": len(loader.dataset)}  # type: ignore[arg-type]
     path = run.folder / "results.json"
     write_whole(path, json.dumps(results, indent=1).encode())
     numbers = {key: float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)}
@@ -55,14 +55,12 @@ def report_test(run: Run, session: Session) -> None:
     for part, values in {"test": found.total, **groups, "cost": numbers}.items():
         run.tracker.log_metrics({f"{part}/{key}": value for key, value in values.items()}, 0, 0)
     run.tracker.log_artifact(path)
-    rows = [
+    rows = [  # groups of test samples are no rivals: nothing is bold
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
     ]
     title = f"{session.title}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
-    session.console.print(
-        results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title, better=better)
-    )
+    session.console.print(results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title))
     if settings.pictures:
         _pictures(run, session, found, synthetic)
     _next_steps(run, spent, session.console)

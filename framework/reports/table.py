@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from framework.errors import ConfigError
+from framework.evaluation.significance import RULE, mean, significantly_best
 
 Row = Mapping[str, object]
 """Names and numbers of one result. "<key>_std" (standard deviation over runs, see `aggregate`) or
@@ -22,7 +23,8 @@ Row = Mapping[str, object]
 were generated."""
 
 Better = Mapping[str, Literal["higher", "lower"]]
-"""Which way a column is better; its best value stands in bold where no other is within their ± together."""
+"""Which way a column is better. Its best value stands in bold where it differs significantly from every other one
+(`framework.evaluation.significance`), and so never where a ± is not known."""
 
 COST_COLUMNS = {
     "milliseconds_per_sample": "ms / sample",
@@ -59,7 +61,7 @@ def results_table(
     turned = [list(line) for line in zip(*lines, strict=True)]
     if _width(lines) > WIDTH and _width(turned) < _width(lines):
         lines = turned
-    table = Table(title=Text(title), caption=_caption(rows, columns) or None, box=box.SIMPLE_HEAD)
+    table = Table(title=Text(title), caption=_caption(rows, columns, lines) or None, box=box.SIMPLE_HEAD)
     for index, head in enumerate(lines[0]):
         heading = Text(_wrapped(head.plain, max((len(cell) for cell in _column(lines, index)), default=0)))
         table.add_column(heading, justify="left" if index == 0 else "right", overflow="fold")
@@ -74,7 +76,7 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
     written = [[_escaped(cell) for cell in line] for line in lines]
     rule = ["---", *["---:"] * (len(written[0]) - 1)]
     text = "".join(f"| {' | '.join(line)} |\n" for line in [written[0], rule, *written[1:]])
-    caption = _caption(rows, columns)
+    caption = _caption(rows, columns, lines)
     return f"{text}\n{caption}\n" if caption else text
 
 
@@ -190,16 +192,10 @@ def _lines(
         }
         if key not in better or len(values) < 2:
             continue
-        best = {"higher": max, "lower": min}[better[key]](values, key=values.__getitem__)
-        # what prints alike is equally good
-        alike = [place for place in values if lines[place][index].plain == lines[best][index].plain]
-        spreads = [_spread(row, key) or 0.0 for row in rows]
-        if all(
-            abs(values[best] - value) > math.hypot(spreads[best], spreads[place])
-            for place, value in values.items()
-            if place not in alike
-        ):
-            for place in alike:
+        places = list(values)
+        means = [mean(rows[place], key, rows[place].get("n")) for place in places]
+        for place, best in zip(places, significantly_best(means, better[key]), strict=True):
+            if best:
                 lines[place][index].stylize("bold")
     heads = [Text(head) for head in columns.values()]
     if origin:
@@ -249,13 +245,17 @@ def _synthetic(row: Row) -> bool:
     return bool(row.get("synthetic", False))
 
 
-def _caption(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    found = [
+def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Sequence[Text]]) -> str:
+    """Say what ± and bold mean, where the table has them."""
+    spreads = [
         meaning
         for suffix, meaning in SPREADS.items()
         if any(_number(row.get(key + suffix)) is not None for row in rows for key in columns)
     ]
-    return f"± {'; of a single run '.join(found)}" if found else ""
+    bold = any(cell.spans for line in lines[1:] for cell in line)
+    return "; ".join(
+        [f"± {'; of a single run '.join(spreads)}"] * bool(spreads) + [f"bold: best, {RULE}"] * bold
+    )
 
 
 def _width(lines: Sequence[Sequence[Text]]) -> int:

@@ -3,7 +3,7 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from framework.evaluation.pareto import NOISE, TIMES_APART, front, standard_error
+from framework.evaluation.pareto import NOISE, TIMES_APART, front
+from framework.evaluation.significance import mean
 from framework.figures.style import COLOURS, GREY, MARKERS, titled_figure
 from framework.reports.table import SPREADS, Better, Row
 
@@ -23,6 +24,8 @@ SIDES = ((9, 6), (9, -6), (-9, 6), (-9, -6), (0, 13), (0, -13), (12, 15), (12, -
 
 Style = dict[str, Any]
 PARETO: Style = {"ls": "", "marker": "o", "mfc": "none", "markersize": 13, "mec": "black"}
+FRONT = "front"
+"""Mark of the lines that ring the points of a front."""
 SHADE = "0.87"
 ACROSS = 3
 """Panels beside each other, at most."""
@@ -63,7 +66,8 @@ def error_against_run_time(
 
     Rows of a method that have a "knob" are joined in their order, and the knob's "value" stands beside each point.
     Bars are a row's "<key>_std" or "<key>_sem". Rings mark the front of `framework.evaluation.pareto`, beyond noise, of
-    each group: errors on different groups do not compare. On a logarithmic axis 0 sits on the lower edge and says so.
+    each group: errors on different groups do not compare. A panel without standard errors has no rings and says so. On
+    a logarithmic axis 0 sits on the lower edge and says so.
 
     Args:
         rows: as for `framework.reports.table`, each with its "method".
@@ -163,13 +167,16 @@ def _panel(
     for kind in dict.fromkeys(one.group for one in series):
         some = [place for place, one in enumerate(series) if one.group == kind]
         own = np.concatenate([places[place] for place in some])
-        noise = [
-            standard_error(row, key, row.get("n", row.get("repeats")))
-            for place in some
-            for row in kept[place]
+        means = [mean(row, key, row.get("n", row.get("repeats"))) for place in some for row in kept[place]]
+        signed = [
+            replace(one, value=height if lower else -height)
+            for one, height in zip(means, own[:, 1], strict=True)
         ]
-        best = front((own[:, 1] * (1 if lower else -1)).tolist(), own[:, 0].tolist(), noise, TIMES_APART)
-        axes.plot(*own[best].T, **PARETO, clip_on=False)
+        best = front(signed, own[:, 0].tolist(), TIMES_APART)
+        if any(best):
+            axes.plot(*own[best].T, **PARETO, clip_on=False, gid=FRONT)
+        elif len(own) > 1:
+            axes.set_title("no front: standard errors not known", loc="left", fontsize=8, color=GREY)
     _plain_ticks(axes.xaxis)
     if axes.get_yscale() == "log":
         _plain_ticks(axes.yaxis)
@@ -187,17 +194,18 @@ def _legends(
         marker = one.style["marker"] if group is None else "o"
         label = f"{one.method} ({knobs})" if knobs else one.method
         handles.insert(0, Line2D([], [], **{**one.style, "marker": marker}, label=label))
-    beaten = "not beaten beyond noise" + ("" if group is None else f" in its {group}")
-    handles.append(Line2D([], [], **PARETO, label=f"{beaten} (Pareto)"))
+    if ringed := any(line.get_gid() == FRONT for axes in figure.axes for line in axes.lines):
+        beaten = "not beaten beyond noise" + ("" if group is None else f" in its {group}")
+        handles.append(Line2D([], [], **PARETO, label=f"{beaten} (Pareto)"))
     handles += [Patch(color=SHADE, label=meaning) for meaning in shaded]
-    longest = max(len(str(handle.get_label())) for handle in handles)
+    longest = max((len(str(handle.get_label())) for handle in handles), default=0)
     columns = max(1, int(figure.get_figwidth() / (0.7 + 0.08 * longest)))  # inches
     style: Style = {"fontsize": 9, "frameon": False}
     legend = figure.legend(
         handles=handles,
         loc="outside lower center",
         ncols=columns,
-        title="; ".join(filter(None, [NOISE, note])),
+        title="; ".join(filter(None, [NOISE if ringed else "", note])),
         **style,
     )
     legend.get_title().set(fontsize=7, color=GREY, parse_math=False)

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals, JointNormal
-from framework.errors import ConfigError
+from framework.errors import ConfigError, NonFiniteAnswer
 from framework.heads.parameters import require_finite
 from framework.storage.weights import require_state
 from framework.target import Target
@@ -165,14 +165,35 @@ class BallisticHead(DensityHead, Fitted):
         """Mean of the future (flight, number), and a factor F of its covariance F Fᵀ (flight, number, 9)."""
         places, slopes = flown_with_slopes(estimate.state, self._whole(seen), self.constants)
         mean = places[:, -self.future :].flatten(1)
+        self._require_course(mean, estimate)
         return mean, slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)
+
+    def _require_course(self, places: Tensor, estimate: Estimate) -> None:
+        """Refuse flights without a finite course: constants of physics far from any ball's lead there.
+
+        Raises:
+            NonFiniteAnswer: names the first such row.
+        """
+        finite = estimate.covariance.flatten(1).isfinite().all(-1) & places.flatten(1).isfinite().all(-1)
+        if not finite.all():
+            raise NonFiniteAnswer(
+                f"the flight in batch row {int((~finite).nonzero()[0])} has no finite course with step={self.step:g} "
+                f"and {self.constants}. Set density_head.step and density_head.constants to those of the recordings."
+            )
 
     def _linearised(self, seen: Seen, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
         mean, factor = self._carried(seen, estimate)
         spread = self.spread.cpu()
         factor = spread.unsqueeze(-1) * factor
         covariance = factor @ factor.mT + torch.diag((float(self.noise) * spread).square())
-        scale = torch.linalg.cholesky(covariance)
+        scale, failed = torch.linalg.cholesky_ex(covariance)
+        if failed.any():
+            deviation, noise = float(factor.square().sum(-1).amax().sqrt()), float(self.noise)
+            raise NonFiniteAnswer(
+                f"the covariance of the flight in batch row {int(failed.nonzero()[0])} is not positive definite: it "
+                f"has deviations of {deviation:.2g} m beside a noise of {noise:.2g} m. No training ends with such "
+                "constants: train the head again, or restore its checkpoint."
+            )
         shape = raw.shape[:-1]
         joint = scale.reshape(*shape, *scale.shape[-2:]).to(raw)
         return JointNormal(mean.reshape(*shape, mean.shape[-1]).to(raw) + zero, joint)
@@ -182,10 +203,12 @@ class BallisticHead(DensityHead, Fitted):
         # the same points whenever asked: the density is one, and no estimate of one
         points = torch.quasirandom.SobolEngine(9, scramble=True, seed=0).draw(count, dtype=torch.float64)
         noise = torch.special.ndtri(points.clamp(1e-9, 1 - 1e-9))
+        self._require_course(estimate.state, estimate)
         states = estimate.state.unsqueeze(1) + noise @ root(estimate.covariance).mT
         times = self._whole(seen).repeat_interleave(count, 0)
         places = flown(states.reshape(-1, 9), times, self.constants)[:, -self.future :, :3]
         places = places.reshape(flights, count, 3 * self.future)
+        self._require_course(places, estimate)
         middle = places.mean(1, keepdim=True)
         places = middle + self.spread.cpu() * (places - middle)
         shape = (*raw.shape[:-1], count)

@@ -1,8 +1,9 @@
 """Flights from files to windows, states from windows, and what heads say of them."""
 
 import os
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ import torch
 from scipy.optimize import least_squares
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, NonFiniteAnswer
+from framework.model import Model
 from framework.target import Target
+from plugins.data.table_tennis.ballistic import BallisticHead
 from plugins.data.table_tennis.estimation import cauchy, estimated, seen_of
 from plugins.data.table_tennis.flight_error import crossing, from_start, landings, last_seen
 from plugins.data.table_tennis.flying import flown
@@ -19,7 +22,7 @@ from plugins.data.table_tennis.identification import FITTED, HIGH, LOW
 from plugins.data.table_tennis.parabolas_compiled import parabolas
 from plugins.data.table_tennis.physics import Constants
 from plugins.data.table_tennis.recordings import Flight
-from plugins.data.table_tennis.rows import table, write_csv
+from plugins.data.table_tennis.rows import FLIGHT, table, thrown, write_csv
 from plugins.data.table_tennis.test_physics import START
 from plugins.data.table_tennis.windows import PARTS, Grid, believed, prefix, windows
 
@@ -267,6 +270,37 @@ def test_constants_are_found_and_of_nonsense_stay_within_their_bounds(nonsense: 
             assert getattr(found, name) == pytest.approx(getattr(Constants(), name), abs=near), name
     if not nonsense:
         assert head.noise.item() == pytest.approx(SIGMA, rel=0.1)
+
+
+@pytest.mark.parametrize("density", ["linearised", "sampled"])
+@pytest.mark.parametrize("value", [1e-30, 1e3, 1e30])
+@pytest.mark.parametrize("name", ["step", *(field.name for field in fields(Constants))])
+def test_physics_far_from_any_ball_give_a_density_or_a_sentence(
+    name: str, value: float, density: Literal["linearised", "sampled"]
+) -> None:
+    step, constants = (value, Constants()) if name == "step" else (0.016, Constants(**{name: value}))
+    head = BallisticHead(
+        FLIGHT,
+        observed=6,
+        step=step,
+        density=density,
+        samples=3,
+        steps=5,
+        identify=False,
+        constants=constants,
+    )
+    try:
+        log_prob = head(thrown(2)).log_prob(torch.zeros(2, 6))
+    except NonFiniteAnswer as error:
+        assert "in batch row 0" in str(error)
+    else:
+        assert log_prob.isfinite().all()
+
+
+def test_a_window_of_another_length_than_the_head_reads_is_refused() -> None:
+    head = BallisticHead(FLIGHT, observed=7, constants=Constants())
+    with pytest.raises(ConfigError, match="BallisticHead reads 35 numbers a sample, but gets 30"):
+        Model([], head, (30,))
 
 
 def test_parabolas_are_those_of_weighted_least_squares() -> None:
