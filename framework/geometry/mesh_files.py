@@ -1,12 +1,12 @@
 """Parses mesh and cloud files into arrays, one function a format; what a file does not hold is never made up.
 
-Every parser takes the bytes of a file and raises a ValueError that says what came and what was wanted; the caller,
-`geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, line ends may be those of any
-system, polygons are cut into fans of triangles (right where they are convex).
+Every parser takes the bytes of a file and raises a ValueError that says what came, in which line, and what was wanted;
+the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, line ends may be those
+of any system, polygons are cut into fans of triangles (right where they are convex).
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from framework.errors import shown
-from framework.storage import arrays
+from framework.storage import arrays, text
 from framework.storage.limits import MOST_ANNOUNCED as MOST
 from framework.storage.limits import MOST_COLUMNS, MOST_NUMBERS
 from framework.storage.reading import require_numbers
@@ -41,59 +41,121 @@ def column_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(OTHER_NAMES.get(name, name) for name in small)
 
 
-def text_lines(content: bytes, comment: bytes = b"#", names: Sequence[bytes] = ()) -> list[bytes]:
-    """The lines that are neither blank nor a comment, without their comments.
+Place = Callable[[int], int]
+"""The number in the file, from 1, of one of some lines, from 0; called where something is wrong."""
+
+
+def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[bytes] = ()) -> list[bytes]:
+    """The lines that are neither blank nor a comment, without their comments and without a byte-order mark.
 
     Args:
-        comment: what begins a comment, anywhere in a line.
+        comment: what begins a comment, but not within a number: 1.#INF is one. None: nothing does.
         names: first words of lines whose rest is a name, which may hold what begins a comment elsewhere.
+
+    Raises:
+        ValueError: it is text in UTF-16.
     """
-    plain = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    if comment in plain:
-        cut = re.escape(comment) + rb"[^\n]*"
+    return [line for line in _lines(content, comment, names) if line and not line.isspace()]
+
+
+def placed(
+    content: bytes,
+    comment: bytes | None = b"#",
+    names: Sequence[bytes] = (),
+    key: bytes = b"",
+    first: int = 0,
+) -> Place:
+    """Where the lines that `text_lines` finds stand in the file, from number `first` on.
+
+    Args:
+        key: counts only lines with this first word.
+    """
+
+    def place(line: int) -> int:
+        kept = [
+            number
+            for number, words in enumerate(map(bytes.split, _lines(content, comment, names)), 1)
+            if words and (not key or words[0] == key)
+        ]
+        return kept[first + line]
+
+    return place
+
+
+def _lines(content: bytes, comment: bytes | None, names: Sequence[bytes]) -> list[bytes]:
+    content = text.plain(content).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if comment is not None and comment in content:
+        cut = rb"(?:(?<![\d.])%b|%b(?!\w))[^\n]*" % (2 * (re.escape(comment),))
         if names:  # a whole line with a name is found first, and stays
             cut = rb"^([ \t]*(?:" + b"|".join(map(re.escape, names)) + rb")[ \t][^\n]*)|" + cut
-        plain = re.sub(cut, rb"\1" if names else b"", plain, flags=re.MULTILINE)
-    return [line for line in plain.split(b"\n") if line and not line.isspace()]
+        content = re.sub(cut, rb"\1" if names else b"", content, flags=re.MULTILINE)
+    return content.split(b"\n")
 
 
-def numbers(lines: Sequence[bytes], dtype: type = np.float64) -> NDArray:
-    """All numbers of some lines, in a row."""
-    text = b" ".join(lines).strip()  # NumPy reads a number out of blanks
+def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | None = None) -> NDArray:
+    """All numbers of some lines, in a row.
+
+    Raises:
+        ValueError: a word is none; names the line.
+    """
+    joined = b" ".join(lines).strip()  # NumPy reads a number out of blanks
     try:
-        return np.fromstring(text, dtype=dtype, sep=" ") if text else np.empty(0, dtype)
+        return np.fromstring(joined, dtype=dtype, sep=" ") if joined else np.empty(0, dtype)
     except ValueError:
-        kind = "a whole number" if dtype is np.int64 else "a number"
-        for line in lines:
+        found: list[float] = []
+        for number, line in enumerate(lines):
             for word in line.split():
-                try:
-                    np.fromstring(word, dtype=dtype, sep=" ")
-                except ValueError:
-                    raise ValueError(
-                        f"wanted {kind}, got {_shown(word)} in the line {_shown(line)}"
-                    ) from None
-        raise
+                value = None if dtype is np.int64 else text.value(word.decode("utf-8", "replace"))
+                if value is None:
+                    value = _whole(word) if dtype is np.int64 else None
+                if value is None:
+                    raise ValueError(_at(number, place) + _no_number(word, dtype, line)) from None
+                found.append(value)
+        return np.array(found, dtype)
 
 
-def rows(lines: Sequence[bytes], what: str, width: int | None = None) -> Float[np.ndarray, "rows width"]:
+def _whole(word: bytes) -> int | None:
+    try:
+        return int(np.fromstring(word, dtype=np.int64, sep=" ")[0])
+    except ValueError:
+        return None
+
+
+def _no_number(word: bytes, dtype: type, line: bytes) -> str:
+    where = f" in the line {_shown(line)}"
+    if dtype is np.int64:
+        return f"wanted a whole number, got {_shown(word)}{where}"
+    return text.no_number(word[:60].decode("utf-8", "replace"), where)
+
+
+def _at(number: int, place: Place | None) -> str:
+    """The number of a line, before a message about it."""
+    return "" if place is None else f"line {place(number)}: "
+
+
+def rows(
+    lines: Sequence[bytes], what: str, width: int | None = None, place: Place | None = None
+) -> Float[np.ndarray, "rows width"]:
     """Lines of equally many numbers; `width` None: as many as the first has.
 
     Raises:
-        ValueError: a line has another number of them; names it.
+        ValueError: a line has another number of them, or a word that is none; names it.
     """
     wanted = len(lines[0].split()) if width is None and lines else width or 0
-    values = numbers(lines)
+    values = numbers(lines, place=place)
     if len(values) != wanted * len(lines) or any(len(line.split()) != wanted for line in lines):
-        line = next(line for line in lines if len(line.split()) != wanted)
-        raise ValueError(f"wanted {wanted} numbers for each {what}, got the line {_shown(line)}")
+        number, line = next((n, line) for n, line in enumerate(lines) if len(line.split()) != wanted)
+        raise ValueError(
+            f"{_at(number, place)}wanted {wanted} numbers for each {what}, got the line {_shown(line)}"
+        )
     return values.reshape(len(lines), wanted)
 
 
-def polygons(lines: Sequence[bytes]) -> Int[np.ndarray, "faces 3"]:
+def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarray, "faces 3"]:
     """Faces written as their number of corners, the corners, and perhaps more (colours), which is left out."""
     if not lines:
         return np.empty((0, 3), np.int64)
-    corners = int(numbers(lines[0].split()[:1], np.int64)[0])
+    corners = int(numbers(lines[0].split()[:1], np.int64, place)[0])
     try:
         flat = numbers(lines, np.int64)
     except ValueError:  # colours, or no number at all: line by line below
@@ -103,14 +165,15 @@ def polygons(lines: Sequence[bytes]) -> Int[np.ndarray, "faces 3"]:
         counts = np.full(len(lines), corners)
         return fans(counts, flat.reshape(-1, corners + 1)[:, 1:].ravel())
     counts, found = [], []
-    for line in lines:
+    for number, line in enumerate(lines):
         words = line.split()
-        count = int(numbers(words[:1], np.int64)[0])
+        where = None if place is None else lambda _, number=number: place(number)
+        count = int(numbers(words[:1], np.int64, where)[0])
         if len(words) <= count:
-            raise ValueError(f"wanted {count} corners, got the line {_shown(line)}")
+            raise ValueError(f"{_at(number, place)}wanted {count} corners, got the line {_shown(line)}")
         counts.append(count)
-        found += words[1 : count + 1]
-    return fans(np.array(counts), numbers(found, np.int64))
+        found.append(b" ".join(words[1 : count + 1]))
+    return fans(np.array(counts), numbers(found, np.int64, place))
 
 
 def fans(
@@ -144,7 +207,8 @@ def off(content: bytes) -> Parsed:
             f"wanted OFF in its first line, got {_shown(lines[0])}; save variants with colours or normals as PLY"
         )
     lines = [first, *lines[1:]] if first.strip() else lines[1:]
-    counts = numbers(lines[0].split(), np.int64) if lines else np.empty(0, np.int64)
+    skipped = 0 if first.strip() else 1
+    counts = numbers(lines[:1], np.int64, placed(content, first=skipped)) if lines else np.empty(0, np.int64)
     if len(counts) not in (2, 3) or (counts < 0).any() or (counts > MOST).any():
         shown = _shown(lines[0]) if lines else "nothing"
         raise ValueError(f"wanted the numbers of vertices, faces and edges, got {shown}")
@@ -155,12 +219,32 @@ def off(content: bytes) -> Parsed:
             f"its header announces {vertices} vertices and {faces} faces, but only {len(body)} lines follow; it is cut "
             "short"
         )
-    return Parsed(rows(body[:vertices], "vertex", 3), polygons(body[vertices : vertices + faces]))
+    start = 1 + skipped
+    return Parsed(
+        rows(body[:vertices], "vertex", 3, placed(content, first=start)),
+        polygons(body[vertices : vertices + faces], placed(content, first=start + vertices)),
+    )
+
+
+def continued(content: bytes) -> bytes:
+    """An OBJ file in which no line goes on in the next, with as many lines as before."""
+    if b"\\" not in content:
+        return content
+    lines: list[bytes] = []
+    begun: list[bytes] = []
+    for line in content.split(b"\n"):
+        goes_on = re.search(rb"\\[ \t]*\r?\Z", line)
+        if goes_on:
+            begun.append(line[: goes_on.start()])
+        else:
+            lines += [b" ".join([*begun, line]), *[b""] * len(begun)]
+            begun = []
+    return b"\n".join([*lines, b" ".join(begun)] if begun else lines)
 
 
 def obj(content: bytes) -> Parsed:
     """Wavefront OBJ: vertices (with colours behind the coordinates, where all have them) and faces of all objects."""
-    joined = re.sub(rb"\\[ \t]*\r?\n", b" ", content)  # a line that goes on
+    joined = continued(content)
     points, faces, before = [], [], []
     for line in text_lines(joined):
         key, *rest = line.split(None, 1)
@@ -169,7 +253,7 @@ def obj(content: bytes) -> Parsed:
         elif key == b"f":
             faces += rest or [b""]
             before.append(len(points))
-    values = rows(points, "vertex")
+    values = rows(points, "vertex", place=placed(joined, key=b"v"))
     if values.size and values.shape[1] not in (3, 4, 6, 7):
         raise ValueError(f"wanted 3 coordinates, and perhaps 3 colours, got the line v {_shown(points[0])}")
     words = [[word.partition(b"/")[0] for word in line.split()] for line in faces]
@@ -178,7 +262,7 @@ def obj(content: bytes) -> Parsed:
         raise ValueError(
             f"wanted a face of at least 3 corners, got the line f {_shown(faces[int(counts.argmin())])}"
         )
-    corners = numbers([word for line in words for word in line], np.int64)
+    corners = numbers([b" ".join(line) for line in words], np.int64, placed(joined, key=b"f"))
     if (corners == 0).any():
         raise ValueError("a face names vertex 0; wanted numbers from 1, or from -1 backwards")
     corners = np.where(corners > 0, corners - 1, corners + np.repeat(np.array(before, np.int64), counts))
@@ -193,9 +277,10 @@ def stl(content: bytes) -> Parsed:
     if len(content) == 84 + 50 * promised:
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
         corners = np.frombuffer(content, record, offset=84)["corners"].astype(np.float64).reshape(-1, 3)
-    elif content.lstrip()[:5].lower() == b"solid" and b"\0" not in content:
+    elif text.plain(content).lstrip()[:5].lower() == b"solid" and b"\0" not in content:
         lines = [line.split() for line in text_lines(content, b"//")]
-        corners = rows([b" ".join(line[1:]) for line in lines if line[0] == b"vertex"], "vertex", 3)
+        place = placed(content, b"//", key=b"vertex")
+        corners = rows([b" ".join(line[1:]) for line in lines if line[0] == b"vertex"], "vertex", 3, place)
         opened = sum(line[0] == b"facet" for line in lines)
         ended = sum(line[0] == b"endfacet" for line in lines)
         solids = [line[0] for line in lines if line[0] in (b"solid", b"endsolid")]
@@ -215,23 +300,83 @@ def stl(content: bytes) -> Parsed:
 def xyz(content: bytes) -> Parsed:
     """A point in each line, numbers separated by blanks, tabs, commas or semicolons; the first three are coordinates.
 
-    A first line of as many names (`x y z red …`, also as a comment) names the columns; else they are column_4 and on.
+    A first line of as many names (`x y z red …`, also as a comment) names the columns, which then may stand in any
+    order; else they are column_4 and on.
     """
-    plain = re.sub(rb"[,;\t]", b" ", content)
-    head = re.split(rb"[\r\n]", plain.lstrip(), maxsplit=1)[0].lstrip(b"#/ ")
-    first = [word.decode("utf-8", "replace") for word in head.split()]  # text has blanks that bytes have not
-    named = bool(first) and column_names(first)[:3] == XYZ
-    lines = text_lines(re.sub(rb"//[^\n]*", b"", plain))
-    if named and lines and lines[0].split()[0].lower() == b"x":
-        lines = lines[1:]
-    values = rows(lines, "point")
+    plain = _separated(text.plain(content))
+    if b"//" in plain:
+        plain = re.sub(rb"(?:(?<![\d.])//|//(?!\w))[^\r\n]*", _as_comment, plain)
+    head = re.split(rb"[\r\n]", plain.lstrip(), maxsplit=1)[0]
+    names = column_names(
+        [text.column_name(word.decode("utf-8", "replace")) for word in head.lstrip(b"#/ ").split()]
+    )
+    lines, first = text_lines(plain), 0
+    named = set(XYZ) <= set(names)
+    if named and not head.startswith(b"#"):
+        lines, first = lines[1:], 1
+    values = rows(lines, "point", place=placed(plain, first=first))
     if len(values) and values.shape[1] < 3:
         raise ValueError(f"wanted at least 3 numbers for each point, got the line {_shown(lines[0])}")
-    if named and len(values) and len(first) != values.shape[1]:
+    if named and head.startswith(b"#") and names[:3] != XYZ and len(names) != values.shape[1]:
+        named = False  # a comment that has these words
+    if not named:
+        return _table(values, None)
+    if len(values) and len(names) != values.shape[1]:
         raise ValueError(
-            f"its first line names {len(first)} columns, but each point has {values.shape[1]} numbers"
+            f"its first line names {len(names)} columns, but each point has {values.shape[1]} numbers"
         )
-    return _table(values, column_names(first)[3:] if named else None)
+    text.require_distinct(names)
+    more = [name for name in names if name not in XYZ]
+    order = [names.index(name) for name in (*XYZ, *more)]
+    return _table(
+        values if order == [*range(len(order))] or not len(values) else values[:, order], tuple(more)
+    )
+
+
+def _as_comment(found: re.Match[bytes]) -> bytes:
+    return b"#" + found[0]
+
+
+DECIMAL_COMMA = re.compile(rb"\d,\d")
+OTHER_SEPARATOR = re.compile(rb"[\d.][ \t]*[ \t;][ \t]*[-+.\d]")
+QUOTED_COMMA = re.compile(rb"\"[-+]?\d*,\d")
+NO_NUMBER = re.compile(rb"[,;][ \t]*[,;]")
+
+
+def _separated(content: bytes) -> bytes:
+    """A cloud's lines with blanks between the numbers.
+
+    Raises:
+        ValueError: a comma is the decimal sign, or a number is missing between two separators; names the line.
+    """
+    if b'"' in content:
+        _refuse(content, lambda line: QUOTED_COMMA.search(line) is not None, COMMAS)
+        content = content.replace(b'"', b"")
+    if b"," not in content and b";" not in content:
+        return content
+    other = next((sign for sign in (b" ", b"\t", b";") if sign in content), None)
+    if other and DECIMAL_COMMA.search(content) and OTHER_SEPARATOR.search(content):
+        _refuse(
+            content, lambda line: bool(DECIMAL_COMMA.search(line) and OTHER_SEPARATOR.search(line)), COMMAS
+        )
+    if NO_NUMBER.search(content) if other else b",," in content:
+        _refuse(
+            content,
+            lambda line: NO_NUMBER.search(line) is not None,
+            "a number is missing between two separators",
+        )
+    return content.translate(BLANKS)
+
+
+BLANKS = bytes.maketrans(b",;\t", b"   ")
+COMMAS = "commas stand for decimal points, or separate beside another separator; write decimals with a point"
+
+
+def _refuse(content: bytes, wrong: Callable[[bytes], bool], why: str) -> None:
+    """Refuse the first line that is wrong, apart from comments."""
+    for number, line in enumerate(_lines(content, b"#", ()), 1):
+        if not re.match(rb"\s*//", line) and wrong(line):
+            raise ValueError(f"line {number}: {why}, got {_shown(line)}")
 
 
 def npy(content: bytes) -> Parsed:

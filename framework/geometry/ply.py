@@ -15,11 +15,15 @@ from framework.geometry.mesh_files import (
     MOST_COLUMNS,
     XYZ,
     Parsed,
+    Place,
     column_names,
     fans,
+    placed,
     polygons,
     rows,
+    text_lines,
 )
+from framework.storage import text
 
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -61,6 +65,7 @@ def ply(content: bytes) -> Parsed:
     Raises:
         ValueError: no PLY, a type nobody knows, fewer or more data than the header announces, faces as strips.
     """
+    content = text.plain(content)
     # as its first line ends, so does the last of the header: behind \r alone, \n may be the first byte of the data
     last = rb"\r" if re.match(rb"ply[ \t]*\r(?!\n)", content) else rb"\r?\n"
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)
@@ -73,7 +78,13 @@ def ply(content: bytes) -> Parsed:
     if "vertex" not in names:
         raise ValueError(f"wanted an element vertex, got {shown(', '.join(sorted(names))) or 'none'}")
     body = content[end.end() :]
-    vertices, faces = _text(body, elements) if order == "" else _binary(body, elements, order)
+    for element in elements:
+        text.require_distinct(column_names([entry.name for entry in element.properties]), "property")
+    if order == "":
+        before = len(re.findall(rb"\r\n|\r|\n", content[: end.end()]))
+        vertices, faces = _text(body, elements, placed(body, None), before)
+    else:
+        vertices, faces = _binary(body, elements, order)
     return _parsed(next(element for element in elements if element.name == "vertex"), vertices, faces)
 
 
@@ -113,22 +124,32 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
     return order, elements
 
 
-def _text(body: bytes, elements: list[Element]) -> tuple[NDArray, NDArray]:
-    """Properties of the vertices, one column each, and triangles, from a body of one line an item."""
-    lines = [line for line in body.replace(b"\r", b"\n").split(b"\n") if line and not line.isspace()]
+def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tuple[NDArray, NDArray]:
+    """Properties of the vertices, one column each, and triangles, from a body of one line an item.
+
+    Args:
+        place: of a line of the body that is not blank, its number.
+        before: lines of the header.
+    """
+    lines = text_lines(body, None)
     promised = sum(element.count for element in elements if element.properties)
     if len(lines) != promised:
         raise ValueError(f"its header announces {promised} lines of data, but {len(lines)} follow")
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
     for element in elements:
+        first = promised - len(lines)
         own, lines = lines[: element.count], lines[element.count :]
+
+        def where(line: int, first: int = first) -> int:
+            return before + place(first + line)
+
         if element.name == "vertex":
             _no_list(element)
-            vertices = rows(own, "vertex", len(element.properties)) if own else vertices
+            vertices = rows(own, "vertex", len(element.properties), where) if own else vertices
         elif element.name == "face" and own:
             if not _corners(element) == element.properties[0]:
                 raise ValueError("a text file's faces must begin with their corners; save it as binary")
-            faces = polygons(own)
+            faces = polygons(own, where)
     return vertices, faces
 
 

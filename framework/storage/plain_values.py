@@ -11,6 +11,7 @@ import yaml
 
 from framework.errors import DataError, UserError, shown
 from framework.storage.reading import RESTORE, guarded, read_bytes
+from framework.storage.text import decoded
 
 LARGEST_JSON, LARGEST_YAML = 2**24, 2**17
 """Bytes."""
@@ -24,7 +25,7 @@ def read_json(file: Path, wanted: str, remedy: str = RESTORE) -> dict[str, Any]:
         DataError: it is missing, damaged, or holds something else; says that `wanted` was.
     """
     with guarded(file, wanted, remedy):
-        found = json.loads(_content(file, LARGEST_JSON))
+        found = json.loads(decoded(_content(file, LARGEST_JSON)))
         if not isinstance(found, dict):
             raise ValueError(f"it holds {type(found).__name__}")
         return found
@@ -38,7 +39,7 @@ def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserEr
             stand for more values than any memory holds.
     """
     with guarded(file, wanted, remedy, kind=error):
-        text = _content(file, LARGEST_YAML).decode("utf-8")
+        text = decoded(_content(file, LARGEST_YAML))
         depth = 0
         for event in yaml.parse(text, yaml.SafeLoader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)

@@ -10,6 +10,7 @@ import numpy as np
 from framework.errors import DataError
 from framework.geometry.meshes import read
 from framework.storage.reading import guarded, read_bytes
+from framework.storage.text import decoded
 
 SUBJECTS, POSES = 10, 10
 TEST = 200
@@ -74,7 +75,7 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
     """
     file = pairs_file(folder, challenge)
     with guarded(file, "pairs of a challenge", "Wanted: two test scans a line, such as 000_001."):
-        lines = read_bytes(file).decode("ascii").split()
+        lines = decoded(read_bytes(file)).split()
     found = []
     for number, line in enumerate(lines, 1):
         match = re.fullmatch(r"(\d{3})_(\d{3})", line)

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from framework.errors import DataError, shown
+from framework.errors import DataError, quoted, shown
 from framework.storage.limits import MOST_FRAMES as LONGEST
 from framework.storage.reading import guarded, read_bytes
+from framework.storage.text import decoded, line_of_word, require_numbers_in, words_of
 from plugins.data.bodies.body import Body
 from plugins.data.bodies.poses import skeleton
 
@@ -61,14 +62,19 @@ def read(file: Path) -> Motion:
         DataError: it cannot be read, or is no BVH file.
     """
     with guarded(file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."):
-        head, found, rest = read_bytes(file).decode("utf-8").partition("MOTION")
-        if not found or head.split()[:1] != ["HIERARCHY"]:
+        text = decoded(read_bytes(file))
+        head, found, rest = text.partition("MOTION")
+        above = words_of(head)
+        if not found or above[:1] != ["HIERARCHY"]:
             raise ValueError("HIERARCHY or MOTION is missing")
-        names, parents, offsets, channels = _hierarchy(head.split()[1:])
-        words = rest.split()
-        if words[:1] != ["Frames:"] or words[2:4] != ["Frame", "Time:"]:
+        names, parents, offsets, channels = _hierarchy(above[1:], text)
+        words = words_of(rest)
+        if words[:1] != ["Frames:"] or words[2:4] != ["Frame", "Time:"] or len(words) < 5:
             raise ValueError("MOTION does not start with Frames: and Frame Time:")
-        frames, seconds, numbers = int(words[1]), float(words[4]), np.array(words[5:], np.float64)
+        before = len(above) + 1
+        frames = _whole(words[1], text, before + 1)
+        seconds, *values_of_frames = require_numbers_in(words[4:], text, before + 4)
+        numbers = np.array(values_of_frames)
         if not 0 < seconds < SLOWEST:
             raise ValueError(f"a frame lasts {seconds:g} s")
         columns = sum(map(len, channels))
@@ -90,10 +96,21 @@ def read(file: Path) -> Motion:
         return Motion(tuple(names), tuple(parents), np.array(offsets), turns, seconds)
 
 
+def _whole(word: str, text: str, place: int) -> int:
+    if not word.isascii() or not word.isdigit():
+        raise ValueError(f"line {line_of_word(text, place)}: wanted a whole number, got {quoted(word)}")
+    return int(word)
+
+
 def _hierarchy(
-    words: list[str],
+    words: list[str], text: str
 ) -> tuple[list[str], list[int], list[list[float]], list[list[str]]]:
-    """Names, parents, offsets and channels of the joints; ends of the last bones are left out."""
+    """Names, parents, offsets and channels of the joints; ends of the last bones are left out.
+
+    Args:
+        words: of the hierarchy, without the first.
+        text: the file, for messages.
+    """
     names, parents, offsets, channels = [], [], [], []
     above, place = [-1], 0
     while place < len(words):
@@ -114,13 +131,13 @@ def _hierarchy(
         elif word == "End":
             place = words.index("}", place) + 1
         elif word == "OFFSET":
-            offsets[above[-1]] = [float(number) for number in words[place + 1 : place + 4]]
+            offsets[above[-1]] = require_numbers_in(words[place + 1 : place + 4], text, place + 2)
             if len(offsets[above[-1]]) != 3 or not np.isfinite(offsets[above[-1]]).all():
                 raise ValueError(f"the OFFSET of {shown(names[above[-1]])} is not three finite numbers")
             place += 4
         elif word == "CHANNELS":
-            count = int(words[place + 1])
-            kinds = words[place + 2 : place + 2 + max(0, count)]
+            count = _whole(words[place + 1], text, place + 2)
+            kinds = words[place + 2 : place + 2 + count]
             if len(kinds) != count or not set(kinds) <= CHANNELS or len(set(kinds)) < count:
                 raise ValueError(
                     f"CHANNELS of {shown(names[above[-1]])}: wanted a number, and so many of "
@@ -132,7 +149,8 @@ def _hierarchy(
             above.pop()
             place += 1
         else:
-            raise ValueError(f"{shown(word)} stands where a joint's description should go on")
+            line = line_of_word(text, place + 1)
+            raise ValueError(f"line {line}: {shown(word)} stands where a joint's description should go on")
     if len(above) != 1 or not names:
         raise ValueError("its joints are not closed, or it has none")
     return names, parents, offsets, channels

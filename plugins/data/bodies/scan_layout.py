@@ -34,6 +34,7 @@ from framework.geometry.mesh_files import COLOURS
 from framework.storage.arrays import archive
 from framework.storage.plain_values import read_json
 from framework.storage.reading import guarded, opened, read_bytes
+from framework.storage.text import lines_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """Of subjects and views: they are names of files."""
@@ -102,8 +103,7 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
     for split in Splits._fields:
         file = root / f"{split}.txt"
         with guarded(file, "names of subjects, a line each"):
-            lines = [line.decode("utf-8").strip() for line in read_bytes(file).splitlines()]
-            names = [line for line in lines if line]
+            names = [line.strip() for line in lines_of(read_bytes(file)) if line.strip()]
             if not names:
                 raise ValueError("it names nobody")
             for name in names:

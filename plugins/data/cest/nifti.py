@@ -11,6 +11,7 @@ import numpy as np
 from framework.errors import DataError
 from framework.storage.limits import MOST_OF_SPECTRA
 from framework.storage.reading import guarded, inflated, read_bytes, require_numbers, room
+from framework.storage.text import decoded, require_numbers_in, words_of
 
 PACKED = b"\x1f\x8b"
 
@@ -32,7 +33,8 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
             f"no {beside.name} beside it; wanted the offsets in ppm, one a line, as many as images."
         )
     with guarded(beside, "offsets", "Wanted: numbers in ppm, one a line, as many as images."):
-        found["offsets"] = np.array([float(line) for line in read_bytes(beside).decode("utf-8").split()])
+        text = decoded(read_bytes(beside))
+        found["offsets"] = np.array(require_numbers_in(words_of(text), text))
         if len(found["offsets"]) != images.shape[-1]:
             raise DataError(
                 f"{len(found['offsets'])} offsets for {images.shape[-1]} images of {file.name}; wanted one for each."

@@ -13,6 +13,7 @@ import numpy as np
 
 from framework.errors import DataError, quoted, shown
 from framework.storage.reading import guarded, read_bytes
+from framework.storage.text import decoded, no_number, value
 from plugins.data.head_pose.archive import wrong_layout
 from plugins.data.head_pose.labelled_images import SPLIT_SEED, Labelled
 
@@ -71,16 +72,18 @@ def read_label(file: Path) -> tuple[float, bool]:
         DataError: the file cannot be read, or its lines are others.
     """
     with guarded(file, "a label"):
-        text = read_bytes(file).decode("utf-8")
+        text = decoded(read_bytes(file))
     entries = [line.partition("=") for line in text.splitlines()]
     fields = {name.strip(): value.strip() for name, _, value in entries}
-    try:
-        return float(fields["pan"]), {"0": False, "1": True}[fields["valid"]]
-    except (KeyError, ValueError):
+    pan, valid = value(fields.get("pan", "")), {"0": False, "1": True}.get(fields.get("valid", ""))
+    if pan is None or not math.isfinite(pan) or valid is None:
+        line = next((number for number, (name, _, _) in enumerate(entries, 1) if name.strip() == "pan"), 0)
+        why = f" Line {line}: {no_number(fields['pan'])}." if pan is None and line else ""
         raise DataError(
-            f"{file}: {quoted(text)}; wanted two lines, `pan = ` with degrees and `valid = ` with 0 or 1. "
+            f"{file}: {quoted(text)}; wanted two lines, `pan = ` with finite degrees and `valid = ` with 0 or 1.{why} "
             "Restore it from its source."
-        ) from None
+        )
+    return pan, valid
 
 
 def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:

@@ -16,6 +16,7 @@ from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, quoted
 from framework.storage.reading import guarded, read_bytes
+from framework.storage.text import lines_of
 
 CLASSES = (
     "aeroplane", "bicycle", "boat", "bottle", "bus", "car",
@@ -95,7 +96,7 @@ def read_list(file: Path) -> list[str]:
     """
     names = []
     with guarded(file, "a list of image names", "Restore it from the release."):
-        lines = [line.decode("utf-8") for line in read_bytes(file).splitlines()]
+        lines = lines_of(read_bytes(file))
     for number, line in enumerate(lines, start=1):
         match line.split():
             case []:

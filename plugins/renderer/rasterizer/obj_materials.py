@@ -1,6 +1,5 @@
 """Reads what Wavefront OBJ files say of colours: places in textures, and the materials of an MTL file beside them."""
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from jaxtyping import Float, Int
 
 from framework.errors import DataError, quoted, shown
 from framework.geometry import mesh_files
-from framework.geometry.mesh_files import text_lines
+from framework.geometry.mesh_files import continued, placed, text_lines
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_MATERIALS
 from framework.storage.reading import guarded, read_bytes
@@ -114,7 +113,8 @@ def _part(
 def _corners(content: bytes) -> Corners:
     points, words, counts, before, materials, libraries = [], [], [], [], [], []
     material = ""
-    for line in text_lines(re.sub(rb"\\[ \t]*\r?\n", b" ", content), names=NAMES):
+    content = continued(content)
+    for line in text_lines(content, names=NAMES):
         key, said = _statement(line)
         rest = said.split()
         if key == b"vt":
@@ -128,7 +128,7 @@ def _corners(content: bytes) -> Corners:
             material = said.decode("utf-8", "replace")
         elif key == b"mtllib":
             libraries.append(said.decode("utf-8", "replace"))
-    uv = mesh_files.rows(points, "place in a texture", 2)
+    uv = mesh_files.rows(points, "place in a texture", 2, placed(content, names=NAMES, key=b"vt"))
     places = mesh_files.numbers(words, np.int64)
     sizes = np.array(counts, np.int64)
     places = np.where(places < 0, places + np.repeat(np.array(before, np.int64), sizes), places - 1)
@@ -154,14 +154,17 @@ def _materials(library: Path) -> dict[str, Material]:
     found: dict[str, Material] = {}
     with guarded(library, "an MTL file"):
         current = Material()
-        for line in text_lines(read_bytes(library), names=NAMES):
+        content = read_bytes(library)
+        for number, line in enumerate(text_lines(content, names=NAMES)):
             key, said = _statement(line)
             if key == b"newmtl":
                 current = found.setdefault(said.decode("utf-8", "replace"), Material())
             elif key == b"Kd":
-                color = mesh_files.rows([said], "colour Kd", 3)[0]
+                color = mesh_files.rows([said], "colour Kd", 3, placed(content, names=NAMES, first=number))[0]
                 if not np.isfinite(color).all():
-                    raise ValueError(f"its colour Kd is {color.tolist()}; wanted three numbers from 0 to 1")
+                    raise ValueError(
+                        f"its colour Kd is {color.tolist()}; wanted three finite numbers from 0 to 1"
+                    )
                 current.color = color
             elif key == b"map_Kd":
                 _texture(current, said.decode("utf-8", "replace").split(" "), library.parent)

@@ -1,0 +1,278 @@
+"""Text files as people and programs write them: their encoding, the names of columns, and the numbers in them.
+
+Every reader of text decodes, names and parses here, so that a cell means the same in a table, a cloud, a mesh, a
+flight, a list of offsets and a motion. A number that is written in another way than programs write it is either read
+here, where it can mean one number alone (a Unicode minus, Fortran's exponent), or described by `mended`, for a message.
+"""
+
+import codecs
+import math
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+from framework.errors import quoted
+
+SAVE = "Save it as UTF-8"
+WIDE = (
+    (codecs.BOM_UTF32_LE, "UTF-32"),  # before UTF-16, whose mark it begins with
+    (codecs.BOM_UTF32_BE, "UTF-32"),
+    (codecs.BOM_UTF16_LE, "UTF-16"),
+    (codecs.BOM_UTF16_BE, "UTF-16"),
+)
+LOOKED_AT = 64
+"""Bytes at the beginning by which UTF-16 without a mark is known: every second one is 0."""
+MINUS = str.maketrans(
+    dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}\N{SMALL HYPHEN-MINUS}\N{FULLWIDTH HYPHEN-MINUS}", "-")
+)
+"""What stands for a minus before digits. A number with one inside, such as the range 1–5, stays no number."""
+NOT_FINITE = re.compile(r"[+-]?1\.#([A-Za-z]+)\d*")
+"""How Microsoft's C library writes NaN and infinity: 1.#INF, -1.#IND, 1.#QNAN, cut after some letters."""
+FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)|([+-]?\d+)[dD]([+-]\d+)")
+FIGURES = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+BLANKS = " \N{NO-BREAK SPACE}\N{THIN SPACE}\N{NARROW NO-BREAK SPACE}"
+INVISIBLE = "\ufeff\u200b\u200c\u200d\u200e\u200f\u2060"
+"""Characters without width, which copies from web pages and office programs bring along."""
+
+
+def plain(content: bytes) -> bytes:
+    """Return a text, or a file that begins with text, without its byte-order mark.
+
+    Raises:
+        ValueError: it is UTF-16 or UTF-32.
+    """
+    for mark, name in WIDE:
+        if content.startswith(mark):
+            raise ValueError(f"it is text in {name}; wanted UTF-8. {SAVE}")
+    first = content[:LOOKED_AT]
+    odd, even = first[1::2], first[::2]
+    if len(first) >= 4 and any(not any(zero) and all(other) for zero, other in ((odd, even), (even, odd))):
+        raise ValueError(f"every second byte of it is 0, as in UTF-16; wanted UTF-8. {SAVE}")
+    return content.removeprefix(codecs.BOM_UTF8)
+
+
+def decoded(content: bytes) -> str:
+    """Return a text in UTF-8, without its byte-order mark.
+
+    Raises:
+        ValueError: it is in another encoding; names the line.
+    """
+    content = plain(content)
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = len(re.split(rb"\r\n|\r|\n", content[: error.start]))
+        raise ValueError(
+            f"line {line} holds the byte 0x{content[error.start]:02x}, which is not UTF-8. {SAVE}"
+        ) from None
+
+
+def lines_of(content: bytes) -> list[str]:
+    """Return the lines of a text, which end as those of any system, and not at the other letters that Python takes.
+
+    Raises:
+        ValueError: as `decoded`.
+    """
+    return re.split(r"\r\n|\r|\n", decoded(content))
+
+
+def words_of(written: str) -> list[str]:
+    """Return what blanks, tabs and ends of lines separate; a no-break space stays in its word, as in 1 234."""
+    return (
+        written.split()
+        if written.isascii()
+        else [word for word in re.split(r"[ \t\r\n\f\v]+", written) if word]
+    )
+
+
+def trimmed(cell: str) -> str:
+    """Return a cell without blanks and characters without width at its ends."""
+    cell = cell.strip()
+    while cell and (cell[0] in INVISIBLE or cell[-1] in INVISIBLE):
+        cell = cell.strip(INVISIBLE).strip()
+    return cell
+
+
+def column_name(cell: str) -> str:
+    """Return what a header calls a column: trimmed, without quotation marks around it, letters composed (NFC)."""
+    name = trimmed(cell)
+    if len(name) > 1 and name[0] == name[-1] and name[0] in "\"'":
+        name = trimmed(name[1:-1])
+    return unicodedata.normalize("NFC", name)
+
+
+def require_distinct(names: Sequence[str], what: str = "column") -> None:
+    """Refuse names of which one stands twice; nameless columns may.
+
+    Raises:
+        ValueError: names the first.
+    """
+    twice = [name for name, count in Counter(names).items() if count > 1 and name]
+    if twice:
+        raise ValueError(f"names the {what} {quoted(twice[0])} twice; wanted each once. Rename one.")
+
+
+def value(word: str) -> float | None:
+    """Return the number that a word says, perhaps NaN or infinite; None where it says none.
+
+    Beside what Python reads: a Unicode minus, Fortran's 1.5D+3, and 1.#INF or -1.#IND of Microsoft's C library.
+    """
+    if "_" in word:
+        return None  # 1_0: Python reads it and no file means it
+    try:
+        return float(word)
+    except ValueError:
+        pass
+    word = trimmed(word).translate(MINUS)
+    found = NOT_FINITE.fullmatch(word)
+    if found:
+        sign = -1 if word.startswith("-") else 1
+        return sign * math.inf if found[1].upper().startswith("INF") else math.nan
+    found = FORTRAN.fullmatch(word)
+    if found:
+        word = f"{found[1] or found[3]}e{found[2] or found[4]}"
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+class Mended(NamedTuple):
+    """What a word would be as a number, after mending.
+
+    Attributes:
+        what: how it is written: "with a decimal comma".
+        number: how to write it instead.
+        settings: of the keys of `framework.datasets.csv_columns.Writing` those that read it, with their values; one
+            set for each meaning that it may have.
+        unit: what stands beside the number.
+    """
+
+    what: str
+    number: str
+    settings: tuple[dict[str, str], ...] = ()
+    unit: str = ""
+
+
+Sign = Literal["comma", "point", "space", "apostrophe"]
+GROUPED: dict[Sign, str] = {
+    "comma": r"\d{1,3}(?:,\d{3})+",
+    "point": r"\d{1,3}(?:\.\d{3})+",
+    "space": rf"\d{{1,3}}(?:[{BLANKS}]\d{{3}})+",
+    "apostrophe": r"\d{1,3}(?:['\N{RIGHT SINGLE QUOTATION MARK}]\d{3})+",
+}
+"""Figures in groups of three, by what stands between the groups."""
+BETWEEN: dict[Sign, str] = {
+    "comma": ",",
+    "point": ".",
+    "space": BLANKS,
+    "apostrophe": "'\N{RIGHT SINGLE QUOTATION MARK}",
+}
+OTHERS: tuple[tuple[str, str, str], ...] = (
+    (rf"\(({FIGURES})\)", "in brackets, as accounts write negative numbers", r"-\1"),
+    (rf"({FIGURES})\s*-", "with the minus behind it", r"-\1"),
+    (rf"([+-])\s+({FIGURES})", "with a blank behind its sign", r"\1\2"),
+    (rf"=?[\"'](?:\s*)([+-]?{FIGURES})\s*[\"']?", "in quotation marks", r"\1"),
+    (rf"([+-]?{FIGURES})\s*[x×*·]\s*10\s*\^?\s*([+-]?\d+)", "as a product with a power of ten", r"\1e\2"),
+    (rf"[<>≤≥~≈]\s*([+-]?{FIGURES})", "as a bound", r"\1"),
+)
+"""Patterns of numbers that no setting reads, how each is written, and how to write it instead."""
+UNIT = re.compile(
+    r"([+-]?)([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})?\s*([+-]?[\d.,].*?)\s*"
+    r"([^\W\d_]{1,8}[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
+)
+"""A sign, a unit before the number ($, EUR), the number, and a unit behind it (%, kg, mm²)."""
+
+
+def mended(word: str) -> Mended | None:
+    """Return how a word that is no number could become one: decimal commas, thousands separators, units and others."""
+    word = trimmed(word).translate(MINUS)
+    if not any(letter.isdigit() for letter in word):
+        return None
+    sign, figures = (word[0], word[1:]) if word[:1] in "+-" else ("", word)
+    found = _separated(sign, figures)
+    if found:
+        return found
+    for pattern, what, number in OTHERS:
+        if re.fullmatch(pattern, word):
+            return Mended(what, re.sub(pattern, number, word))
+    return _with_unit(word)
+
+
+def _separated(sign: str, figures: str) -> Mended | None:
+    """A number with another decimal sign than the point, or with figures in groups."""
+    decimal = {"decimal": "comma"}
+    if re.fullmatch(r"\d*,\d+(?:[eE][+-]?\d+)?|\d+,", figures):
+        number = sign + figures.replace(",", ".")
+        if re.fullmatch(r"[1-9]\d{0,2},\d{3}", figures):
+            whole = sign + figures.replace(",", "")
+            return Mended("with a comma", f"{number} or {whole}", (decimal, {"thousands": "comma"}))
+        return Mended("with a decimal comma", number, (decimal,))
+    for name, pattern in GROUPED.items():
+        found = re.fullmatch(rf"({pattern})(?:([.,])(\d*))?", figures)
+        if found is None or found[2] == BETWEEN[name]:
+            continue
+        if name == "point" and found[2] is None and figures.count(".") == 1:
+            continue  # 1.234
+        whole = re.sub(r"\D", "", found[1]) + (f".{found[3]}" if found[3] else "")
+        settings = {"thousands": name} | (decimal if found[2] == "," else {})
+        return Mended("with figures in groups", sign + whole, (settings,))
+    return None
+
+
+def _with_unit(word: str) -> Mended | None:
+    found = UNIT.fullmatch(word)
+    if found is None or not (found[2] or found[4]) or (found[1] and not found[2]):
+        return None
+    unit = found[2] or found[4]
+    if found[2] and found[4]:
+        return None
+    inner = found[1] + found[3]
+    if value(inner) is not None:
+        return Mended(f"with the unit {unit!r}", inner, ({"units": f"[{unit}]"},), unit)
+    sign, figures = (inner[0], inner[1:]) if inner[:1] in "+-" else ("", inner)
+    core = _separated(sign, figures)
+    if core is None:
+        return None
+    settings = tuple({"units": f"[{unit}]"} | one for one in core.settings)
+    return Mended(
+        f"with the unit {unit!r} and {core.what.removeprefix('with ')}", core.number, settings, unit
+    )
+
+
+def line_of_word(text: str, number: int) -> int:
+    """Return the line (from 1) of a word of a text, counted from 0."""
+    line = 1
+    for line, words in enumerate(re.split(r"\r\n|\r|\n", text), 1):
+        number -= len(words_of(words))
+        if number < 0:
+            return line
+    return line
+
+
+def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[float]:
+    """Return the numbers of some words of a text; `first` is the place of the first of them among all its words.
+
+    Raises:
+        ValueError: a word is none; names the line.
+    """
+    try:
+        found = list(map(float, words))
+    except ValueError:
+        found = []
+    if len(found) == len(words) and "_" not in "".join(words):
+        return found
+    values = [value(word) for word in words]
+    for place, (word, number) in enumerate(zip(words, values, strict=True)):
+        if number is None:
+            raise ValueError(f"line {line_of_word(text, first + place)}: {no_number(word)}")
+    return [number for number in values if number is not None]
+
+
+def no_number(word: str, where: str = "") -> str:
+    """Return a sentence about a word where a number was wanted, with how to mend it."""
+    remedy = mended(word)
+    why = f": a number {remedy.what}; write {remedy.number}" if remedy else ""
+    return f"wanted a number, got {quoted(word)}{where}{why}"
