@@ -2,7 +2,10 @@
 
 import copy
 import math
-from collections.abc import Callable, Collection, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -18,16 +21,31 @@ from torch.distributions import (
 
 from framework.distributions.circular import circular
 from framework.distributions.protocol import estimate, exactly, marginal, median, pick, take
+from framework.errors import UserError
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target
 from framework.testing.balls import Ball, ball
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
+from framework.testing.metric_numbers import (
+    SCALE,
+    degrees,
+    nats,
+    not_hidden,
+    same,
+    scaled,
+    standard_errors,
+)
 from framework.testing.rows import MetricRow
 
 Make = Callable[[], Metric]
 SAMPLES = 24
+MANY = 261
+"""Samples at once, more than a test split is commonly fetched by; of images MANY_IMAGES."""
+MANY_IMAGES = 72
+CASES = 48
+"""Test cases that standard errors are resampled from."""
 
 
 class Cardioid(Distribution):
@@ -125,60 +143,88 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
     """Every property of one metric on predictions of `row.target`."""
-    reads = build().reads
-    whole = _predictions(row, SAMPLES, reads)
+    reads = bool(build().reads)
+    whole = predictions(row, SAMPLES, images=reads)
+    many, kind = Many(build, row, images=reads), row.target.kind
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "named numbers": (0.0, lambda worst: _named(build, whole, worst)),
         "nothing seen is NaN": (0.0, lambda worst: _nothing(build, whole, worst)),
-        "batches do not matter": (1e-9, lambda worst: _batches(build, whole, worst)),
-        "order does not matter": (1e-9, lambda worst: _order(build, whole, worst)),
+        "batches do not matter": (1e-9, lambda worst: _batches(build, whole, many, worst)),
+        "order does not matter": (1e-9, lambda worst: _order(build, whole, many, worst)),
         "states merge": (1e-9, lambda worst: _merge(build, whole, worst)),
         "reset and copy": (0.0, lambda worst: _reset(build, whole, worst)),
+        "computing changes nothing": (1e-9, lambda worst: _computed_twice(build, whole, worst)),
+        "predictions are left as they are": (0.0, lambda worst: _untouched(build, whole, worst)),
         "perfect beats random": (0.0, lambda worst: _perfect(build, row, worst)),
-        "only the images it names": (0.0, lambda worst: _images(build, whole, worst)),
+        "standard errors": (math.log(1.3), lambda worst: _standard_errors(build, row, worst)),
     }
+    if kind == "angle":
+        checks["turns do not matter"] = (1e-6, lambda worst: _turns(build, row, worst))
     if not reads:
-        del checks["only the images it names"]
+        checks["unit"] = (0.0, lambda worst: _unit(build, row, worst))
+        checks["NaN is not hidden"] = (0.0, lambda worst: _nan(build, row, worst))
+    else:
+        checks["only the images it names"] = (0.0, lambda worst: _images(build, whole, worst))
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield examined(name, row.limits.get(name, limit), check)
 
 
-Slices = Callable[[Tensor, Split], Prediction]
+@dataclass(frozen=True)
+class Predictions:
+    """Index and split → the prediction of those samples of one fixed set.
 
+    Attributes:
+        row: whose target they are of.
+        target: of each sample.
+        place: what `density_about` reads, of each sample.
+        breadth: of the densities of the test split; None: the narrowest.
+        outliers: how many times as broad the densities of outliers are. They are those of other samples, so that no two
+            of one index are about the same place.
+        fields: further fields of the batch.
+        images: whether images are read; they show balls.
+    """
 
-def _predictions(row: MetricRow, count: int, reads: Collection[str]) -> Slices:
-    """Indices and split → the prediction of those samples of one fixed set; as outliers they have other densities, most
-    of them broader. Where images are read, they show balls."""
-    target = values(row.target, (count,))
-    fields = {name: make(count) for name, make in row.fields.items()}
-    if reads:
-        fields = {**ball(_place(row, target), row.size), **fields}
-    generator = torch.Generator().manual_seed(SEED)
-    location = (
-        torch.randn(target.flatten(1).shape, generator=generator)
-        if row.target.kind != "class"
-        else torch.zeros(())
-    )
-    logits = torch.randn(count, len(row.target.names), generator=generator)
-    breadth = 1 + 2 * torch.rand(count, generator=generator)
+    row: MetricRow
+    target: Tensor
+    place: Tensor
+    breadth: Tensor | None
+    outliers: Tensor
+    fields: dict[str, Tensor]
+    images: bool
 
-    def some(index: Tensor, split: Split) -> Prediction:
+    def __call__(self, index: Tensor, split: Split) -> Prediction:
+        about, breadth = self.place[index], None if self.breadth is None else self.breadth[index]
         if split == "outliers":
-            # the densities of others, so that no two of one index are about the same place
-            other = (index + 1) % count
-            about = logits[other] if row.target.kind == "class" else location[other]
-            density = density_about(row.target, about, breadth[index])
-        else:
-            about = logits[index] if row.target.kind == "class" else location[index]
-            density = density_about(row.target, about)
-        if reads:
-            density = Ball(density, about, row.size)
-        batch = {"target": target[index], "index": index, "group": torch.zeros_like(index)}
-        batch |= {name: field[index] for name, field in fields.items()}
+            about = self.place[(index + 1) % len(self.target)]
+            breadth = self.outliers[index] * (1 if breadth is None else breadth)
+        density = density_about(self.row.target, about, breadth)
+        if self.images:
+            density = Ball(density, about.float(), self.row.size)
+        batch = {"target": self.target[index], "index": index, "group": torch.zeros_like(index)}
+        batch |= {name: field[index] for name, field in self.fields.items()}
         return Prediction(density, batch, split=split)
 
-    return some
+
+def predictions(row: MetricRow, count: int, *, images: bool, near: bool = False) -> Predictions:
+    """One fixed set of predictions, about anywhere, or `near` the targets: as far as each sample is hard, so that the
+    errors of its numbers go together."""
+    target = values(row.target, (count,))
+    fields = {name: make(count) for name, make in row.fields.items()}
+    if images:
+        fields = {**ball(_place(row, target), row.size), **fields}
+    generator = torch.Generator().manual_seed(SEED)
+    shape = (count, numbers_about(row.target))
+    place = torch.randn(shape, generator=generator)
+    outliers = 1 + 2 * torch.rand(count, generator=generator)
+    if near:
+        hard = torch.randn(count, 1, generator=generator).abs()
+        away = _place(row, target)
+        place = away / 2 + place if row.target.kind == "class" else away + hard * (0.7 + 0.1 * place)
+    return Predictions(row, target, place, None, outliers, fields, images)
+
+
+Slices = Callable[[Tensor, Split], Prediction]
 
 
 def _place(row: MetricRow, target: Tensor) -> Tensor:
@@ -196,20 +242,12 @@ def _feed(metric: Metric, some: Slices, part: Tensor) -> None:
         metric.update(some(part, split))
 
 
-def _after(build: Make, some: Slices, parts: list[Tensor]) -> dict[str, Tensor]:
+def _after(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tensor]:
     metric = build()
     torch.manual_seed(SEED)
     for part in parts:
         _feed(metric, some, part)
     return metric.compute()
-
-
-def _compare(what: str, found: dict[str, Tensor], wanted: dict[str, Tensor], worst: Worst) -> None:
-    worst.same(f"{what}: keys", sorted(found), sorted(wanted))
-    for key, value in wanted.items():
-        gap = (found[key].double() - value.double()).abs() / value.double().abs().clamp(min=1)
-        both = found[key].isnan() & value.isnan()
-        worst.see(gap.where(~both, 0), f"{what}: {key} {found[key].item():.9g}, wanted {value.item():.9g}")
 
 
 def _named(build: Make, some: Slices, worst: Worst) -> None:
@@ -233,25 +271,47 @@ def _nothing(build: Make, some: Slices, worst: Worst) -> None:
             worst.count(not value.isnan().item(), f"{what}: {key} is {value.item():g}")
 
 
-def _quiet(build: Make, some: Slices, parts: list[Tensor]) -> dict[str, Tensor]:
-    import warnings
-
+def _quiet(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tensor]:
     with warnings.catch_warnings():
         # torchmetrics warns of compute before update, which is what is tried here
         warnings.filterwarnings("ignore", message=".*compute.*before the.*update.*", category=UserWarning)
         return _after(build, some, parts)
 
 
-def _batches(build: Make, some: Slices, worst: Worst) -> None:
+class Many:
+    """More predictions than a metric may be used to, and the numbers of all of them at once.
+
+    Attributes:
+        some: the predictions.
+        index: all of them.
+    """
+
+    def __init__(self, build: Make, row: MetricRow, *, images: bool) -> None:
+        self.build = build
+        dear = images or row.target.kind == "image"
+        self.some = predictions(row, MANY_IMAGES if dear else MANY, images=images)
+        self.index = torch.arange(len(self.some.target))
+
+    @cached_property
+    def at_once(self) -> dict[str, Tensor]:
+        return _after(self.build, self.some, [self.index])
+
+
+def _batches(build: Make, some: Slices, many: Many, worst: Worst) -> None:
     index = torch.arange(SAMPLES)
     wanted = _after(build, some, [index])
-    _compare("in batches of 7", _after(build, some, list(index.split(7))), wanted, worst)
-    _compare("one by one", _after(build, some, list(index.split(1))), wanted, worst)
+    same("in batches of 7", _after(build, some, index.split(7)), wanted, worst)
+    same("one by one", _after(build, some, index.split(1)), wanted, worst)
+    count, half = len(many.index), len(many.index) // 2
+    parts = many.index.split([1, half + 3, count - half - 4])
+    same(f"{count} in uneven parts", _after(build, many.some, parts), many.at_once, worst)
 
 
-def _order(build: Make, some: Slices, worst: Worst) -> None:
+def _order(build: Make, some: Slices, many: Many, worst: Worst) -> None:
     index = torch.arange(SAMPLES)
-    _compare("backwards", _after(build, some, [index.flip(0)]), _after(build, some, [index]), worst)
+    same("backwards", _after(build, some, [index.flip(0)]), _after(build, some, [index]), worst)
+    order = torch.randperm(len(many.index), generator=torch.Generator().manual_seed(SEED))
+    same(f"{len(order)} shuffled", _after(build, many.some, [order]), many.at_once, worst)
 
 
 def _merge(build: Make, some: Slices, worst: Worst) -> None:
@@ -260,7 +320,7 @@ def _merge(build: Make, some: Slices, worst: Worst) -> None:
     _feed(first, some, torch.arange(10))
     _feed(second, some, torch.arange(10, SAMPLES))
     first.merge_state(second)
-    _compare("two halves merged", first.compute(), _after(build, some, [torch.arange(SAMPLES)]), worst)
+    same("two halves merged", first.compute(), _after(build, some, [torch.arange(SAMPLES)]), worst)
 
 
 def _reset(build: Make, some: Slices, worst: Worst) -> None:
@@ -270,8 +330,8 @@ def _reset(build: Make, some: Slices, worst: Worst) -> None:
     metric.reset()
     _feed(metric, some, index)
     wanted = _after(build, some, [index])
-    _compare("after a reset", metric.compute(), wanted, worst)
-    _compare("of a copy", copy.deepcopy(metric).compute(), wanted, worst)
+    same("after a reset", metric.compute(), wanted, worst)
+    same("of a copy", copy.deepcopy(metric).compute(), wanted, worst)
 
 
 def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
@@ -281,7 +341,7 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
     latter.
     """
     metric = build()
-    some = _predictions(row, SAMPLES, metric.reads)
+    some = predictions(row, SAMPLES, images=bool(metric.reads))
     index = torch.arange(SAMPLES)
     breadth = torch.full((SAMPLES,), 2.0)
 
@@ -304,6 +364,122 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
         ahead = good[key] - bad[key] if way == "higher" else bad[key] - good[key]
         told = f"{key}: {good[key].item():.4g} about the target, {bad[key].item():.4g} elsewhere"
         worst.count(not (ahead > 0 or good[key].isnan().item()), told)
+
+
+def _computed_twice(build: Make, some: Slices, worst: Worst) -> None:
+    """Numbers may be asked for in between, and again."""
+    index = torch.arange(SAMPLES)
+    wanted = _after(build, some, index.split(10))
+    metric = build()
+    torch.manual_seed(SEED)
+    for part in index.split(10):
+        _feed(metric, some, part)
+        metric.compute()
+    same("computed after every batch", metric.compute(), wanted, worst)
+    metric.update(some(index[:0], metric.splits[0]))  # so that nothing is kept of the last computation
+    same("computed again", metric.compute(), wanted, worst)
+
+
+def _untouched(build: Make, some: Slices, worst: Worst) -> None:
+    """Other metrics read the same prediction."""
+    metric, index = build(), torch.arange(SAMPLES)
+    for split in metric.splits:
+        seen = some(index, split)
+        torch.manual_seed(SEED)
+        for derived in ("log_prob", "estimate", "class_probabilities", "entropy", "point"):
+            try:
+                getattr(seen, derived)
+            except (UserError, NotImplementedError):
+                continue
+        before = {name: value.clone() for name, value in _tensors(seen).items()}
+        metric.update(seen)
+        after = _tensors(seen)
+        worst.same("fields of the batch", sorted(after.keys() & before.keys()), sorted(before))
+        for name in before.keys() & after.keys():
+            worst.same_bits(f"{name} after an update", after[name], before[name])
+
+
+def _tensors(prediction: Prediction) -> dict[str, Tensor]:
+    """Of the batch, of the density, and of what was derived from both."""
+    found = {f"batch[{name!r}]": value for name, value in prediction.batch.items()}
+    for owner in (prediction, prediction.density):
+        for name, value in vars(owner).items():
+            if isinstance(value, Tensor):
+                found[name.lstrip("_")] = value
+    return found
+
+
+def _standard_errors(build: Make, row: MetricRow, worst: Worst) -> None:
+    images = bool(build().reads)
+    count = CASES // 2 if images or row.target.kind == "image" else CASES
+    some = predictions(row, count, images=images, near=True)
+    standard_errors(lambda index: _after(build, some, [index]), count, worst)
+
+
+def _turns(build: Make, row: MetricRow, worst: Worst) -> None:
+    """Whole turns of angles, predicted or true, change nothing; in float64, where they hardly round."""
+    some = predictions(row, SAMPLES, images=bool(build().reads))
+    some = replace(some, target=some.target.double(), place=some.place.double())
+    index = torch.arange(SAMPLES)
+    wanted = _after(build, some, [index])
+    generator = torch.Generator().manual_seed(SEED)
+    turns = 2 * math.pi * torch.randint(-3, 4, (2, *some.target.shape), generator=generator).double()
+    for what, other in {
+        "targets": replace(some, target=some.target + turns[0]),
+        "predicted angles": replace(some, place=some.place + turns[1]),
+    }.items():
+        same(f"whole turns of {what}", _after(build, other, [index]), wanted, worst)
+
+
+def _unit(build: Make, row: MetricRow, worst: Worst) -> None:
+    """Degrees and radians, nats and bits, and how numbers of reals follow their target's unit."""
+    index, kind = torch.arange(SAMPLES), row.target.kind
+    some = predictions(row, SAMPLES, images=False, near=True)
+    metric = build()
+    columns = metric.columns
+    if kind in ("class", "angle"):
+        place = torch.zeros_like(some.place)
+        flat = replace(some, place=place, breadth=torch.full((SAMPLES,), 1e15))
+        nats(columns, row.target, _after(build, flat, [index]), worst)
+    if kind == "angle":
+        anywhere = predictions(row, SAMPLES, images=False)
+        off, far = (replace(some, place=some.target.double() + far) for far in (1.0, 2.0))
+        wide = [_after(build, other, [index]) for other in (anywhere, some, far)]
+        degrees(columns, wide, _after(build, off, [index]), worst)
+    if kind == "real":
+        large = replace(
+            some,
+            target=some.target.double() * SCALE,
+            place=some.place.double() * SCALE,
+            breadth=torch.full((SAMPLES,), SCALE, dtype=torch.float64),
+        )
+        small = replace(some, target=some.target.double(), place=some.place.double())
+        found, wanted = (_after(build, other, [index]) for other in (large, small))
+        scaled(columns, found, wanted, len(row.target.names), worst)
+    worst.count(False, "nothing has a unit")
+
+
+def _nan(build: Make, row: MetricRow, worst: Worst) -> None:
+    some = predictions(row, SAMPLES, images=False, near=True)
+    bad = slice(5, 13)  # so many that a median sees them
+
+    def judge(place: float | Tensor, breadth: float) -> dict[str, Tensor]:
+        places, breadths = some.place.clone(), torch.ones(SAMPLES)
+        places[bad] += place
+        breadths[bad] = breadth
+        return _after(build, replace(some, place=places, breadth=breadths), [index])
+
+    index, metric = torch.arange(SAMPLES), build()
+    without = _after(build, some, [torch.cat([index[: bad.start], index[bad.stop :]])])
+    not_hidden(
+        lambda: judge(math.nan, math.nan),
+        judge(0.0, 1.0),
+        judge(torch.arange(1.0, 1.0 + some.place.shape[1]), 2.0),
+        without,
+        metric.columns,
+        metric.better,
+        worst,
+    )
 
 
 def _images(build: Make, some: Slices, worst: Worst) -> None:

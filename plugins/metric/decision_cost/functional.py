@@ -98,7 +98,7 @@ def regions(value: Tensor, edges: Float[Tensor, "edge"], *, around: bool) -> Int
     the last ends there.
     """
     if not around:
-        return torch.bucketize(value.double(), edges, right=True)
+        return torch.bucketize(value.double().contiguous(), edges, right=True)
     # radians in float32 may stand a rounding before the edge that they were made of
     ahead = torch.remainder(turn(edges[0], value) + 1e-7, 2 * math.pi)
     return torch.bucketize(ahead, edges - edges[0] + 1e-12, right=True) - 1

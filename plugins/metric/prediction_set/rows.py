@@ -11,7 +11,13 @@ CHECKS = (
     "order does not matter",
     "states merge",
     "reset and copy",
+    "computing changes nothing",
+    "predictions are left as they are",
     "perfect beats random",
+    "standard errors",
+    "turns do not matter",
+    "unit",
+    "NaN is not hidden",
 )
 ROWS = {
     "prediction_set": tuple(

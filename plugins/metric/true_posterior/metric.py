@@ -9,6 +9,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import grid, wrap
 from framework.errors import ConfigError, DataError
 from framework.metric import Metric
@@ -43,6 +44,7 @@ class TruePosterior(Metric):
     Raises:
         ConfigError: no azimuth in the target; at the first update, no "symmetry" in the data.
         DataError: a symmetry below 0 or above `largest_symmetry`.
+        UserError: entropies that are NaN; says how many.
     """
 
     bibtex = """@inproceedings{prokudin2018deep,
@@ -101,6 +103,7 @@ class TruePosterior(Metric):
         entropy, mass = entropy_and_mode_mass(
             density, azimuth, symmetry, self.largest, self.points, prediction.samples
         )
+        refuse_nan(entropy, "entropies of the azimuth")
         self.count += len(symmetry)
         self.entropy += entropy.sum()
         self.gap += (math.log(2 * math.pi) - entropy)[symmetry == 0].sum()

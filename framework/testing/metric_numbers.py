@@ -1,0 +1,231 @@
+"""What the contract asks of a metric's numbers: their standard error, unit and turns; each reports its worst case."""
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.errors import UserError
+from framework.target import Target
+from framework.testing.finding import SEED, Worst
+
+Numbers = Mapping[str, Tensor]
+SEM = "_sem"
+NEAR = 0.15
+"""Relative difference of a standard error from the jackknife's above which the bootstrap decides."""
+RESAMPLES = 300
+SCALE = 8.0
+"""How many times as large a target in another unit is: a power of two, so that nothing rounds."""
+SQUARES = re.compile(
+    r"(^|[\W_])(mse|sse|squared?|squares|sq|var|variance|quadratic|energy|power|l2|2)([\W_]|$)"
+)
+
+ROOTS = re.compile(r"(^|[\W_])(root|rms[a-z]*)([\W_]|$)")
+
+
+def standard_errors(judge: Callable[[Tensor], Numbers], count: int, worst: Worst) -> None:
+    """What is printed behind ± against the jackknife over test cases, else their bootstrap; |log| of the ratio.
+
+    Of a mean the jackknife's is the standard error itself (Efron & Tibshirani 1993, §11.1); of what is not smooth, a
+    median, only the bootstrap's holds (§11.6).
+
+    Args:
+        judge: which of the test cases → the metric's numbers.
+        count: number of test cases.
+    """
+    index = torch.arange(count)
+    whole = judge(index)
+    said = {key: float(value) for key, value in whole.items() if _is_error(key, whole)}
+    worst.count(False, "no number has a standard error")
+    if not said:
+        return
+    for key, value in judge(index[:1]).items():
+        if key in said:
+            worst.count(value.item() == 0, f"{key} of one case is 0; wanted NaN: one case shows no spread")
+    left = [judge(index[index != one]) for one in range(count)]
+    spread = {key: _deviation(left, key) * (count - 1) / count**0.5 for key in said}
+    unsure = [key for key in said if not _gap(said[key], spread[key]) < NEAR]
+    if unsure:
+        random = np.random.default_rng(SEED)
+        again = [judge(torch.from_numpy(random.integers(0, count, count))) for _ in range(RESAMPLES)]
+        for key in unsure:
+            boot = _deviation(again, key)
+            spread[key] = min(spread[key], boot, key=lambda other, key=key: _gap(said[key], other))
+    for key, value in said.items():
+        worst.see(
+            _gap(value, spread[key]), f"{key} {value:.4g}, by resampling {count} test cases {spread[key]:.4g}"
+        )
+
+
+def _is_error(key: str, whole: Numbers) -> bool:
+    return key.endswith(SEM) and key.removesuffix(SEM) in whole
+
+
+def _deviation(found: list[Numbers], key: str) -> float:
+    """Of the number that a standard error is of."""
+    return float(np.std([numbers[key.removesuffix(SEM)].item() for numbers in found]))
+
+
+def _gap(one: float, other: float) -> float:
+    if math.isnan(one) or math.isnan(other):
+        return 0.0 if math.isnan(one) and math.isnan(other) else math.inf
+    small = 1e-9
+    return abs(math.log((abs(one) + small) / (abs(other) + small)))
+
+
+def same(what: str, found: Numbers, wanted: Numbers, worst: Worst) -> None:
+    """Numbers that must not differ; relative where they are above 1. NaN equals NaN."""
+    worst.same(f"{what}: keys", sorted(found), sorted(wanted))
+    for key in found.keys() & wanted.keys():
+        one, other = found[key].double(), wanted[key].double()
+        gap = (one - other).abs() / other.abs().clamp(min=1)
+        equal = (one.isnan() & other.isnan()) | (one == other)
+        worst.see(gap.where(~equal, 0), f"{what}: {key} {one.item():.9g}, wanted {other.item():.9g}")
+
+
+def degrees(columns: Mapping[str, str], wide: Sequence[Numbers], off: Numbers, worst: Worst) -> None:
+    """Numbers of angles that say they are degrees are no radians, and others no degrees.
+
+    Args:
+        columns: the metric's.
+        wide: its numbers of predictions that are far off in various ways.
+        off: its numbers of predictions that are 1 radian off, each.
+    """
+    worst.count(False, "no number says its unit")
+    for key, title in columns.items():
+        if key not in off:
+            continue
+        largest = max((abs(found[key].item()) for found in wide if found[key].isfinite()), default=math.inf)
+        value = off[key].item()
+        if _in_degrees(key, title):
+            radians = largest <= 2 * math.pi or abs(value - 1) < 1e-4
+            worst.count(
+                radians, f"{key} is {value:.6g} of a deviation of 1 radian and never above {largest:.6g}"
+            )
+        else:
+            worst.count(
+                abs(value - math.degrees(1)) < 1e-2,
+                f"{key} is {value:.6g} of a deviation of 1 radian: its name must say degrees",
+            )
+
+
+def _in_degrees(key: str, title: str) -> bool:
+    return "deg" in key.split("_") or "degrees" in key.split("_") or "°" in title
+
+
+def scaled(columns: Mapping[str, str], found: Numbers, wanted: Numbers, numbers: int, worst: Worst) -> None:
+    """Of reals in another unit, SCALE times as large, a number scales or does not, and its standard error likewise;
+    logarithms of densities shift by nats.
+
+    Args:
+        columns: the metric's.
+        found, wanted: its numbers in the other unit, and in the first.
+        numbers: how many reals a target has.
+    """
+    worst.count(False, "no number scales")
+    for key, value in wanted.items():
+        if key.endswith(SEM) or not value.isfinite() or not found[key].isfinite() or value == 0:
+            continue
+        power = _power(found[key], value)
+        title = f"{key} {columns.get(key, '')}".lower()
+        worst.count(
+            power == 2 and (not SQUARES.search(title) or bool(ROOTS.search(title))),
+            f"{key} scales as the square of the target's unit, which neither its name nor its heading says",
+        )
+        if power is None:
+            shift = (found[key] - value).item() / math.log(SCALE)
+            bits = abs(shift) > 1e-3 and _whole(shift * math.log(2)) and not _whole(shift)
+            worst.count(
+                bits and "bit" not in title,
+                f"{key} shifts by {shift:.6g} log {SCALE:g} of {numbers} numbers: bits, wanted nats",
+            )
+        error = key + SEM
+        if error in wanted and wanted[error].isfinite() and wanted[error] != 0:
+            other = _power(found[error], wanted[error])
+            # a share within a fixed distance, say, neither scales nor shifts
+            known = power is not None or _shifts(found[key], value)
+            worst.count(
+                known and other != (power or 0),
+                f"{error} scales by the power {other} of the target's unit, {key} by {power or 0}",
+            )
+
+
+def _power(found: Tensor, wanted: Tensor) -> int | None:
+    ratio = (found / wanted).item()
+    if ratio <= 0:
+        return None
+    power = math.log(ratio) / math.log(SCALE)
+    return round(power) if abs(power - round(power)) < 1e-6 else None
+
+
+def _shifts(found: Tensor, wanted: Tensor) -> bool:
+    shift = (found - wanted).item() / math.log(SCALE)
+    return _whole(shift) or _whole(shift * math.log(2))
+
+
+def _whole(number: float) -> bool:
+    return abs(number - round(number)) < 1e-6 * max(1.0, abs(number))
+
+
+def nats(columns: Mapping[str, str], target: Target, flat: Numbers, worst: Worst) -> None:
+    """Of uniform densities, whose every log-density and entropy is known, a number is that in nats and not in bits.
+
+    Args:
+        columns: the metric's.
+        flat: its numbers of uniform predictions of the target.
+    """
+    uniform = math.log2(len(target.names)) if target.kind == "class" else math.log2(2 * math.pi)
+    if target.kind == "angle":
+        uniform *= len(target.names)
+    worst.count(False, "no number is in bits")
+    for key, value in flat.items():
+        title = f"{key} {columns.get(key, '')}".lower()
+        # of two or four classes bits are whole numbers, which a share may be too
+        bits = not _whole(uniform) and abs(abs(value.item()) - uniform) < 1e-6
+        worst.count(
+            bits and "bit" not in title,
+            f"{key} of uniform densities is {value.item():.6g}: bits, wanted nats",
+        )
+
+
+def not_hidden(
+    judge: Callable[[], Numbers],
+    whole: Numbers,
+    moved: Numbers,
+    without: Numbers,
+    columns: Mapping[str, str],
+    better: Mapping[str, str],
+    worst: Worst,
+) -> None:
+    """Predictions that are NaN are refused, make the numbers NaN, or count against who made them; none is left out.
+
+    Args:
+        judge: the numbers with such predictions.
+        whole: the numbers where there are none.
+        moved: the numbers where they are others.
+        without: the numbers without these samples.
+        columns, better: the metric's.
+    """
+    try:
+        found = judge()
+    except (UserError, ValueError, RuntimeError) as error:
+        worst.count(False, f"refused: {error}")
+        return
+    worst.count(False, "no number depends on the prediction")
+    for key in columns:
+        if key not in found or not found[key].isfinite():
+            continue
+        # what does not depend on these predictions, they cannot spoil
+        if (whole[key] - moved[key]).abs() < 1e-12 or whole[key] == without[key]:
+            continue
+        value, left = found[key].item(), without[key].item()
+        flattered = abs(value - left) < 1e-12
+        if key in better:
+            flattered |= value > left if better[key] == "higher" else value < left
+        worst.count(
+            flattered,
+            f"{key} is {value:.6g} though some predictions are NaN, {left:.6g} without them; wanted NaN or an error",
+        )

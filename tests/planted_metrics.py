@@ -1,0 +1,347 @@
+"""Metrics as strangers write them, right ones and each of the others wrong in one thing: `mode=check` has to tell."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.metric import Metric
+from framework.prediction import Prediction
+from framework.target import Target
+
+ONE, THREE = Target("angle", ("azimuth",)), Target("angle", ("azimuth", "elevation", "tilt"))
+HEIGHT, PLACE = Target("real", ("height",)), Target("real", ("x", "y"))
+CLASSES = Target("class", ("a", "b", "c"))
+
+
+def apart(one: Tensor, other: Tensor) -> Tensor:
+    """The shorter way round, radians."""
+    return torch.atan2((one - other).sin(), (one - other).cos()).abs()
+
+
+class Kept(Metric):
+    """A mean of one number a sample with its standard error; keeps all of them."""
+
+    bibtex = ""
+    columns = {"error": "error"}  # noqa: RUF012 - a metric as people write it
+    better = {"error": "lower"}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("seen", [], dist_reduce_fx="cat")
+
+    def each(self, prediction: Prediction) -> Tensor:
+        return (prediction.point.double() - prediction.target.double()).abs().mean(-1)
+
+    def update(self, prediction: Prediction) -> None:
+        self.seen.append(self.each(prediction))  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
+
+    def all(self) -> Tensor:
+        seen: Any = self.seen
+        if isinstance(seen, Tensor):
+            return seen
+        return torch.cat(list(seen)) if len(seen) else torch.empty(0, dtype=torch.float64)
+
+    def spread(self, seen: Tensor) -> Tensor:
+        return seen.std() / len(seen) ** 0.5 if len(seen) > 1 else seen.new_tensor(math.nan)
+
+    def compute(self) -> dict[str, Tensor]:
+        seen = self.all()
+        return {"error": seen.mean(), "error_sem": self.spread(seen)}
+
+
+class Plain(Kept):
+    """Without a standard error."""
+
+    def compute(self) -> dict[str, Tensor]:
+        return {"error": self.all().mean()}
+
+
+class Turned(Kept):
+    """Of angles, in degrees."""
+
+    columns = {"turned_deg": "turned °"}  # noqa: RUF012
+    better = {"turned_deg": "lower"}  # noqa: RUF012
+
+    def each(self, prediction: Prediction) -> Tensor:
+        return apart(prediction.point.double(), prediction.target.double()).rad2deg().mean(-1)
+
+    def compute(self) -> dict[str, Tensor]:
+        seen = self.all()
+        return {"turned_deg": seen.mean(), "turned_deg_sem": self.spread(seen)}
+
+
+class Within(Kept):
+    """Share of predictions within half a unit: a bound in the target's own unit."""
+
+    columns = {"within": "within 0.5"}  # noqa: RUF012
+    better = {"within": "higher"}  # noqa: RUF012
+
+    def each(self, prediction: Prediction) -> Tensor:
+        return (super().each(prediction) < 0.5).double()
+
+    def compute(self) -> dict[str, Tensor]:
+        seen = self.all()
+        return {"within": seen.mean(), "within_sem": self.spread(seen)}
+
+
+class Median(Kept):
+    """With the standard error that a bootstrap of its own gives, as nobody knows another."""
+
+    def compute(self) -> dict[str, Tensor]:
+        seen = self.all()
+        if len(seen) < 2:
+            return {
+                "error": seen.median() if len(seen) else seen.mean(),
+                "error_sem": seen.new_tensor(math.nan),
+            }
+        draws = torch.randint(len(seen), (400, len(seen)), generator=torch.Generator().manual_seed(1))
+        ordered = seen.sort().values
+        return {"error": ordered.quantile(0.5), "error_sem": ordered[draws].quantile(0.5, dim=-1).std()}
+
+
+class Surprise(Kept):
+    """Mean negative log-density, nats."""
+
+    def each(self, prediction: Prediction) -> Tensor:
+        return -prediction.log_prob.double()
+
+
+class Rooted(Kept):
+    """Root mean square by the delta method."""
+
+    columns = {"root": "root mean square"}  # noqa: RUF012
+    better = {"root": "lower"}  # noqa: RUF012
+
+    def each(self, prediction: Prediction) -> Tensor:
+        return (prediction.point.double() - prediction.target.double()).square().mean(-1)
+
+    def compute(self) -> dict[str, Tensor]:
+        seen = self.all()
+        root = seen.mean().sqrt()
+        return {"root": root, "root_sem": self.spread(seen) / (2 * root)}
+
+
+class Hit(Metric):
+    """Share of labels that are the likeliest class; keeps sums alone, and is silent of its standard error."""
+
+    bibtex = ""
+    columns = {"hit": "hit"}  # noqa: RUF012
+    better = {"hit": "higher"}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in ("right", "count"):
+            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, prediction: Prediction) -> None:
+        guess = prediction.class_probabilities.argmax(-1)
+        self.right = self.right + (guess == prediction.target).sum()
+        self.count = self.count + len(guess)
+
+    def compute(self) -> dict[str, Tensor]:
+        return {"hit": self.right / self.count}
+
+
+RIGHT = {
+    "mean with its error": (Kept, PLACE),
+    "mean without": (Plain, HEIGHT),
+    "degrees": (Turned, THREE),
+    "a bound in the unit": (Within, HEIGHT),
+    "a median with a bootstrap": (Median, HEIGHT),
+    "nats": (Surprise, ONE),
+    "nats of classes": (Surprise, CLASSES),
+    "nats of reals": (Surprise, PLACE),
+    "a root": (Rooted, PLACE),
+    "a share of classes": (Hit, CLASSES),
+}
+"""Right metrics and what they judge."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One wrong metric.
+
+    Attributes:
+        name: what is wrong.
+        target: what it judges.
+        base: the right metric.
+        changes: methods of it that are replaced.
+        by: the property that has to find it.
+    """
+
+    name: str
+    target: Target
+    base: type[Metric]
+    changes: dict[str, Callable[..., Any]]
+    by: str
+
+    def build(self) -> Metric:
+        return self.kind()
+
+    @cached_property
+    def kind(self) -> type[Metric]:
+        """One class: states of two cannot merge."""
+        return type(self.base.__name__, (self.base,), dict(self.changes))
+
+
+def nothing_of(seen: Tensor) -> Tensor:
+    return seen.new_tensor(math.nan)
+
+
+def deviation_alone(metric: Kept, seen: Tensor) -> Tensor:
+    return seen.std() if len(seen) > 1 else nothing_of(seen)
+
+
+def half_interval(metric: Kept, seen: Tensor) -> Tensor:
+    return 1.96 * Kept.spread(metric, seen)
+
+
+def divided_by_count(metric: Kept, seen: Tensor) -> Tensor:
+    return seen.std() / len(seen) if len(seen) > 1 else nothing_of(seen)
+
+
+def in_radians(metric: Kept, seen: Tensor) -> Tensor:
+    return Kept.spread(metric, seen).deg2rad()
+
+
+def of_one_is_0(metric: Kept, seen: Tensor) -> Tensor:
+    return seen.std(correction=0) / len(seen) ** 0.5 if len(seen) else nothing_of(seen)
+
+
+def squares_error(metric: Kept) -> dict[str, Tensor]:
+    seen = metric.all()
+    return {"root": seen.mean().sqrt(), "root_sem": metric.spread(seen)}
+
+
+def every_number(metric: Kept, prediction: Prediction) -> Tensor:
+    return apart(prediction.point.double(), prediction.target.double()).rad2deg().flatten()
+
+
+def no_wrap(metric: Kept, prediction: Prediction) -> Tensor:
+    return (prediction.point.double() - prediction.target.double()).abs().rad2deg().mean(-1)
+
+
+def wraps_once(metric: Kept, prediction: Prediction) -> Tensor:
+    gap = (prediction.point.double() - prediction.target.double()).abs()
+    return torch.where(gap > math.pi, (2 * math.pi - gap).abs(), gap).rad2deg().mean(-1)
+
+
+def of_degrees(metric: Kept, prediction: Prediction) -> Tensor:
+    return apart(prediction.point.double(), prediction.target.double().deg2rad()).rad2deg().mean(-1)
+
+
+def radians(metric: Kept, prediction: Prediction) -> Tensor:
+    return apart(prediction.point.double(), prediction.target.double()).mean(-1)
+
+
+def unsaid_degrees(metric: Kept, prediction: Prediction) -> Tensor:
+    return apart(prediction.point.double(), prediction.target.double()).rad2deg().mean(-1)
+
+
+def overwritten(metric: Kept, prediction: Prediction) -> Tensor:
+    return prediction.point.sub_(prediction.target).double().abs().mean(-1)
+
+
+def wrapped_in_place(metric: Kept, prediction: Prediction) -> Tensor:
+    prediction.batch["target"].remainder_(2 * math.pi)
+    return Turned.each(metric, prediction)  # pyright: ignore[reportArgumentType]
+
+
+def first_hundred(metric: Kept, prediction: Prediction) -> Tensor:
+    return Kept.each(metric, prediction)[:100]
+
+
+def jumps(metric: Kept, prediction: Prediction) -> Tensor:
+    found = Kept.each(metric, prediction)
+    return found + 0.1 * torch.cat([found[:1] * 0, found.diff().abs()])
+
+
+def batch_mean(metric: Kept, prediction: Prediction) -> Tensor:
+    found = Kept.each(metric, prediction)
+    return found.mean(0, keepdim=True) if len(found) else found
+
+
+def in_bits(metric: Kept, prediction: Prediction) -> Tensor:
+    return -prediction.log_prob.double() / math.log(2)
+
+
+def ignoring_nan(metric: Kept, prediction: Prediction) -> Tensor:
+    found = Kept.each(metric, prediction)
+    return found[~found.isnan()]
+
+
+def nan_is_0(metric: Kept, prediction: Prediction) -> Tensor:
+    return Kept.each(metric, prediction).nan_to_num(0.0)
+
+
+def squares(metric: Kept) -> dict[str, Tensor]:
+    seen = metric.all()
+    return {"root": seen.mean(), "root_sem": metric.spread(seen)}
+
+
+def last_ones(metric: Kept) -> Tensor:
+    return Kept.all(metric)[-200:]
+
+
+def outliers_cut(metric: Kept) -> Tensor:
+    """Beyond 50 samples those that look odd beside the ones before."""
+    seen = Kept.all(metric)
+    return torch.cat([seen[:50], seen[50:][seen[50:] < 3 * seen[:50].mean()]]) if len(seen) > 50 else seen
+
+
+def finished(metric: Any) -> dict[str, Tensor]:
+    """Divides its own state."""
+    metric.right = metric.right / metric.count
+    return {"hit": metric.right}
+
+
+def averaged_states(metric: Any) -> None:
+    Metric.__init__(metric)
+    for name in ("right", "count"):
+        metric.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="mean")
+
+
+def per_batch(metric: Any, prediction: Prediction) -> None:
+    guess = prediction.class_probabilities.argmax(-1)
+    if len(guess):
+        metric.right = metric.right + (guess == prediction.target).double().mean()
+        metric.count = metric.count + 1
+
+
+SEM, TURNS, UNIT, NAN = "standard errors", "turns do not matter", "unit", "NaN is not hidden"
+BATCHES, ORDER, LEFT = "batches do not matter", "order does not matter", "predictions are left as they are"
+ALL_FAULTS = (
+    Fault("± is the deviation of samples", HEIGHT, Kept, {"spread": deviation_alone}, SEM),
+    Fault("± is half of an interval", PLACE, Kept, {"spread": half_interval}, SEM),
+    Fault("± is divided by n, not by its root", HEIGHT, Kept, {"spread": divided_by_count}, SEM),
+    Fault("± of degrees in radians", ONE, Turned, {"spread": in_radians}, SEM),
+    Fault("± of one sample is 0", HEIGHT, Kept, {"spread": of_one_is_0}, SEM),
+    Fault("± of a root is that of the square", PLACE, Rooted, {"compute": squares_error}, SEM),
+    Fault("± counts every angle as a sample", THREE, Turned, {"each": every_number}, SEM),
+    Fault("angles are not wrapped", ONE, Turned, {"each": no_wrap}, TURNS),
+    Fault("angles are wrapped once", THREE, Turned, {"each": wraps_once}, TURNS),
+    Fault("targets are taken for degrees", ONE, Turned, {"each": of_degrees}, TURNS),
+    Fault("radians are called degrees", THREE, Turned, {"each": radians}, UNIT),
+    Fault("degrees are not said", ONE, Kept, {"each": unsaid_degrees}, UNIT),
+    Fault("bits are called nats, of classes", CLASSES, Surprise, {"each": in_bits}, UNIT),
+    Fault("bits are called nats, of an angle", ONE, Surprise, {"each": in_bits}, UNIT),
+    Fault("bits are called nats, of reals", PLACE, Surprise, {"each": in_bits}, UNIT),
+    Fault("the root is forgotten", PLACE, Rooted, {"compute": squares}, UNIT),
+    Fault("the point is overwritten", PLACE, Kept, {"each": overwritten}, LEFT),
+    Fault("the target is wrapped in place", ONE, Turned, {"each": wrapped_in_place}, LEFT),
+    Fault("a hundred of a batch", HEIGHT, Kept, {"each": first_hundred}, BATCHES),
+    Fault("a mean of batches' means", HEIGHT, Kept, {"each": batch_mean}, BATCHES),
+    Fault("shares of batches", CLASSES, Hit, {"update": per_batch}, BATCHES),
+    Fault("the last two hundred", HEIGHT, Kept, {"all": last_ones}, ORDER),
+    Fault("neighbours in a batch", PLACE, Kept, {"each": jumps}, ORDER),
+    Fault("odd ones are cut", HEIGHT, Kept, {"all": outliers_cut}, ORDER),
+    Fault("NaN is left out", PLACE, Kept, {"each": ignoring_nan}, NAN),
+    Fault("NaN is 0", HEIGHT, Kept, {"each": nan_is_0}, NAN),
+    Fault("computing divides the sum", CLASSES, Hit, {"compute": finished}, "computing changes nothing"),
+    Fault("merged states are averaged", CLASSES, Hit, {"__init__": averaged_states}, "states merge"),
+)

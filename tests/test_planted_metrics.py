@@ -1,0 +1,28 @@
+"""`mode=check` finds every wrong metric that is planted, by the property meant for it, and none in right ones."""
+
+import pytest
+
+from framework.metric import Metric
+from framework.target import Target
+from framework.testing.finding import require
+from framework.testing.metrics import examine_metric
+from framework.testing.rows import MetricRow
+from tests.planted_metrics import ALL_FAULTS, RIGHT, Fault
+
+
+@pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
+def test_the_fault_is_found(fault: Fault) -> None:
+    failed = {
+        finding.name
+        for finding in examine_metric(MetricRow("", fault.target), fault.build)
+        if not finding.holds
+    }
+    assert fault.by in failed
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_right_metric_passes(name: str) -> None:
+    kind: type[Metric]
+    target: Target
+    kind, target = RIGHT[name]
+    require(*examine_metric(MetricRow("", target), kind))
