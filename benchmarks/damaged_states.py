@@ -356,7 +356,9 @@ def predicted(file: Path) -> object:
     told = content[TOLD] if isinstance(content.get(TOLD), dict) else {}
     found = None
     try:
-        inputs = torch.rand(4, *description.input_shape)
+        inputs = torch.rand(
+            1, *description.input_shape
+        )  # where the damage is in what was told; some heads fit to it
         given = told.get("inputs")
         if isinstance(given, Tensor) and given.shape == inputs.shape:
             inputs = given

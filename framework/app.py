@@ -8,6 +8,7 @@ from io import TextIOWrapper
 from pathlib import Path
 
 from framework.errors import ConfigError, UserError
+from framework.storage.threads import wait_passively
 
 
 def main() -> None:
@@ -15,6 +16,7 @@ def main() -> None:
 
     It exits with 0, 1 (failed), 2 (refused), 129 (its terminal was closed), 130 (interrupted) or 143 (terminated).
     """
+    wait_passively()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a table must not fail for an ± that a terminal has not
             stream.reconfigure(errors="backslashreplace")

@@ -1,11 +1,28 @@
 """Work that is shared out to threads is done once, and ends where some of it fails."""
 
+import os
 import threading
 import time
 
 import pytest
 
-from framework.storage.threads import Pool
+from framework.storage.threads import Pool, wait_passively
+
+
+@pytest.mark.parametrize(
+    ("set_by_user", "policy"),
+    [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"), ({"GOMP_SPINCOUNT": "2000"}, None)],
+)
+def test_openmp_waits_passively_unless_the_user_says_otherwise(
+    set_by_user: dict[str, str], policy: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.setenv(name, "")  # so that it is put back afterwards
+        monkeypatch.delenv(name)
+    for name, value in set_by_user.items():
+        monkeypatch.setenv(name, value)
+    wait_passively()
+    assert os.environ.get("OMP_WAIT_POLICY") == policy
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
