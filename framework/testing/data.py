@@ -1,10 +1,9 @@
 """The contract of a data set: one function a property, each reporting the worst case it saw."""
 
-import hashlib
 import math
 import pickle
 import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,12 +24,17 @@ from framework.testing.data_files import (
     raw_input,
     read_back,
 )
-from framework.testing.data_folders import Build, Workbench, cache_in
+from framework.testing.data_folders import Build, Workbench, cache_in, listed_backwards
 from framework.testing.data_samples import (
+    FEW,
+    batches,
     equal_fields,
+    equal_marks,
     equal_splits,
     few,
     fits,
+    marks,
+    numbers,
     parts,
     samples,
     trimmed,
@@ -52,10 +56,13 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "attributes": (0.0, _attributes),
             "constructor reads nothing": (0.0, _constructor),
             "samples": (0.0, _samples),
+            "samples differ": (0.5, _differ),
+            "images are 0 to 1": (1e-6, _images),
             "angles are radians": (2 * math.pi, _radians),
             "no sample in two splits": (0.0, _disjoint),
             "same data, same bits": (0.0, _repeatable),
             "one by one or at once": (0.0, _fetching),
+            "a batch is nobody else's": (0.0, _owned),
             "fingerprint": (0.0, _fingerprint),
             "synthetic is said": (0.0, _synthetic),
             "pictures": (0.0, _pictures),
@@ -88,6 +95,9 @@ def _applies(name: str, bench: Workbench) -> bool:
     match name:
         case "angles are radians":
             return getattr(getattr(bench.data, "target", None), "kind", None) == "angle"
+        case "images are 0 to 1":
+            shape = getattr(bench.data, "input_shape", ())
+            return len(shape) == 3 and shape[0] in (1, 3)
         case "synthetic is said":
             return row.synthetic is not None
         case "official layout read back":
@@ -150,8 +160,72 @@ def _constructor(bench: Workbench, worst: Worst) -> None:
 def _samples(bench: Workbench, worst: Worst) -> None:
     data = bench.data
     for name, split in parts(data).items():
+        fields: list[str] = []
         for number, sample in samples(split):
+            fields = fields or sorted(sample)
+            worst.same(f"{name} {number}: fields", sorted(sample), fields)
             _sample(data, sample, number, f"{name} {number}", worst)
+        if len(split) <= FEW:
+            continue
+        for asked in batches(numbers(split), [256]):
+            _together(data, fetched(split, asked), asked, f"{name} {asked[0]} to {asked[-1]}", worst)
+
+
+def _together(data: Data, batch: Batch, asked: Sequence[int], where: str, worst: Worst) -> None:
+    """The same of many samples."""
+    missing = [key for key in NEEDED if key not in batch]
+    worst.same(f"{where}: fields missing", missing, [])
+    if missing:
+        return
+    target = batch["target"]
+    worst.count(batch["index"] != torch.tensor(asked), f"{where}: index, wanted the samples' numbers")
+    group = batch["group"]
+    worst.count((group < 0) | (group >= len(data.groups)), f"{where}: group of {len(data.groups)}")
+    if data.target.kind == "class":
+        worst.count((target < 0) | (target >= len(data.target.names)), f"{where}: class")
+    else:
+        worst.finite(f"{where}: target", target)
+    inputs = batch["input"]
+    if inputs.dim() != 3:
+        worst.finite(f"{where}: input", inputs)
+        return
+    for number, cloud in zip(asked, inputs, strict=True):
+        worst.finite(f"{where}: input of {number}", trimmed(cloud))
+
+
+def _differ(bench: Workbench, worst: Worst) -> None:
+    """Of inputs that are measured no half is the same again, and in training neither all inputs nor targets are one."""
+    for name, split in parts(bench.data).items():
+        found = bench.contents[name].marks
+        if len(found) < 2:
+            worst.count(False, f"{name} has one sample")
+            continue
+        if name == "train":
+            for key in ("input", "target"):
+                worst.count(
+                    len({one[key] for one in found.values()}) == 1, f"{name}: every {key} is the same"
+                )
+        if _measured(split[0]["input"]):
+            different = len({(one["input"], one["target"]) for one in found.values()})
+            worst.see(1 - different / len(found), f"{name}: {different} different samples of {len(found)}")
+
+
+def _measured(inputs: Tensor) -> bool:
+    """Not of so few whole numbers that they may well be the same in two samples."""
+    kept = trimmed(inputs)
+    return kept.numel() >= 16 or (kept.is_floating_point() and bool((kept != kept.round()).any()))
+
+
+def _images(bench: Workbench, worst: Worst) -> None:
+    """Floats of images, that is: encoders read bytes as 0 to 1 and floats as they are."""
+    for name, split in parts(bench.data).items():
+        for number, sample in samples(split):
+            inputs = sample["input"]
+            if not inputs.is_floating_point():
+                worst.count(False, "bytes")
+                continue
+            worst.see((-inputs).amax(), f"{name} {number}: down to {inputs.amin().item():.4g}")
+            worst.see(inputs.amax() - 1, f"{name} {number}: up to {inputs.amax().item():.4g}")
 
 
 def _sample(data: Data, sample: Any, number: int, where: str, worst: Worst) -> None:
@@ -191,21 +265,23 @@ def _target(data: Data, target: Tensor, where: str, worst: Worst) -> None:
 def _radians(bench: Workbench, worst: Worst) -> None:
     """Angles beyond a turn are most likely degrees."""
     for name, split in parts(bench.data).items():
-        for number, sample in samples(split):
-            worst.see(sample["target"].abs().max(), f"{name} {number}: {sample['target'].tolist()}")
+        for asked in batches(numbers(split), [64]):
+            largest = fetched(split, asked)["target"].abs().flatten(1).amax(-1)
+            worst.see(largest, lambda at, name=name, asked=asked: f"{name} {asked[at[0]]}")
 
 
 def _disjoint(bench: Workbench, worst: Worst) -> None:
     """No input with its target is in two splits."""
-    seen: dict[bytes, str] = {}
+    seen: dict[tuple[int, int], str] = {}
     for name, split in parts(bench.data).items():
-        own = {}
-        for number, sample in samples(split):
+        own: dict[tuple[int, int], str] = {}
+        for number in numbers(split):
+            sample = split[number]
             target = sample["target"]
             # training targets may be kept in half precision
             rounded = target.half() if target.is_floating_point() else target
-            content = hashlib.sha256(trimmed(sample["input"]).numpy().tobytes() + rounded.numpy().tobytes())
-            own[content.digest()] = f"{name} {number}"
+            one = marks({"input": sample["input"][None], "target": rounded[None]})[0]
+            own[one["input"], one["target"]] = f"{name} {number}"
         worst.count(not own, f"{name} is empty")
         for content, where in own.items():
             worst.count(content in seen, f"{where} is {seen.get(content)} again")
@@ -213,41 +289,67 @@ def _disjoint(bench: Workbench, worst: Worst) -> None:
 
 
 def _repeatable(bench: Workbench, worst: Worst) -> None:
-    """Two preparations in two places, after other random numbers, give the same samples, and so do two looks."""
+    """Two preparations in two places give the same samples, also after other random numbers and where folders list
+    their files in another order; so does one more in the same place, and so does a second look."""
     torch.manual_seed(SEED + 7)
     np.random.seed(SEED + 7)  # noqa: NPY002 - the global generator is the point
     random.seed(SEED + 7)
-    again = bench.prepared(bench.place())
-    worst.same("target", again.target, bench.data.target)
-    equal_splits(again, bench.data, "another preparation", worst)
-    equal_splits(bench.data, bench.data, "a second look", worst)
+    place = bench.place()
+    wanted = bench.contents
+    with listed_backwards():
+        again = bench.prepared(place)
+        worst.same("target", again.target, bench.data.target)
+        equal_splits(again, wanted, "another preparation", worst)
+    equal_splits(bench.again, wanted, "prepared again in the same place", worst)
+    equal_splits(bench.data, wanted, "a second look", worst)
+
+
+SIZES = (1, 300, 37, 64, 129)
+"""Of the batches that are fetched of a split, in turn."""
 
 
 def _fetching(bench: Workbench, worst: Worst) -> None:
-    """A fetched batch holds the single samples, in whatever order they are asked for."""
+    """A fetched batch holds the single samples, in whatever order and number they are asked for."""
     for name, split in parts(bench.data).items():
-        order = few(len(split), 24)
-        shuffled = np.random.default_rng(SEED).permutation(order).tolist()
+        wanted = bench.contents[name].marks
+        order = list(wanted)
+        random = np.random.default_rng(SEED)
+        shuffled = random.permutation(order).tolist()
         for what, asked in {
-            "in order": order,
-            "shuffled": shuffled,
-            "one twice": [*order[-2:], *order[-2:]],
+            "in order": [order[:1000]],
+            "shuffled": list(batches(shuffled, SIZES)),
+            "backwards": [order[::-1][:300]],
+            "one twice": [[*order[-2:], *order[-2:], *order[-40:]]],
         }.items():
-            batch = fetched(split, asked)
-            for row, number in enumerate(asked):
-                single = split[number]
-                where = f"{name} {number}, {what}"
-                worst.same(f"{where}: fields", sorted(batch), sorted(single))
-                for key in set(batch) & set(single):
-                    # clouds of a batch are padded to the largest
-                    whole = key == "input" and single[key].dim() == 2
-                    found = trimmed(batch[key][row]) if whole else batch[key][row]
-                    worst.same_bits(f"{where}: {key}", found, trimmed(single[key]) if whole else single[key])
+            for part in asked:
+                found = marks(fetched(split, part))
+                worst.same(f"{name}, {what}: samples of a batch of {len(part)}", len(found), len(part))
+                for number, one in zip(part, found, strict=False):
+                    equal_marks(one, wanted[number], f"{name} {number} of {len(part)}, {what}", worst)
+
+
+def _owned(bench: Workbench, worst: Worst) -> None:
+    """What is fetched later changes no batch, and a batch has memory of its own, which may be written to."""
+    for name, split in parts(bench.data).items():
+        order = list(bench.contents[name].marks)
+        wanted = [bench.contents[name].marks[number] for number in order[:16]]
+        single = split[order[0]]
+        kept = fetched(split, order[:16])
+        _ = fetched(split, order[-16:])
+        for number, found, one in zip(order, marks(kept), wanted, strict=False):
+            equal_marks(found, one, f"{name} {number} after another batch was fetched", worst)
+        _ = split[order[-1]]
+        found = marks({key: value[None] for key, value in single.items()})[0]
+        equal_marks(found, wanted[0], f"{name} {order[0]} after another sample was fetched", worst)
+        again = fetched(split, order[:16])
+        for key in ("input", "target"):
+            shared = kept[key].untyped_storage().data_ptr() == again[key].untyped_storage().data_ptr()
+            worst.count(shared, f"{name}: {key} of two batches is one memory: what augment writes stays")
 
 
 def _fingerprint(bench: Workbench, worst: Worst) -> None:
     found = _words(bench.data, worst)
-    worst.same("of the same data again", _words(bench.prepared(bench.first), worst), found)
+    worst.same("of the same data again", _words(bench.again, worst), found)
     for key, value in bench.row.changes.items():
         other = bench.prepared(bench.first, **{key: value})
         worst.count(_words(other, worst) == found, f"the same with {key} = {value}")
@@ -283,7 +385,10 @@ def _augment(bench: Workbench, worst: Worst) -> None:
     """A varied batch is a batch still, and a function of torch's seed alone; while a model of float64 trains, too."""
     data, train = bench.data, parts(bench.data)["train"]
     usual = torch.get_default_dtype()
-    for size, kind in ((min(16, len(train)), usual), (1, usual), (min(16, len(train)), torch.float64)):
+    sizes = [(1, usual), (min(16, len(train)), usual), (min(16, len(train)), torch.float64)]
+    if len(train) > 16:
+        sizes.append((min(300, len(train)), usual))
+    for size, kind in sizes:
         batch = fetched(train, list(range(size)))
         if kind != usual:  # as the trainer does
             batch = {
@@ -320,7 +425,7 @@ def _varied(data: Data, batch: Batch, where: str, worst: Worst) -> None:
             worst.count((~new.isfinite() & old.isfinite()).sum(), f"{where}: {key} no longer finite")
         for key in ("index", "group"):
             worst.same_bits(f"{where}: {key}", found[key], batch[key])
-        for row, target in enumerate(found["target"]):
+        for row, target in enumerate(found["target"][:16]):
             _target(data, target, f"{where}, row {row}", worst)
 
 
@@ -331,3 +436,7 @@ def _workers(bench: Workbench, worst: Worst) -> None:
         worst.same(f"length of a copy of {name}", len(copy), len(split))
         for number in few(len(split), 3):
             equal_fields(copy[number], split[number], f"{name} {number} of a copy", worst)
+        wanted = bench.contents[name].marks
+        asked = list(wanted)[-300:]
+        for number, one in zip(asked, marks(fetched(copy, asked)), strict=True):
+            equal_marks(one, wanted[number], f"{name} {number} of a copy", worst)

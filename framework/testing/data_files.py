@@ -2,6 +2,7 @@
 
 import io
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
@@ -14,7 +15,7 @@ from framework.data import Data
 from framework.errors import DataError
 from framework.storage.generated import MARK
 from framework.testing.data_folders import Workbench, cache_in, damage, first_match
-from framework.testing.data_samples import equal_splits, parts, samples, total, trimmed
+from framework.testing.data_samples import FEW, equal_splits, parts, samples, total, trimmed
 from framework.testing.finding import TooSlow, Worst
 from framework.testing.rows import DAMAGES, Damage
 
@@ -27,7 +28,7 @@ def read_back(bench: Workbench, worst: Worst) -> None:
         worst.same(f"{what}: synthetic", found.synthetic, synthetic)
         worst.same(f"{what}: target", found.target, bench.data.target)
         worst.same(f"{what}: input_shape", found.input_shape, bench.data.input_shape)
-        equal_splits(found, bench.data, what, worst, only=("input", "target", "index", "group"))
+        equal_splits(found, bench.contents, what, worst, only=("input", "target", "index", "group"))
 
 
 def missing_root(bench: Workbench, worst: Worst) -> None:
@@ -93,14 +94,30 @@ def own_files(bench: Workbench, worst: Worst) -> None:
     apart = [sample for file in files for sample in _read(data, [file], bench, worst)]
     backwards = _read(data, files[::-1], bench, worst)
     count = len(_read(data, files[-1:], bench, worst))
+    times = max(1, min(5, FEW // max(len(together), 1)))  # more samples are not all looked at
+    renamed = _exchanged(files, bench.folder())
+    swapped = [_read(data, [file], bench, worst) for file in renamed]
     for what, found, wanted in (
         ("one file at a time", apart, together),
+        (f"every file {times} times", _read(data, [*files] * times, bench, worst), together * times),
+        (
+            "files that have each other's names",
+            [sample for part in swapped[::-1] for sample in part],
+            [sample for file in files[: len(renamed)] for sample in _read(data, [file], bench, worst)],
+        ),
         ("files backwards", backwards[:count], together[-count:]),
         ("without prepare", _read(bench.data, files, bench, worst), together),
     ):
         worst.same(f"{what}: samples", len(found), len(wanted))
         for number, (one, other) in enumerate(zip(found, wanted, strict=False)):
             worst.same_bits(f"{what}: sample {number}", one, other)
+
+
+def _exchanged(files: Sequence[Path], folder: Path) -> list[Path]:
+    """The first two files under each other's names elsewhere; none where their formats differ."""
+    if len(files) < 2 or files[0].suffix != files[1].suffix or not all(file.is_file() for file in files[:2]):
+        return []
+    return [Path(shutil.copy(files[other], folder / files[one].name)) for one, other in ((0, 1), (1, 0))]
 
 
 def raw_input(bench: Workbench, worst: Worst) -> None:

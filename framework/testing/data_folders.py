@@ -15,6 +15,7 @@ import numpy as np
 
 from framework.data import Data
 from framework.storage.generated import MARK
+from framework.testing.data_samples import Contents, contents, parts
 from framework.testing.finding import SEED
 from framework.testing.rows import SAID_BY_ROWS, Damage, DataRow
 
@@ -32,6 +33,41 @@ def cache_in(folder: Path) -> Iterator[None]:
         del os.environ["FRAMEWORK_CACHE"]
         if before is not None:
             os.environ["FRAMEWORK_CACHE"] = before
+
+
+class _Entries:
+    """What `os.scandir` gives, in another order."""
+
+    def __init__(self, entries: Any) -> None:
+        with entries:
+            self.entries = iter(sorted(entries, key=lambda entry: entry.name, reverse=True))
+
+    def __iter__(self) -> Iterator[Any]:
+        return self.entries
+
+    def __next__(self) -> Any:
+        return next(self.entries)
+
+    def __enter__(self) -> Iterator[Any]:
+        return self.entries
+
+    def __exit__(self, *raised: object) -> None:
+        pass
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@contextmanager
+def listed_backwards() -> Iterator[None]:
+    """Folders list their files in another order meanwhile, as on another machine."""
+    listdir, scandir = os.listdir, os.scandir
+    os.listdir = lambda *path: sorted(listdir(*path), reverse=True)  # type: ignore[assignment]
+    os.scandir = lambda *path: _Entries(scandir(*path))  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        os.listdir, os.scandir = listdir, scandir
 
 
 class Place:
@@ -90,6 +126,16 @@ class Workbench:
     def data(self) -> Data:
         """Prepared once, for checks that change nothing."""
         return self.prepared(self.first)
+
+    @cached_property
+    def again(self) -> Data:
+        """Prepared in the same place once more: of generated data what was written is read."""
+        return self.prepared(self.first)
+
+    @cached_property
+    def contents(self) -> dict[str, Contents]:
+        """Of every split."""
+        return {name: contents(split) for name, split in parts(self.data).items()}
 
     @cached_property
     def says_where(self) -> list[str]:

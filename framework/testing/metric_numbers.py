@@ -223,6 +223,8 @@ def not_hidden(
             continue
         value, left = found[key].item(), without[key].item()
         flattered = abs(value - left) < 1e-12
+        if better.get(key) == "higher":
+            flattered &= left != 0  # of none that is right, one more that is wrong leaves none
         if key in better:
             flattered |= value > left if better[key] == "higher" else value < left
         worst.count(
