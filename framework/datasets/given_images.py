@@ -10,7 +10,7 @@ from torch import Tensor
 
 from framework.data import Data
 from framework.datasets.images import plain, square
-from framework.errors import DataError
+from framework.errors import DataError, shown
 
 
 def inputs(data: Data, given: Any) -> Tensor:
@@ -51,7 +51,15 @@ def inputs(data: Data, given: Any) -> Tensor:
 
 
 def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channels side side"]:
-    decoded = plain(image, shape[0], upright=True)
+    try:
+        decoded = plain(image, shape[0], upright=True)
+    except DataError as error:
+        raise DataError(f"an image of mode {image.mode}: {error}") from error
+    except Exception as error:  # Pillow reads the file only now
+        why = shown(error) or type(error).__name__
+        raise DataError(
+            f"an image of mode {image.mode} cannot be decoded ({why}). Restore its file."
+        ) from error
     pixels = square(decoded, (0.0, 0.0, float(decoded.width), float(decoded.height)), 0.0, shape[1])
     if pixels is None:
         raise DataError(f"an image of {image.width} × {image.height} pixels shows nothing.")

@@ -7,13 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -32,6 +34,10 @@ SUFFIXES = (".avif", ".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".
 """The usual ends of their names; a file of another one is an image where it can be read."""
 ORIENTATION = 0x0112
 """Number of EXIF's entry that says how an image is turned."""
+BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
+"""Numbers of TIFF's entries for the bits of a number, and for what 0 stands: 0 is white, 1 is black."""
+MODES = {1: "L", 3: "RGB", 4: "RGBA"}
+"""Pillow's names of decoded images, by their channels."""
 STRIP = 256
 """Rows that are converted at once."""
 IN_MEMORY = 2 * 2**30
@@ -104,8 +110,26 @@ def opened(file: Path) -> Iterator[Image.Image]:
     with (
         reading.guarded(file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."),
         reading.opened(file) as stream,
-        Image.open(stream, formats=FORMATS) as image,
+        of_stream(stream) as image,
     ):
+        yield image
+
+
+@contextmanager
+def of_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
+    """Open the content of an image file, whatever its name ends in, for the time of decoding it.
+
+    Of several images (frames, pages) it is the first.
+
+    Raises:
+        ValueError: it has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow.
+        Exception: it is no image, or damaged.
+    """
+    try:
+        found = Image.open(stream, formats=FORMATS)
+    except UnidentifiedImageError:
+        raise ValueError(f"its content is none of {', '.join(FORMATS)}") from None
+    with found as image:
         most = MOST_PIXELS_OF.get(image.format or "", MOST_PIXELS)
         if image.width * image.height > most or max(image.size) > LONGEST_SIDE:
             raise ValueError(
@@ -147,30 +171,118 @@ DECODED = AtOnce(AT_ONCE)
 
 
 def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
-    """Decode an image to RGB or grey with eight bits, however it was stored; transparent pixels become white."""
-    if image.mode == "F":
-        raise ValueError("its pixels are floating-point numbers of unknown range; wanted 8 or 16 bits")
+    """Decode an image to eight bits, however it was stored: the decoder of every reader of images.
+
+    Args:
+        channels: 1 for grey, 3 for RGB, 4 for RGB with alpha. Without alpha, transparent pixels become white.
+        upright: turn it as its EXIF entry says.
+
+    Raises:
+        DataError: the range of its numbers is unknown.
+    """
+    stored = _stored(image)
+    # exif_transpose would copy it in any case
     turned = upright and image.getexif().get(ORIENTATION, 1) != 1
-    whole = ImageOps.exif_transpose(image) if turned else image  # which would copy it in any case
+    whole = ImageOps.exif_transpose(image) if turned else image
     whole.load()
-    mode = "RGB" if channels == 3 else "L"
+    mode = MODES[channels]
     if whole.mode == mode and "transparency" not in whole.info:
         return whole
     found = Image.new(mode, whole.size)
     # in strips: beside the image and the result a whole one of each step would take four times the memory
-    for top in range(0, whole.height, STRIP):
-        strip = whole.crop((0, top, whole.width, min(top + STRIP, whole.height)))
-        found.paste(_eight_bit(strip).convert(mode), (0, top))
+    for top, strip in _strips(whole, stored, channels, opaque=False):
+        found.paste(strip, (0, top))
     return found
 
 
-def _eight_bit(image: Image.Image) -> Image.Image:
-    """The same without alpha, and with eight bits."""
-    if image.mode.startswith("I"):
-        return Image.fromarray((np.asarray(image).clip(0, 65535) // 257).astype(np.uint8))
-    if "transparency" in image.info or image.mode in ("LA", "PA", "RGBA"):
-        return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
-    return image
+def colors(image: Image.Image) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+    """Decode an image to RGB as `plain` does, but without its alpha: what lies under transparent pixels is shown.
+
+    Yields:
+        The first row of a strip, and its pixels.
+
+    Raises:
+        DataError: as `plain`.
+    """
+    for top, strip in _strips(image, _stored(image), 3, opaque=True):
+        yield top, np.asarray(strip)
+
+
+def _strips(
+    image: Image.Image, stored: "_Stored", channels: int, *, opaque: bool
+) -> Iterator[tuple[int, Image.Image]]:
+    for top in range(0, image.height, STRIP):
+        strip = image.crop((0, top, image.width, min(top + STRIP, image.height)))
+        if stored.key is not None:
+            strip.info["transparency"] = stored.key
+        strip = _eight_bit(strip, stored)
+        if channels != 4 and not opaque and has_alpha(strip):
+            strip = Image.alpha_composite(Image.new("RGBA", strip.size, "white"), strip.convert("RGBA"))
+        yield top, strip.convert(MODES[channels])
+
+
+def has_alpha(image: Image.Image) -> bool:
+    """Say whether an image tells how transparent its pixels are."""
+    return image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info
+
+
+class _Stored(NamedTuple):
+    """How the numbers of a file are to be read; a loaded image no longer says it.
+
+    Attributes:
+        black, white: the numbers that stand for them where a number has more than eight bits.
+        key: which colour is transparent, as decoded pixels say it; None where no colour is.
+    """
+
+    black: int
+    white: int
+    key: Any
+
+
+def _stored(image: Image.Image) -> _Stored:
+    """Look at the header of an image.
+
+    Raises:
+        DataError: the range of its numbers is unknown, or one of its 16-bit colours, of which 8 bits are decoded, is
+            transparent.
+    """
+    tags = getattr(image, "tag_v2", {})  # of a TIFF
+    long = image.mode.startswith("I")
+    if image.mode == "F" or (image.mode == "I" and tags):
+        kind = "floating-point numbers" if image.mode == "F" else "integers of 32 bits, or with a sign,"
+        raise DataError(
+            f"its pixels are {kind} of unknown range; wanted 8 or 16 bits. Scale them to 16 bits, and save it anew."
+        )
+    key = image.info.get("transparency")
+    if image.mode == "RGB" and isinstance(key, tuple) and max(key) > 255:
+        raise DataError(
+            "one of its 16-bit colours stands for transparent pixels; wanted an alpha channel. Save it with one."
+        )
+    if image.mode == "L" and isinstance(key, int) and isinstance(image, ImageFile.ImageFile) and image.tile:
+        # Pillow gives it in the bits of the PNG file
+        key *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
+    most = 2 ** tags.get(BITS_PER_SAMPLE, (16,))[0] - 1 if long else 255
+    return _Stored(most, 0, key) if long and tags.get(PHOTOMETRIC) == 0 else _Stored(0, most, key)
+
+
+def _eight_bit(strip: Image.Image, stored: _Stored) -> Image.Image:
+    """Return a strip in one of the modes that Pillow converts to grey, RGB and RGBA."""
+    if strip.mode.startswith("I"):
+        numbers, most = np.asarray(strip).astype(np.int64), max(stored.black, stored.white)
+        if numbers.size and not (numbers.min() >= 0 and numbers.max() <= most):
+            raise DataError(
+                f"its pixels go from {numbers.min()} to {numbers.max()}; wanted 0 to {most}. Scale them, and save it "
+                "anew."
+            )
+        grey = Image.fromarray(((255 * abs(numbers - stored.black) + most // 2) // most).astype(np.uint8))
+        if stored.key is not None:
+            grey.putalpha(Image.fromarray((255 * (numbers != stored.key)).astype(np.uint8)))
+        return grey
+    if strip.mode in ("La", "RGBa"):  # colours that were multiplied with alpha
+        return strip.convert("LA" if strip.mode == "La" else "RGBA")
+    if has_alpha(strip):
+        return strip.convert("RGBA")
+    return strip.convert("RGB") if strip.mode == "LAB" else strip
 
 
 def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:

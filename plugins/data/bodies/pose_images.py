@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
-from framework.datasets.images import opened
+from framework.datasets.images import has_alpha, opened, plain
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
 from framework.geometry.light import eight_bit, linear
@@ -157,12 +157,12 @@ class PoseFromImage(Data):
     def _picture_of(self, file: Path) -> Float[Tensor, "4 height width"]:
         _, height, width = self.input_shape
         with opened(file) as image:
-            if image.mode != "RGBA" or image.size != (width, height):
+            if not has_alpha(image) or image.size != (width, height):
                 raise DataError(
                     f"{file}: {image.width} × {image.height} pixels, mode {image.mode}; wanted {width} × {height} and "
-                    "an alpha channel that says how much of a pixel is body: cut the body out and scale the picture."
+                    "an alpha channel that says how much of a pixel is body. Cut the body out and scale the picture."
                 )
-            stored = torch.from_numpy(np.array(image))
+            stored = torch.from_numpy(np.array(plain(image, 4, upright=False)))
         cover = stored[..., 3:].float() / 255
         return torch.cat([linear(stored[..., :3]) * cover, cover], -1).movedim(-1, 0)
 

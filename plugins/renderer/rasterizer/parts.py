@@ -9,15 +9,14 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image
 from torch import Tensor
 
-from framework.datasets.images import FORMATS, STRIP
-from framework.errors import DataError, quoted
+from framework.datasets import images
+from framework.errors import DataError, quoted, shown
 from framework.geometry.camera import look_from
 from framework.geometry.light import linear
 from framework.renderer import Scene, Texture, Wrap, joined
-from framework.storage.limits import FEW_TEXELS, LONGEST_SIDE, MOST_TEXELS, TEXELS_PER_BYTE
+from framework.storage.limits import FEW_TEXELS, MOST_TEXELS, TEXELS_PER_BYTE
 
 Axis = Literal["y", "z"]
 GREY = 0.55
@@ -155,27 +154,23 @@ class Pictures:
             DataError: it is no image, or too large.
         """
         try:
-            with Image.open(BytesIO(content), formats=FORMATS) as image:
+            with images.of_stream(BytesIO(content)) as image:
                 self._texels += image.width * image.height
                 self._bytes += len(content)
                 most = min(MOST_TEXELS, max(FEW_TEXELS, TEXELS_PER_BYTE * self._bytes))
-                if self._texels > most or max(image.size) > LONGEST_SIDE:
+                if self._texels > most:
                     raise DataError(
-                        f"the texture {name} has {image.width} x {image.height} pixels; wanted up to {LONGEST_SIDE} "
-                        f"along a side, and {most} of all textures together. Make it smaller."
+                        f"it has {image.width} x {image.height} pixels; wanted up to {most} of all textures together. "
+                        "Make it smaller."
                     )
                 light = np.empty((image.height, image.width, 3), np.float32)
-                for top in range(
-                    0, image.height, STRIP
-                ):  # beside the whole image, whole steps would take twice it
-                    strip = image.crop((0, top, image.width, min(top + STRIP, image.height)))
-                    plain = strip.convert("RGBA") if "transparency" in image.info else strip
-                    light[top : top + STRIP] = _light(np.asarray(plain.convert("RGB")))
-        except DataError:
-            raise
+                for top, strip in images.colors(image):
+                    light[top : top + len(strip)] = _light(strip)
+        except DataError as error:
+            raise DataError(f"the texture {name}: {error}") from error
         except Exception as error:
             raise DataError(
-                f"the texture {name} cannot be read as an image ({type(error).__name__}). Restore it."
+                f"the texture {name} cannot be read as an image ({shown(error) or type(error).__name__}). Restore it."
             ) from error
         self._decoded[key] = torch.from_numpy(light)
         return self._decoded[key]

@@ -426,7 +426,7 @@ def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.Monk
     file = written(tmp_path, content, arrays)
     monkeypatch.setattr(parts, "MOST_TEXELS", 3)
     with pytest.raises(
-        DataError, match=r"one\.glb: the texture 0 has 2 x 2 pixels; wanted .* Make it smaller"
+        DataError, match=r"one\.glb: the texture 0: it has 2 x 2 pixels; wanted .* Make it smaller"
     ):
         read(file)
 
