@@ -2,7 +2,7 @@
 crop and bfloat16 cost.
 
 `python benchmarks/smplpix_networks.py` first trains what outputs/smplpix_networks does not hold yet, half an hour of
-one core. Results lie beside this file.
+one core. `--only frames` writes the section of the milliseconds a frame alone. Results lie beside this file.
 """
 
 import json
@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.machine import machine, milliseconds
 from benchmarks.rasterizer import figure
+from benchmarks.rounds import ROUNDS, Rounds, in_turn, replace_section, require_idle
 from framework.configuration.loading import load_with_description, reader
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
@@ -36,8 +37,6 @@ FRONT = (0.4, 0.15, 0.05)
 """Azimuth, elevation and tilt, radians, from which the body covers a quarter of the frame there."""
 SPLAT = 5
 """Pixels, as smplpix/quick has it."""
-ROUNDS = 3
-REPEATS = {"unet": 3, "slim": 40, "projection": 40}
 TRAININGS = {
     "unet": ("experiment=smplpix/unet", "trainer.max_epochs=1", "+trainer.limit_train_batches=120"),
     "slim": ("experiment=smplpix/quick", "trainer.max_epochs=10"),
@@ -91,8 +90,8 @@ def like(made: Encoder, name: str, channels: int, size: tuple[int, int], **confi
     return other
 
 
-def frames() -> tuple[list[str], dict[tuple, float], list[float]]:
-    """A line for each network, size, precision and crop; the milliseconds; the share of pixels that are covered."""
+def frames() -> tuple[list[str], dict[tuple, Rounds], list[float]]:
+    """A line for each network, size, precision and crop; their milliseconds; the share of pixels that are covered."""
     lines, found, covered = [], {}, []
     for size in SIZES:
         calls: dict[tuple, tuple[Encoder, Tensor]] = {
@@ -106,16 +105,14 @@ def frames() -> tuple[list[str], dict[tuple, float], list[float]]:
             config = {"crop": None} if crop is None else {}
             made = encoder(name, tuple(source.shape[1:]), precision=precision, residual=True, **config)
             calls[name, precision, crop] = made, source
-        for _ in range(ROUNDS):
-            for key, (call, given) in calls.items():
-                with torch.inference_mode():
-                    took = milliseconds(partial(call, given), REPEATS[key[0]], warm_up=1)
-                found[size, *key] = min(took, found.get((size, *key), math.inf))
+        with torch.inference_mode():
+            times = in_turn({str(key): partial(call, given) for key, (call, given) in calls.items()})
+        found |= {(size, *key): times[str(key)] for key in calls}
         for splat in (0, SPLAT):
             what = f"splats of {splat} pixels" if splat else "no splats"
             took = found[size, "projection", splat]
             lines.append(
-                f"| {size[0]} × {size[1]} | projection | float32 | {what} | {took:.1f} | – | – | – |"
+                f"| {size[0]} × {size[1]} | projection | float32 | {what} | {took.text()} | – | – | – |"
             )
         for key in keys:
             made: Any = calls[key][0]
@@ -125,7 +122,7 @@ def frames() -> tuple[list[str], dict[tuple, float], list[float]]:
             count = sum(parameter.numel() for parameter in made.parameters())
             lines.append(
                 f"| {size[0]} × {size[1]} | {key[0]} | {key[1]} | {'whole frame' if key[2] is None else 'box'} | "
-                f"{found[size, *key]:.1f} | {counter.get_total_flops() / 1e9:.2f} | {part:.0%} | {count / 1e6:.2f} |"
+                f"{found[size, *key].text()} | {counter.get_total_flops() / 1e9:.2f} | {part:.0%} | {count / 1e6:.2f} |"
             )
     return lines, found, covered
 
@@ -201,24 +198,26 @@ def costs(found: dict[str, Trained]) -> list[str]:
     return lines
 
 
-def judged(found: dict[tuple, float], networks: dict[str, Trained]) -> list[str]:
+def judged(found: dict[tuple, Rounds]) -> list[str]:
     """The figures beside what is wanted of them, each in float32 and, where the processor has it, in bfloat16."""
     size, rows = SIZES[0], []
     for kind in kinds():
         unet, slim = (found[size, name, kind, None] for name in ("unet", "slim"))
         limit = {"float32": MOST_FLOAT32, "bfloat16": MOST_BFLOAT16}[kind]
-        ratio, gain = unet / slim, slim / found[size, "slim", kind, "default"]
-        rows.append((f"slim faster than unet, {kind}", ratio, f"≥ {LEAST_RATIO:g}", ratio >= LEAST_RATIO))
+        box = found[size, "slim", kind, "default"]
+        faster, gain = slim.over(unet), box.over(slim)
+        rows.append(
+            (f"slim faster than unet, {kind}", faster, f"≥ {LEAST_RATIO:g}", faster.median >= LEAST_RATIO)
+        )
         for splat, said in ((SPLAT, f"with splats of {SPLAT} pixels"), (0, "without splats")):
-            whole = found[size, "projection", splat] + slim
+            drawing = found[size, "projection", splat].milliseconds
+            whole = Rounds(tuple(a + b for a, b in zip(drawing, slim.milliseconds, strict=True)))
             what = f"projection {said} and slim, a whole frame, {kind}, ms"
-            rows.append((what, whole, f"≤ {limit:g}", whole <= limit))
+            rows.append((what, whole, f"≤ {limit:g}", whole.median <= limit))
         what = f"slim, the box alone, times as fast, {kind}"
-        rows.append((what, gain, f"≥ {LEAST_GAIN:g}", gain >= LEAST_GAIN))
-    below = networks["unet"].numbers["psnr_db"] - networks["slim"].numbers["psnr_db"]
-    rows.append(("PSNR of slim below unet's, dB", below, f"≤ {MOST_BELOW:g}", below <= MOST_BELOW))
+        rows.append((what, gain, f"≥ {LEAST_GAIN:g}", gain.median >= LEAST_GAIN))
     lines = [
-        f"| {what} | {value:.1f} | {wanted} | {'holds' if holds else '**missed**'} |"
+        f"| {what} | {value.text()} | {wanted} | {'holds' if holds else '**missed**'} |"
         for what, value, wanted, holds in rows
     ]
     if "bfloat16" not in kinds():
@@ -233,18 +232,21 @@ def kinds() -> tuple[str, ...]:
     return ("float32", "bfloat16") if fast_bfloat16(torch.device("cpu")) else ("float32",)
 
 
-def report() -> str:
-    networks = {name: trained(name) for name in TRAININGS}
+FRAMES = "## A frame"
+
+
+def of_frames() -> str:
+    """The section with the milliseconds of a frame."""
     torch.set_num_threads(1)
+    require_idle()
     lines, found, cover = frames()
     return "\n".join(
         [
-            "# unet and slim: milliseconds a picture (synthetic people)",
-            "",
             f"A synthetic body of {body().shape[1]:,} points, projected with splats of {SPLAT} pixels as "
             f"`smplpix/quick` has it; it covers {cover[0]:.0%} of the larger, {cover[1]:.0%} of the smaller picture. "
-            f"One thread; processor time, the lowest of {ROUNDS} medians, all in turn. GFLOP: multiply-adds of "
-            "convolutions, times two. Pixels: those computed, beyond the border too, of those of the picture.",
+            f"One thread, processor time, all in turn: median of {ROUNDS} rounds (least to largest). GFLOP: "
+            "multiply-adds of convolutions, times two. Pixels: those computed, beyond the border too, of those of the "
+            "picture.",
             "",
             "| size | network | numbers | computed | ms | GFLOP | pixels | million parameters |",
             "|---|---|---|---|---:|---:|---:|---:|",
@@ -252,7 +254,22 @@ def report() -> str:
             "",
             f"| at {SIZES[0][0]} × {SIZES[0][1]} | measured | wanted | |",
             "|---|---|---|---|",
-            *judged(found, networks),
+            *judged(found),
+            "",
+            f"{machine('torch', 'numpy')} Command: `python benchmarks/smplpix_networks.py --only frames`.",
+        ]
+    )
+
+
+def report() -> str:
+    networks = {name: trained(name) for name in TRAININGS}
+    torch.set_num_threads(1)
+    below = networks["unet"].numbers["psnr_db"] - networks["slim"].numbers["psnr_db"]
+    return "\n".join(
+        [
+            "# unet and slim: milliseconds a picture (synthetic people)",
+            "",
+            FRAMES,
             "",
             "## Training",
             "",
@@ -268,6 +285,8 @@ def report() -> str:
             "| network | training | minutes | PSNR, dB | inside | SSIM | inside |",
             "|---|---:|---:|---:|---:|---:|---:|",
             *equal_time(networks),
+            "",
+            f"PSNR of slim below unet's: {below:.1f} dB (wanted ≤ {MOST_BELOW:g}).",
             "",
             "## What crop and bfloat16 cost",
             "",
@@ -286,4 +305,7 @@ def report() -> str:
 
 
 if __name__ == "__main__":
-    HERE.with_suffix(".md").write_text(report(), encoding="utf-8")
+    section = of_frames()  # first: it ends where the machine is not idle
+    if sys.argv[1:] != ["--only", "frames"]:
+        HERE.with_suffix(".md").write_text(report(), encoding="utf-8")
+    replace_section(HERE.with_suffix(".md"), FRAMES, section)

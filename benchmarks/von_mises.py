@@ -4,8 +4,8 @@ import math
 import os
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.machine import machine
+from benchmarks.rounds import ROUNDS, in_turn, median_and_range, replace_section, require_idle
 from framework.distributions.circular import circular_median, wrap
 from framework.distributions.density import Mixture
 from plugins.density_head.von_mises import functions, integrals
@@ -45,18 +46,6 @@ Density = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 def of_torch(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     return torch.distributions.VonMises(mean, concentration, validate_args=False).log_prob(value)
-
-
-def milliseconds(call: Callable[[], object], seconds: float = 1.0) -> float:
-    """Least processor time of the calls that fit into `seconds`, at least five, after two to warm up."""
-    for _ in range(2):
-        call()
-    times: list[float] = []
-    while len(times) < 5 or sum(times) < seconds:
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return 1e3 * min(times)
 
 
 def errors(density: Density, dtype: torch.dtype) -> list[list[float]]:
@@ -111,37 +100,37 @@ def value_only(density: Density, arguments: tuple[Tensor, ...]) -> None:
 
 
 def speed() -> list[str]:
+    """Value and gradients of a million elements: torch, ours as it is and compiled."""
     lines = [
-        "| dtype | way | value, ms | × torch | value and gradients, ms | × torch |",
+        "| dtype | way | value, ms | times torch's speed | value and gradients, ms | times torch's speed |",
         "|---|---|---|---|---|---|",
     ]
+    ways = {"torch": of_torch, "as is": functions.log_prob, "compiled": COMPILED}
     for dtype in DTYPES:
-        value, mean, spread = torch.randn(3, COUNT, dtype=dtype)
-        arguments = (value, mean.requires_grad_(), torch.exp(2 * spread + 1).requires_grad_())
-        ones = torch.ones(COUNT, dtype=dtype)
-        peer: tuple[float, float] = (0.0, 0.0)
-        for name, density in (("torch", of_torch), ("as is", functions.log_prob), ("compiled", COMPILED)):
-            value_ms = milliseconds(lambda density=density, given=arguments: value_only(density, given))
-            both_ms = milliseconds(
-                lambda density=density, given=arguments, ones=ones: both(density, given, ones)
-            )
-            peer = (value_ms, both_ms) if name == "torch" else peer
-            ratios = peer[0] / value_ms, peer[1] / both_ms
-            lines.append(
-                f"| {str(dtype)[6:]} | {name} | {value_ms:.2f} | {ratios[0]:.1f} | {both_ms:.2f} | {ratios[1]:.1f} |"
-            )
+        value, mean, logarithm = torch.randn(3, COUNT, dtype=dtype)
+        arguments = (value, mean.requires_grad_(), torch.exp(2 * logarithm + 1).requires_grad_())
         detached = tuple(argument.detach() for argument in arguments)
-        one_ms = milliseconds(lambda given=detached: ONE_PASS(*given))
-        lines.append(
-            f"| {str(dtype)[6:]} | compiled, `log_prob_and_slopes` | - | - | {one_ms:.2f} | {peer[1] / one_ms:.1f} |"
+        ones = torch.ones(COUNT, dtype=dtype)
+        values = in_turn({name: partial(value_only, density, arguments) for name, density in ways.items()})
+        one_pass = {"compiled, `log_prob_and_slopes`": partial(ONE_PASS, *detached)}
+        gradients = in_turn(
+            {name: partial(both, density, arguments, ones) for name, density in ways.items()} | one_pass
         )
+        for name, found in gradients.items():
+            cells = [str(dtype)[6:], name]
+            cells += (
+                [values[name].text(), values[name].times_faster(values["torch"])]
+                if name in values
+                else ["–", "–"]
+            )
+            lines.append(f"| {' | '.join([*cells, found.text(), found.times_faster(gradients['torch'])])} |")
     return lines
 
 
 def sampling() -> list[str]:
     torch.manual_seed(1)
     lines = [
-        "| κ | float32: KS distance | p | float64: KS distance | p | ms | torch, ms | × torch |",
+        "| κ | float32: KS distance | p | float64: KS distance | p | ms | torch, ms | times torch's speed |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for kappa in SAMPLED:
@@ -154,14 +143,13 @@ def sampling() -> list[str]:
                 drawn.numpy(), lambda at, k=exact: integrals.cdf(torch.from_numpy(at), k * 0, k).numpy()
             )
             cells.append(f"{result.statistic:.1e} | {result.pvalue:.2f}")
-        ours = milliseconds(lambda k=concentration, m=zero: functions.sample(m, k), 0.3)
+        ways: dict[str, Callable[[], object]] = {"ours": partial(functions.sample, zero, concentration)}
         # torch's sampler does not end at κ = 0 and from 1e16 on, and is wrong before
         if 0 < kappa <= 1e6:
-            peer = torch.distributions.VonMises(zero, concentration, validate_args=False)
-            theirs = milliseconds(lambda peer=peer: peer.sample(), 0.3)
-            cells.append(f"{ours:.0f} | {theirs:.0f} | {theirs / ours:.1f}")
-        else:
-            cells.append(f"{ours:.0f} | - | -")
+            ways["torch"] = torch.distributions.VonMises(zero, concentration, validate_args=False).sample
+        found = in_turn(ways, seconds=0.1)
+        ours, theirs = found["ours"], found.get("torch")
+        cells += [ours.text(), *([theirs.text(), ours.times_faster(theirs)] if theirs else ["–", "–"])]
         lines.append(f"| {kappa:g} | {' | '.join(cells)} |")
     return lines
 
@@ -253,8 +241,8 @@ def mixtures() -> list[str]:
     return lines
 
 
-def medians() -> tuple[float, float]:
-    """Milliseconds of the circular median of 64 × 10,000 samples, and by all pairs: 2 rows' scaled up to 64."""
+def medians() -> list[str]:
+    """The circular median of 64 × 10,000 samples, and two of them by all pairs."""
     samples = wrap(torch.randn(10_000, 64))
 
     def all_pairs() -> None:
@@ -262,12 +250,48 @@ def medians() -> tuple[float, float]:
             cost = torch.cat([wrap(part[:, None] - row).abs().mean(1) for part in row.split(500)])
             row[cost.argmin()]
 
-    return milliseconds(lambda: circular_median(samples)), 32 * milliseconds(all_pairs, 0.1)
+    found = in_turn({"sorted": partial(circular_median, samples), "pairs": all_pairs}, seconds=0.1)
+    ratios = [
+        32 * slow / fast
+        for fast, slow in zip(found["sorted"].milliseconds, found["pairs"].milliseconds, strict=True)
+    ]
+    return [
+        f"Circular median of 64 × 10,000 samples, float32: {found['sorted'].text()} ms. Two of the 64 by all pairs "
+        f"take {found['pairs'].text()} ms, so that all would take {median_and_range(ratios)} times as long."
+    ]
+
+
+SPEEDS = {
+    "## Speed": (
+        speed,
+        f"{COUNT:,} elements; torch is torch.distributions.VonMises.",
+    ),
+    "## Sampling": (
+        sampling,
+        f"{COUNT:,} samples against `cdf`; the 95 % critical distance is 1.4e-3. Times of float64.",
+    ),
+    "## Point prediction": (medians, ""),
+}
+"""Sections with times: heading, what writes the lines, and what is said before them."""
+
+
+def times() -> dict[str, str]:
+    """The text of each section that has times."""
+    torch.set_num_threads(1)
+    require_idle()
+    told = (
+        f"One thread, processor time, each way in turn: median of {ROUNDS} rounds (least to largest). "
+        f"{machine('torch', 'numpy', 'scipy')} Command: `python benchmarks/von_mises.py --only times`."
+    )
+    return {
+        heading: "\n".join([before, "", *lines(), "", told] if before else [*lines(), "", told])
+        for heading, (lines, before) in SPEEDS.items()
+    }
 
 
 def report() -> str:
+    """The whole page; the sections with times stay as they are until they are measured."""
     torch.set_num_threads(1)
-    fast, slow = medians()
     return "\n".join(
         [
             "# The von Mises functions: accuracy and speed",
@@ -290,29 +314,17 @@ def report() -> str:
             "",
             *mixtures(),
             "",
-            "## Speed",
-            "",
-            f"{COUNT:,} elements, one thread, least processor time of several calls; "
-            "torch is torch.distributions.VonMises.",
-            "",
-            *speed(),
-            "",
-            "## Sampling",
-            "",
-            f"{COUNT:,} samples against `cdf`; the 95 % critical distance is 1.4e-3. Times of float64.",
-            "",
-            *sampling(),
-            "",
-            "## Point prediction",
-            "",
-            f"Circular median of 64 × 10,000 samples, float32: {fast:.0f} ms; by all pairs {slow:,.0f} ms (two of the "
-            f"64 measured and multiplied by 32): {slow / fast:.0f} ×.",
-            "",
             machine("torch", "numpy", "scipy", "mpmath") + " Command: `python benchmarks/von_mises.py`.",
             "",
+            *(line for heading in SPEEDS for line in (heading, "")),
         ]
     )
 
 
 if __name__ == "__main__":
-    Path(__file__).with_suffix(".md").write_text(report())
+    page = Path(__file__).with_suffix(".md")
+    sections = times()  # first: it ends where the machine is not idle
+    if sys.argv[1:] != ["--only", "times"]:
+        page.write_text(report(), encoding="utf-8")
+    for heading, section in sections.items():
+        replace_section(page, heading, section)
