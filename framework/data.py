@@ -90,6 +90,9 @@ class Data(ABC):
     """Whether the samples were generated."""
     skipped: int = 0
     """How many samples were left out because they could not be read (only when the config allows it)."""
+    remarks: tuple[str, ...] = ()
+    """What is not read of the user's files, and what looks odd in them, for the first lines of a run: clauses such as
+    "left out: 'note' (words)". Set by `prepare`."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         # plugins written before `splits` have three methods of the splits' names

@@ -9,12 +9,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import nibabel
+import numpy as np
 import pytest
 
+from framework.datasets.csv_columns import (
+    LabelledWriting,
+    Writing,
+    numbers,
+    numeric_columns,
+    read_columns,
+    tables,
+    told,
+)
 from framework.errors import DataError
 from framework.geometry import meshes
 from plugins.data.bodies import motion
+from plugins.data.cest.volumes import read_volume
 from plugins.data.head_pose import towncentre_labels
+from plugins.data.images_with_angles.table import read_table
+from plugins.data.moons.points import read_points
+from plugins.data.table_tennis import recordings
 from plugins.renderer.rasterizer import scene_files
 
 
@@ -29,6 +44,7 @@ class TextReader:
         line: where it stands, from 1; 0 where no line is named.
         beside: other files that the reader wants.
         signed: whether the number may be negative.
+        cells: whether quotation marks may stand around the number.
     """
 
     name: str
@@ -37,6 +53,7 @@ class TextReader:
     line: int
     beside: dict[str, str | bytes] | None = None
     signed: bool = True
+    cells: bool = False
 
 
 def vertex(file: Path) -> float:
@@ -72,9 +89,33 @@ BVH = (
 TURNED = BVH.replace("OFFSET 0 {} 0", "OFFSET 0 0 0").replace("\n0 0 0\n", "\n0 0 {}\n")
 
 
+def cell(file: Path) -> float:
+    ((_, found),) = tables([file], ("a",), "The test", LabelledWriting())
+    return float(found[1, 0])
+
+
+def pan(file: Path) -> float:
+    return math.degrees(read_table(file, None, None).rows[1].angles[0])
+
+
+def offset(file: Path) -> float:
+    return float(read_volume(file.with_name("one.nii")).offsets[1])
+
+
 def turned(file: Path) -> float:
     rotation = motion.read(file).rotations[0, 0]
     return math.degrees(math.atan2(rotation[1, 0], rotation[0, 0]))
+
+
+TABLE = (
+    "a,b,y\n"
+    + "0,0,no\n{},1,yes\n"
+    + "".join(f"{row / 8},{row * row % 7},{('no', 'yes')[row % 2]}\n" for row in range(30))
+)
+ANGLES = "file,pan\na.png,0\nb.png,{}\n" + "".join(f"{row}.png,{row * 31 % 360}\n" for row in range(30))
+FLIGHT = "t,x,y,z\n0.000,0,0,0\n0.016,{},0,0\n0.032,0,0,0\n"
+POINTS = "x,y\n0,1\n{},0\n2,2\n"
+SPECTRA = 1 - 0.5 / (1 + np.linspace(-1, 1, 3) ** 2) + np.zeros((2, 2, 1, 3))
 
 
 READERS = {
@@ -91,6 +132,23 @@ READERS = {
     "BVH, frames": TextReader("walk.bvh", TURNED, turned, 14),
     "labels of TownCentre": TextReader(
         "one.txt", "pan = {}\nvalid = 1\n", lambda file: towncentre_labels.read_label(file)[0], 1
+    ),
+    "offsets of Z-spectra": TextReader(
+        "one.offsets.txt",
+        "-1\n{}\n1\n",
+        offset,
+        2,
+        {"one.nii": nibabel.Nifti1Image(SPECTRA, np.eye(4)).to_bytes()},
+    ),
+    "tables": TextReader("one.csv", TABLE, cell, 3, cells=True),
+    "tables, semicolons": TextReader("one.csv", TABLE.replace(",", ";"), cell, 3, cells=True),
+    "tables, tabs": TextReader("one.csv", TABLE.replace(",", "\t"), cell, 3, cells=True),
+    "images with angles": TextReader("angles.csv", ANGLES, pan, 3, cells=True),
+    "flights": TextReader(
+        "one.csv", FLIGHT, lambda file: recordings.flights_of(file, 0.016)[0].places[1, 0], 3, cells=True
+    ),
+    "points of the plane": TextReader(
+        "one.csv", POINTS, lambda file: read_points([file]).fields["input"][1, 0].item(), 3, cells=True
     ),
 }
 NOT_NUMBERS = (
@@ -128,7 +186,8 @@ def write(folder: Path, reader: TextReader, word: str) -> Path:
     file.parent.mkdir(exist_ok=True, parents=True)
     for name, content in (reader.beside or {}).items():
         (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    file.write_bytes(reader.content.format(word).encode())
+    quoted = '"{}"'.format(word.replace('"', '""')) if reader.cells else word
+    file.write_bytes(reader.content.format(quoted).encode())
     return file
 
 
@@ -146,7 +205,9 @@ def test_numbers_are_read_right_or_refused_by_line(tmp_path: Path, name: str) ->
             assert number is None, f"{name}, {word}: {said}"
             assert str(tmp_path) in said, f"{name}, {word}: {said}"
             assert f"line {reader.line}" in said.lower() or "finite" in said, f"{name}, {word}: {said}"
-            assert any(remedy in said for remedy in ("write", "Write", "Mend", "Save", "Restore")), said
+            assert any(
+                remedy in said for remedy in ("write", "Write", "Mend", "Save", "Wanted:", "Restore")
+            ), said
         else:
             assert number is not None, f"{name}: {word!r} is read as {found}"
             assert found == pytest.approx(number, rel=1e-6), f"{name}, {word}"
@@ -174,3 +235,107 @@ def test_encodings_and_ends_of_lines_change_no_number(tmp_path: Path, name: str)
         with pytest.raises(DataError, match=r"UTF-(16|32).*wanted UTF-8. Save it as UTF-8") as raised:
             reader.read(file)
         assert str(tmp_path) in str(raised.value)
+
+
+HEADED = {
+    **dict.fromkeys(("tables", "images with angles", "flights", "points of the plane"), ","),
+    **dict.fromkeys(("tables, semicolons", "XYZ, semicolons"), ";"),
+}
+"""Readers with names of columns in the first line, and what separates them."""
+
+
+@pytest.mark.parametrize("name", HEADED)
+def test_headers_are_read_or_refused_by_name(tmp_path: Path, name: str) -> None:
+    reader, sign = READERS[name], HEADED[name]
+    file = write(tmp_path, reader, "0.5")
+    first, _, rest = file.read_text(encoding="utf-8").partition("\n")
+    names = first.split(sign)
+    for header in (
+        sign.join(f'"{one}"' for one in names),
+        "\ufeff" + sign.join(f'"{one}"' for one in names),
+        sign.join(f" {one}\N{ZERO WIDTH SPACE}" for one in names),
+        sign.join(f"{one}\N{NO-BREAK SPACE}" for one in names),
+    ):
+        file.write_text(f"{header}\n{rest}", encoding="utf-8")
+        assert reader.read(file) == pytest.approx(0.5, rel=1e-6), header
+    twice = [*names, names[-1]]
+    longer = "\n".join(f"{line}{sign}1" for line in rest.splitlines())
+    file.write_text(f"{sign.join(twice)}\n{longer}\n", encoding="utf-8")
+    with pytest.raises(DataError, match=rf"{file.name}.*names the column '{names[-1]}' twice"):
+        reader.read(file)
+    if reader.cells:  # others have no names, and then a number in the first line is one
+        file.write_text(rest, encoding="utf-8")
+        with pytest.raises(DataError, match=str(file)):
+            reader.read(file)
+
+
+INDEX = ("", "Unnamed: 0", "index", "id", "row_number")
+
+
+@pytest.mark.parametrize("name", INDEX)
+@pytest.mark.parametrize("start", [0, 1, 100])
+def test_row_numbers_are_no_inputs_and_no_angles(tmp_path: Path, name: str, start: int) -> None:
+    """Also shuffled ones, as a table that was drawn from another has them."""
+    order = np.random.default_rng(0).permutation(30) if start == 100 else np.arange(30)
+    file = tmp_path / "one.csv"
+    lines = [f"{name},a,file,y"] + [
+        f"{start + order[row]},{row * row % 7},{row}.png,{row % 2}" for row in range(30)
+    ]
+    file.write_text("\n".join(lines), encoding="utf-8")
+    columns = read_columns(file, LabelledWriting())
+    chosen = numeric_columns(columns, ("file", "y"), "data.columns")
+    assert chosen.names == ("a",)
+    assert any("row numbers" in said for said in told(chosen))
+    table = read_table(file, None, "degrees")
+    assert table.columns == ("a", "y")
+    assert any("row numbers" in said for said in table.remarks)
+    if name:  # who names it means it
+        assert read_table(file, [name], "degrees").columns == (name,)
+
+
+def test_a_column_that_counts_the_rows_under_another_name_is_said(tmp_path: Path) -> None:
+    file = tmp_path / "one.csv"
+    file.write_text("azimuth,file\n" + "".join(f"{row},{row}.png\n" for row in range(30)), encoding="utf-8")
+    table = read_table(file, None, "degrees")
+    assert table.columns == ("azimuth",)
+    assert "'azimuth' counts the rows from 0 to 29; data.angle_columns leaves it out" in table.remarks
+
+
+WRITTEN = {
+    "1,5": {"decimal": "comma"},
+    "1.234,5": {"decimal": "comma", "thousands": "point"},
+    "1,234": {"thousands": "comma"},
+    "1 234": {"thousands": "space"},
+    "1\N{NARROW NO-BREAK SPACE}234": {"thousands": "space"},
+    "1'234": {"thousands": "apostrophe"},
+    "5%": {"units": ["%"]},
+    "$5": {"units": ["$"]},
+    "-$5": {"units": ["$"]},
+    "5 km/h": {"units": ["km/h"]},
+    "1.234,5 €": {"units": ["€"], "decimal": "comma", "thousands": "point"},
+    "12°": {"units": ["°"]},
+}
+VALUES = (1.5, 1234.5, 1234.0, 1234.0, 1234.0, 1234.0, 5.0, 5.0, -5.0, 5.0, 1234.5, 12.0)
+
+
+@pytest.mark.parametrize("word", WRITTEN)
+def test_a_column_written_otherwise_is_refused_and_read_by_the_setting_that_is_told(
+    tmp_path: Path, word: str
+) -> None:
+    file = tmp_path / "one.csv"
+    file.write_text(
+        "file;a;b\n" + "".join(f"{row}.png;{word};{row / 8}\n" for row in range(30)), encoding="utf-8"
+    )
+    wanted = VALUES[list(WRITTEN).index(word)]
+    plain = read_columns(file, Writing())
+    with pytest.raises(DataError, match=r"one\.csv line 2, column 'a'") as raised:
+        numeric_columns(plain, ("file",), "data.columns")
+    for key, value in WRITTEN[word].items():
+        assert f"data.{key}=" in str(raised.value)
+        assert (value if isinstance(value, str) else f'["{value[0]}"]') in str(raised.value)
+    with pytest.raises(DataError, match=r"line 2, column 'a'"):
+        numbers(plain, "a", missing="")
+    told_of = read_columns(file, Writing(**WRITTEN[word]))
+    assert numeric_columns(told_of, ("file",), "data.columns").names == ("a", "b")
+    np.testing.assert_array_equal(numbers(told_of, "a", missing=""), np.full(30, wanted))
+    np.testing.assert_array_equal(numbers(told_of, "b", missing=""), np.arange(30) / 8)

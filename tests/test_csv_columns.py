@@ -41,10 +41,11 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
         ("\na,b\n1,2", "is empty or begins with a blank line"),
         ("a,b", "has no row below its first line"),
         ("a,b\n,\n\n", "has no row below its first line"),
-        ("a;b\n1;2", r"is separated by semicolons: its first line reads 'a;b'; wanted commas"),
-        ("a\tb\n1\t2", "is separated by tabs"),
+        ("a b\n1 2\n3 4", r"is separated by blanks: its first line reads 'a b'; wanted commas"),
+        ("1,2\n3,4", r"line 1: '1, 2' are numbers; wanted the names of the columns"),
         ("a,b,a\n1,2,3", "names the column 'a' twice"),
-        (",a\n0,1", r"column 1 has no name \(a row number"),
+        (",a\nx,1", r"column 1 has no name, and holds 'x', which is no row number"),
+        ("a,b\n1,5,2\n", r"line 2: 3 cells; wanted 2, .* a decimal comma stands in quotation marks"),
         ("a,b\n1,2\n1,2,3", "line 3: 3 cells; wanted 2"),
         ("a,b\n1,2\n1\n", "line 3: 1 cells; wanted 2"),
         ('a,b\n1,"2', "cannot be read"),
@@ -73,7 +74,7 @@ def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
         ("-inf", r"'-inf'; wanted a finite number\. Mend the cell, or take the line out\.$"),
         ("1e999", "'1e999'; wanted a finite number"),
         ("1_0", "'1_0'; wanted a finite number"),
-        ('"1,5"', r"'1,5'; .* Decimals are written with a point"),
+        ('"1,5"', r"'1,5'; .* It is a number with a decimal comma\. Write 1\.5"),
     ],
 )
 def test_cells_that_are_no_finite_number_are_named(tmp_path: Path, cell: str, message: str) -> None:

@@ -152,6 +152,9 @@ def test_what_is_said_to_be_words_is_no_path() -> None:
     assert {f"{name}.{key}" for group, name, key in texts() if is_words(group, name, key)} == {
         "tabular.target",
         "tabular.columns",
+        "tabular.units",
+        "tabular.missing_words",
+        "images_with_angles.units",
         "images_with_angles.angle_columns",
         "images_with_angles.mirror",
         "point_cloud_folder.columns",

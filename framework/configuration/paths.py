@@ -13,26 +13,16 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import PurePath
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import BaseModel
 
 from framework.configuration.registry import GROUPS, load
 from framework.configuration.signature import parts, signature
 from framework.errors import ConfigError, did_you_mean, printable, quoted, shown
-
-
-@dataclass(frozen=True)
-class _Mark:
-    """What an annotation says of a text."""
-
-    path: bool
-
-
-FilePath = Annotated[str, _Mark(path=True)]
-"""Annotation of a parameter that names a file or folder."""
-Words = Annotated[str, _Mark(path=False)]
-"""Annotation of a parameter whose text is never used as a path, as "km/h" of a column."""
+from framework.storage.path_marks import FilePath as FilePath
+from framework.storage.path_marks import Mark
+from framework.storage.path_marks import Words as Words
 
 MODEL = ("encoder", "density_head", "uncertainty")
 """Groups of what a model predicts with."""
@@ -287,7 +277,7 @@ def _marked(annotation: Any) -> bool:
 
 def _mark(annotation: Any) -> bool | None:
     """What an annotation says of texts: they are paths, they never are, or nothing."""
-    marks = [each.path for each in getattr(annotation, "__metadata__", ()) if isinstance(each, _Mark)]
+    marks = [each.path for each in getattr(annotation, "__metadata__", ()) if isinstance(each, Mark)]
     if isinstance(annotation, type) and issubclass(annotation, PurePath):
         marks.append(True)
     marks += [mark for inner in typing.get_args(annotation) if (mark := _mark(inner)) is not None]

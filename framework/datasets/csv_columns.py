@@ -1,61 +1,270 @@
-"""A table of numbers and words in a CSV file, by columns; what is wrong with it is said by line and column."""
+"""A table of numbers and words in a CSV file, by columns; what is wrong with it is said by line and column.
+
+Which words are numbers `framework.storage.text` says, and how a user's own table is written its config: `Writing`. What
+is no column of numbers is named (`Chosen.left_out`): words, row numbers, or nothing. A column that would be numbers if
+it were written otherwise is refused, with the setting that reads it.
+"""
 
 import csv
 import io
 import math
+import re
+import shlex
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.storage import text
 from framework.storage.limits import MOST_TABLE_COLUMNS as MOST_COLUMNS
-from framework.storage.reading import guarded, opened
+from framework.storage.path_marks import Words
+from framework.storage.reading import guarded, opened, read_bytes
 
-MISSING = {"", "na", "n/a", "nan", "null", "none", "?"}
-"""What stands in a cell, in small letters, that has no number."""
-SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+MISSING = frozenset(
+    {"", "na", "n/a", "#n/a", "#na", "<na>", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "nil", "nat", "?"}
+    | {".", "-", "--", "\N{EN DASH}", "\N{EM DASH}", "1.#ind", "-1.#ind", "1.#qnan", "-1.#qnan"}
+    | {"#div/0!", "#value!", "#num!", "#ref!", "#name?", "#null!"}
+)  # fmt: skip
+"""What stands in a cell, in small letters, that has no number or label, as pandas, R and spreadsheets write it."""
+BOOLEANS = {"true": 1.0, "false": 0.0}
+ENOUGH_ROWS = 20
+"""With more rows than this a table shows what a column holds: row numbers, radians."""
+INDEX = re.compile(
+    r"unnamed: \d+(_level_\d+)?|index|level_\d+|row|rows?[ _.]?(number|name|id|index)s?|rownum|id|idx", re.I
+)
+"""What pandas, R and databases call a column that numbers the rows."""
+
+MOST_TOLD = 12
+"""Columns that a sentence lists."""
+Separator = Literal["comma", "semicolon", "tab", "bar", "space", ",", ";", "\t", "|", " "]
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
+GROUPED_BY_POINTS = text.GROUPED["point"]
+GROUPING = {
+    "comma": ",",
+    "point": ".",
+    "space": text.BLANKS,
+    "apostrophe": "'\N{RIGHT SINGLE QUOTATION MARK}",
+}
 
 
-class Columns(NamedTuple):
-    """A file's cells by column, without surrounding blanks, and the number of the line each row ends on."""
+@dataclass(frozen=True, kw_only=True)
+class Writing:
+    """How a user's table is written.
+
+    Attributes:
+        separator: what stands between cells; None: what the first line has, of commas, semicolons, tabs and bars.
+        decimal: the decimal sign.
+        thousands: what stands between groups of three figures; None: nothing.
+        units: what may stand beside the numbers of a column ("%", "$", "kg") and is left away; 5% is 5 then.
+    """
+
+    separator: Separator | None = None
+    decimal: Literal["point", "comma", ".", ","] = "point"
+    thousands: Literal["comma", "point", "space", "apostrophe"] | None = None
+    units: list[Words] | None = None
+
+    def __post_init__(self) -> None:
+        if self.thousands and GROUPING[self.thousands] == self.sign:
+            raise DataError(
+                f"data.decimal and data.thousands are both {self.thousands}; wanted two signs. Change one."
+            )
+
+    @property
+    def delimiter(self) -> str | None:
+        return None if self.separator is None else SEPARATORS.get(self.separator, self.separator)
+
+    @property
+    def sign(self) -> str:
+        """The decimal sign itself."""
+        return GROUPING.get(self.decimal, self.decimal)
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """What says that a cell holds nothing, in small letters."""
+        return MISSING
+
+    @cached_property
+    def plain(self) -> bool:
+        """Whether numbers are written as programs write them."""
+        return self.sign == "." and self.thousands is None and not self.units
+
+    def standard(self, cell: str) -> str:
+        """A cell's number as programs write it; a word stays one."""
+        return self._ungrouped(self.split_unit(cell)[0])
+
+    def split_unit(self, cell: str) -> tuple[str, str]:
+        """A cell without its unit, and the unit, "" where it has none."""
+        cell = text.trimmed(cell).translate(text.MINUS)
+        for unit in sorted(self.units or (), key=len, reverse=True):
+            sign = cell[:1] if cell[:1] in ("+", "-") else ""
+            if cell[len(sign) :].startswith(unit):
+                return sign + cell[len(sign) + len(unit) :].strip(), unit
+            if cell.endswith(unit):
+                return cell.removesuffix(unit).strip(), unit
+        return cell, ""
+
+    def _ungrouped(self, cell: str) -> str:
+        if self.sign == "." and self.thousands is None:
+            return cell
+        between, sign = (
+            f"[{re.escape(GROUPING[self.thousands])}]" if self.thousands else "",
+            re.escape(self.sign),
+        )
+        whole = rf"\d{{1,3}}(?:{between}\d{{3}})+|\d+" if between else r"\d+"
+        found = re.fullmatch(rf"([+-]?)({whole})?(?:{sign}(\d*))?((?:[eEdD][+-]?\d+)?)", cell)
+        if found is None:
+            return f"_{cell}" if any(letter.isdigit() for letter in cell) else cell
+        figures = re.sub(between, "", found[2] or "") if between else found[2] or ""
+        return f"{found[1]}{figures}.{found[3] or ''}{found[4]}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledWriting(Writing):
+    """How a table with missing numbers and labels is written.
+
+    Attributes:
+        missing_words: what says that a cell holds nothing, beside an empty one; None: MISSING. []: nothing else does,
+            where "none" or "NA" is a label.
+    """
+
+    missing_words: list[Words] | None = None
+
+    @cached_property
+    def missing(self) -> frozenset[str]:
+        return MISSING if self.missing_words is None else frozenset(["", *map(str.lower, self.missing_words)])
+
+
+PLAIN = Writing()
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A table's cells by column.
+
+    Attributes:
+        file: where they come from.
+        cells: by column, without surrounding blanks.
+        lines: the number of the line each row ends on.
+        writing: how it is written; None: as programs write, and no setting says otherwise.
+        left_out: columns without a name that were left out, and why.
+    """
 
     file: Path
     cells: dict[str, list[str]]
     lines: list[int]
+    writing: Writing | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def how(self) -> Writing:
+        return self.writing or PLAIN
+
+    def written(self, name: str) -> Writing:
+        """How a column is written: with decimal points, too, where it has points that group no figures and no comma."""
+        how = self.how
+        if how.sign != ",":
+            return how
+        cells = [cell.lstrip("+-") for cell in self.cells[name]]
+        points = [cell for cell in cells if "." in cell]
+        if not points or any("," in cell for cell in cells):
+            return how
+        grouped = all(re.fullmatch(GROUPED_BY_POINTS, cell) for cell in points)
+        return how if grouped else replace(how, decimal="point", thousands=None)
+
+
+class Chosen(NamedTuple):
+    """Columns of numbers by name; of the others why each is left out; of odd ones that are taken what is odd."""
+
+    names: tuple[str, ...]
+    left_out: dict[str, str]
+    odd: dict[str, str]
+
+
+def told(chosen: Chosen) -> tuple[str, ...]:
+    """Sentences on what is left out and what is odd, for the first lines of a run."""
+    left_out = [f"{quoted(name)} ({why})" for name, why in chosen.left_out.items()]
+    many = (
+        [*left_out[:MOST_TOLD], f"and {len(left_out) - MOST_TOLD} more"]
+        if len(left_out) > MOST_TOLD
+        else left_out
+    )
+    said = (f"left out: {', '.join(many)}",) if many else ()
+    return (*said, *(f"{quoted(name)} {why}" for name, why in chosen.odd.items()))
 
 
 @contextmanager
-def csv_rows(file: Path, missing: str) -> Iterator[Any]:
-    """The rows of a CSV file as lists of cells: UTF-8 (also with a byte-order mark), commas.
+def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterator[Any]:
+    """The rows of a CSV file as lists of cells: UTF-8, also with a byte-order mark.
 
     Args:
         missing: what to say of a file that is not there.
+        writing: how it is written.
 
     Raises:
         DataError: it is missing or unreadable.
     """
     with (
-        guarded(file, "a table", "Save it as the wanted UTF-8 text, separated by commas.", missing),
+        guarded(file, "a table", "Save it as the wanted UTF-8 text, a row a line.", missing),
         opened(file) as stream,
-        io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as text,
     ):
-        yield csv.reader(text, strict=True)
+        text.plain(stream.peek(text.LOOKED_AT))
+        with io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as lines:
+            try:
+                yield _rows(lines, writing or PLAIN)
+            except UnicodeDecodeError:
+                text.decoded(read_bytes(file))  # names the line
+                raise
 
 
-def read_columns(file: Path) -> Columns:
-    """Read a CSV file: UTF-8 (also with a byte-order mark), commas, names in its first line; blank lines are left out.
+def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
+    first = lines.readline()
+    told = re.fullmatch(r"sep=(.)\s*", first)  # how Excel writes which separator it uses
+    sign = told[1] if told else writing.delimiter or _separator(first)
+    rest = _with_first(first, lines)
+    if sign == " ":
+        return csv.reader(rest, strict=True, delimiter=" ", skipinitialspace=True)
+    return csv.reader(rest, strict=True, delimiter=sign)
+
+
+def _with_first(first: str, lines: io.TextIOWrapper) -> Iterator[str]:
+    yield first
+    yield from lines
+
+
+def _separator(first: str) -> str:
+    """What separates the names of a first line; a comma where nothing does."""
+    outside = re.sub(r'"[^"]*"', "", first)
+    counts = {sign: outside.count(sign) for sign in ",;\t|"}
+    return "," if counts[","] or not any(counts.values()) else max(counts, key=counts.__getitem__)
+
+
+def read_columns(
+    file: Path, writing: Writing | None = None, missing: str = "wanted a CSV table. Mend the path."
+) -> Columns:
+    """Read a CSV file: UTF-8 (also with a byte-order mark), names in its first line; blank lines are left out.
+
+    A column without a name is left out where it holds row numbers or nothing.
+
+    Args:
+        writing: how it is written; None: as programs write.
+        missing: what to say of a file that is not there.
 
     Raises:
-        DataError: it is missing, unreadable, empty, separated by something else, a name is missing or stands twice,
-            there is no row, or a row has more or fewer cells than there are names.
+        DataError: it is missing, unreadable, empty, a name is missing or stands twice, there is no row, or a row has
+            more or fewer cells than there are names.
     """
-    with csv_rows(file, "wanted a CSV table. Mend the path.") as reader:
-        header = [cell.strip() for cell in next(reader, [])]
+    with csv_rows(file, missing, writing) as reader:
+        names = next(reader, [])
+        if re.fullmatch(r"sep=.?", "".join(names).strip()) and len(names) < 3:
+            names = next(reader, [])
+        header = [text.column_name(cell) for cell in names]
         _check_header(file, header)
         columns: list[list[str]] = [[] for _ in header]  # a list for each row would take most of the memory
         lines: list[int] = []
@@ -66,14 +275,43 @@ def read_columns(file: Path) -> Columns:
             if len(cells) != len(header):
                 raise DataError(
                     f"{file} line {reader.line_num}: {len(cells)} cells; wanted {len(header)}, as many as the "
-                    "first line names. Mend that line."
+                    f"first line names. Mend that line.{_why_other_width(header, cells, writing)}"
                 )
             for column, cell in zip(columns, cells, strict=True):
                 column.append(cell.strip())
             lines.append(reader.line_num)
     if not lines:
         raise DataError(f"{file} has no row below its first line; wanted one for each sample. Add them.")
-    return Columns(file, dict(zip(header, columns, strict=True)), lines)
+    _check_blanks(file, header, columns)
+    return _named(file, header, columns, lines, writing)
+
+
+def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writing | None) -> str:
+    if len(cells) > len(header) and sum(cell.strip().isdigit() for cell in cells) > len(header) // 2 + 1:
+        return " Where commas separate cells, a decimal comma stands in quotation marks."
+    return (
+        " Or its rows begin with numbers that the first line does not name."
+        if len(cells) == len(header) + 1
+        else ""
+    )
+
+
+def _named(
+    file: Path, header: Sequence[str], columns: list[list[str]], lines: list[int], writing: Writing | None
+) -> Columns:
+    """The columns that have names; of others row numbers and empty ones are left out."""
+    left_out: dict[str, str] = {}
+    for place, (name, cells) in enumerate(zip(header, columns, strict=True), 1):
+        if name:
+            continue
+        if any(cells) and not _distinct_whole(cells):
+            raise DataError(
+                f"{file}: column {place} has no name, and holds {quoted(next(filter(None, cells)))}, which is no row "
+                "number. Name it in the first line, or take the column out."
+            )
+        left_out[f"column {place}, without a name"] = "row numbers" if any(cells) else "empty"
+    kept = {name: cells for name, cells in zip(header, columns, strict=True) if name}
+    return Columns(file, kept, lines, writing, left_out)
 
 
 def require(columns: Columns, names: Sequence[str], asked: str) -> None:
@@ -94,9 +332,13 @@ def require(columns: Columns, names: Sequence[str], asked: str) -> None:
 
 
 def tables(
-    files: Sequence[Path], names: Sequence[str], asked: str
+    files: Sequence[Path], names: Sequence[str], asked: str, writing: Writing | None = None
 ) -> Iterator[tuple[Columns, Float[np.ndarray, "rows names"]]]:
     """A user's own files one after the other, each with its columns of these names as numbers.
+
+    Args:
+        asked: who names them.
+        writing: how they are written; with it TRUE and FALSE are 1 and 0, as in a table that was trained on.
 
     Raises:
         DataError: there is no file; or as `read_columns`, `require` and `numbers`.
@@ -104,65 +346,197 @@ def tables(
     if not files:
         raise DataError(f"No file was given; wanted at least one CSV table with {', '.join(names)}.")
     for file in files:
-        columns = read_columns(Path(file))
+        columns = read_columns(Path(file), writing)
         require(columns, names, asked)
-        yield columns, np.stack([numbers(columns, name, missing="") for name in names], -1)
+        found = [numbers(columns, name, missing="", booleans=writing is not None) for name in names]
+        yield columns, np.stack(found, -1)
+
+
+def numeric_columns(columns: Columns, but: Collection[str], asked: str) -> Chosen:
+    """Which columns hold numbers, TRUE and FALSE among them, where nobody names them.
+
+    Args:
+        but: columns of another meaning.
+        asked: the setting that names columns, "data.columns" say.
+
+    Raises:
+        DataError: most cells of a column would be numbers, written otherwise; says how.
+    """
+    names: list[str] = []
+    left_out, odd = dict(columns.left_out), {}
+    for name, cells in columns.cells.items():
+        if name in but:
+            continue
+        counted = _counts_rows(cells)
+        if INDEX.fullmatch(name) and _distinct_whole(cells):
+            left_out[name] = f"row numbers; {asked} reads it"
+        elif mostly_numbers(columns, name) or is_boolean(columns, name):
+            names.append(name)
+            if is_boolean(columns, name):
+                odd[name] = "holds TRUE and FALSE, read as 1 and 0"
+            elif counted:
+                odd[name] = f"counts the rows from {cells[0]} to {cells[-1]}; {asked} leaves it out"
+        else:
+            left_out[name] = _why_no_numbers(columns, name, asked)
+    return Chosen(tuple(names), left_out, odd)
+
+
+def _counts_rows(cells: Sequence[str]) -> bool:
+    """Whether a column numbers the rows of a table that has enough of them."""
+    if len(cells) <= ENOUGH_ROWS or cells[0] not in ("0", "1"):
+        return False
+    start = int(cells[0])
+    return all(cell == str(number) for number, cell in enumerate(cells, start))
+
+
+def _distinct_whole(cells: Sequence[str]) -> bool:
+    values = [text.value(cell) for cell in cells]
+    whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
+    return whole and len(set(values)) == len(values)
+
+
+def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
+    """Why a column holds no numbers; refuses one that would after mending."""
+    how = columns.written(name)
+    filled = [
+        (cell, line)
+        for cell, line in zip(columns.cells[name], columns.lines, strict=True)
+        if cell.lower() not in how.missing
+    ]
+    if not filled:
+        return "empty"
+    plain = sum(number(cell, how) is not None for cell, _ in filled)
+    found = [(cell, line, _mended(cell, how)) for cell, line in filled if number(cell, how) is None]
+    units = Counter(mend.unit for _, _, mend in found if mend is not None and mend.unit)
+    unit = max(units, key=units.__getitem__, default="")
+    wrong = [(cell, line, mend) for cell, line, mend in found if mend is not None and mend.unit in ("", unit)]
+    if wrong and 2 * (plain + len(wrong)) > len(filled):
+        clear = (one for one in wrong if len(one[2].settings) == 1)  # 1,5 says more than 1,234
+        cell, line, mend = next(clear, wrong[0])
+        raise DataError(
+            f"{columns.file} line {line}, column {quoted(name)}: {quoted(cell)} is a number {mend.what}. "
+            f"{remedy(mend, columns.writing)} Or say with {asked} which columns to read, without this one."
+        )
+    return f"words, {plain} of {len(filled)} cells are numbers" if plain else "words"
+
+
+def _mended(cell: str, writing: Writing) -> text.Mended | None:
+    """How a word that is no number, as a table is written, could become one."""
+    if not writing.plain and text.value(cell) is not None:
+        figures = cell.lstrip("+-")
+        grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, figures)
+        way = ({"thousands": "point"},) if grouped else ()
+        number = cell.replace(".", "") if grouped else f"{cell} as the other columns are written"
+        return text.Mended("with a point, which here is no decimal sign", number, way)
+    return text.mended(cell)
+
+
+def remedy(mend: text.Mended, writing: Writing | None) -> str:
+    """What to do about a number that is written otherwise."""
+    if writing is None or not mend.settings:
+        return f"Write {mend.number}."
+    ways = [
+        " ".join(shlex.quote(f"data.{key}={value}") for key, value in one.items()) for one in mend.settings
+    ]
+    if len(ways) == 1:
+        return f"Set {ways[0]} to read it as {mend.number}, or write that."
+    pairs = zip(ways, mend.number.split(" or "), strict=False)
+    return f"Set {', or '.join(f'{way} to read it as {number}' for way, number in pairs)}."
+
+
+def is_boolean(columns: Columns, name: str) -> bool:
+    """Whether a column says TRUE or FALSE, in any letters, wherever it says something."""
+    said = {cell.lower() for cell in columns.cells[name]} - columns.how.missing
+    return bool(said) and said <= BOOLEANS.keys()
 
 
 def mostly_numbers(columns: Columns, name: str) -> bool:
     """Whether more than half of a column's cells that are not empty are numbers; not so where all are empty."""
-    if _all_finite(columns.cells[name]) is not None:
+    how = columns.written(name)
+    if _all_finite(columns.cells[name], how) is not None:
         return True
-    filled = [cell for cell in columns.cells[name] if cell.lower() not in MISSING]
-    return 2 * sum(number(cell) is not None for cell in filled) > len(filled)
+    filled = [cell for cell in columns.cells[name] if cell.lower() not in how.missing]
+    return 2 * sum(number(cell, how) is not None for cell in filled) > len(filled)
 
 
-def number(cell: str) -> float | None:
+def number(cell: str, writing: Writing = PLAIN) -> float | None:
     """What a cell says in figures, perhaps infinite; NaN where it says that there is none; None where it is a word."""
-    if cell.lower() in MISSING:
+    if cell.lower() in writing.missing:
         return math.nan
-    try:
-        return None if "_" in cell else float(cell)  # 1_0: Python reads it and no table means it
-    except ValueError:
-        return None
+    found = text.value(cell if writing.plain else writing.standard(cell))
+    return None if found is not None and math.isnan(found) else found
 
 
-def numbers(columns: Columns, name: str, *, missing: str | None) -> Float[np.ndarray, "rows"]:
+def numbers(
+    columns: Columns, name: str, *, missing: str | None, booleans: bool = False
+) -> Float[np.ndarray, "rows"]:
     """A column as float64, NaN where it has no number.
 
     Args:
         missing: None lets numbers be missing; otherwise what else could be done about one, a clause for the message.
+        booleans: take TRUE and FALSE for 1 and 0, where all cells are of these.
 
     Raises:
-        DataError: a cell is a word, is infinite, or is missing and must not be; names the first.
+        DataError: a cell is a word, is infinite, or is missing and must not be; or some numbers have a unit and others
+            have not; names the first.
     """
-    plain = _all_finite(columns.cells[name])
+    how = columns.written(name)
+    plain = _all_finite(columns.cells[name], how)
     if plain is not None:
         return plain
+    booleans = booleans and is_boolean(columns, name)
     found = np.empty(len(columns.lines))
     for row, cell in enumerate(columns.cells[name]):
-        value = number(cell)
+        value = BOOLEANS.get(cell.lower(), math.nan) if booleans else number(cell, how)
         if value is None or math.isinf(value) or (missing is not None and math.isnan(value)):
-            hint = ""
-            if value is None and number(cell.replace(",", ".")) is not None:
-                hint = " Decimals are written with a point."
-            elif value is not None and math.isnan(value) and missing:
-                hint = f" Or {missing}."
             raise DataError(
                 f"{columns.file} line {columns.lines[row]}, column {quoted(name)}: {quoted(cell)}; wanted a finite "
-                f"number. Mend the cell, or take the line out.{hint}"
+                f"number. Mend the cell, or take the line out.{_hint(cell, value, columns, missing)}"
             )
         found[row] = value
+    _check_units(columns, name)
     return found
 
 
-def _all_finite(cells: Sequence[str]) -> Float[np.ndarray, "rows"] | None:
+def _hint(cell: str, value: float | None, columns: Columns, missing: str | None) -> str:
+    if value is not None:
+        return f" Or {missing}." if math.isnan(value) and missing else ""
+    mend = _mended(cell, columns.how)
+    return f" It is a number {mend.what}. {remedy(mend, columns.writing)}" if mend else ""
+
+
+def _check_units(columns: Columns, name: str) -> None:
+    """Refuse a column some of whose numbers have a unit, and others another one or none."""
+    how = columns.how
+    if not how.units:
+        return
+    first: tuple[str, str] | None = None
+    for cell, line in zip(columns.cells[name], columns.lines, strict=True):
+        if cell.lower() in how.missing:
+            continue
+        unit = how.split_unit(cell)[1]
+        first = first or (unit, cell)
+        if unit != first[0]:
+            raise DataError(
+                f"{columns.file} line {line}, column {quoted(name)}: {quoted(cell)}, where the column began with "
+                f"{quoted(first[1])}; wanted one unit in all its cells, or none. Mend the column."
+            )
+
+
+def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndarray, "rows"] | None:
     """The cells as `number` has them, several times as fast; None unless all are finite numbers."""
+    joined = "".join(cells)
+    if "_" in joined:
+        return None
+    if not writing.plain:
+        if writing.sign != "," or writing.thousands or writing.units or "." in joined or "\n" in joined:
+            return None
+        cells = "\n".join(cells).replace(",", ".").split("\n")
     try:
         found = np.fromiter(map(float, cells), np.float64, len(cells))
     except ValueError:
         return None
-    return found if np.isfinite(found).all() and "_" not in "".join(cells) else None
+    return found if np.isfinite(found).all() else None
 
 
 def _check_header(file: Path, header: Sequence[str]) -> None:
@@ -170,18 +544,22 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
         raise DataError(f"{file} has {len(header)} columns; wanted at most {MOST_COLUMNS}. Leave some out.")
     if not any(header):
         raise DataError(f"{file} is empty or begins with a blank line; wanted names of columns. Write them.")
-    if len(header) == 1:
-        for sign, word in SEPARATORS.items():
-            if sign in header[0]:
-                raise DataError(
-                    f"{file} is separated by {word}: its first line reads {quoted(header[0])}; wanted commas, and "
-                    "decimals with a point. Save it as such."
-                )
-    if "" in header:
+    if all(name and text.value(name) is not None for name in header):
         raise DataError(
-            f"{file}: column {header.index('') + 1} has no name (a row number that a program wrote, perhaps). "
-            "Name it in the first line, or take the column out."
+            f"{file} line 1: {quoted(', '.join(header))} are numbers; wanted the names of the columns there. "
+            "Write them in a line before."
         )
-    twice = [name for name, count in Counter(header).items() if count > 1]
-    if twice:
-        raise DataError(f"{file} names the column {quoted(twice[0])} twice; wanted each once. Rename one.")
+    try:
+        text.require_distinct(header)
+    except ValueError as error:
+        raise DataError(f"{file} {error}") from None
+
+
+def _check_blanks(file: Path, header: Sequence[str], columns: Sequence[Sequence[str]]) -> None:
+    """Refuse a table whose cells blanks separate: it has a single column, of as many words in each line."""
+    words = len(header[0].split())
+    if len(header) == 1 and words > 1 and all(len(cell.split()) == words for cell in columns[0]):
+        raise DataError(
+            f"{file} is separated by blanks: its first line reads {quoted(header[0])}; wanted commas, semicolons, tabs "
+            "or bars. Set data.separator=space where there is that setting, or save it as such."
+        )

@@ -48,6 +48,7 @@ from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
+from framework.runs.introduction import introduce
 from framework.runs.run import Run, goes_on
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
@@ -170,6 +171,7 @@ def for_training(config: Config) -> Session:
     parts = config.parts
     data = build_data(parts)
     data.prepare()
+    introduce(data, console)
     objectives = build_objectives(parts)
     predictor = build_predictor(
         parts, data.target, data.input_shape, config.settings.seed, columns=data.columns

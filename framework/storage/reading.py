@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from framework.errors import DataError, UserError, shown
 from framework.storage import limits
@@ -43,7 +42,7 @@ def guarded(
         raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
 
 
-def opened(file: Path) -> BinaryIO:
+def opened(file: Path) -> "Bounded":
     """A file to read; whoever asks closes it.
 
     Raises:

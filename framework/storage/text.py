@@ -181,7 +181,7 @@ OTHERS: tuple[tuple[str, str, str], ...] = (
 """Patterns of numbers that no setting reads, how each is written, and how to write it instead."""
 UNIT = re.compile(
     r"([+-]?)([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})?\s*([+-]?[\d.,].*?)\s*"
-    r"([^\W\d_]{1,8}[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
+    r"([^\W\d_]{1,8}(?:/[^\W\d_]{1,4})?[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
 )
 """A sign, a unit before the number ($, EUR), the number, and a unit behind it (%, kg, mm²)."""
 
@@ -231,12 +231,12 @@ def _with_unit(word: str) -> Mended | None:
         return None
     inner = found[1] + found[3]
     if value(inner) is not None:
-        return Mended(f"with the unit {unit!r}", inner, ({"units": f"[{unit}]"},), unit)
+        return Mended(f"with the unit {unit!r}", inner, ({"units": f'["{unit}"]'},), unit)
     sign, figures = (inner[0], inner[1:]) if inner[:1] in "+-" else ("", inner)
     core = _separated(sign, figures)
     if core is None:
         return None
-    settings = tuple({"units": f"[{unit}]"} | one for one in core.settings)
+    settings = tuple({"units": f'["{unit}"]'} | one for one in core.settings)
     return Mended(
         f"with the unit {unit!r} and {core.what.removeprefix('with ')}", core.number, settings, unit
     )

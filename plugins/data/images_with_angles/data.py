@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
 from framework.datasets import given_images, images
+from framework.datasets.csv_columns import Writing
 from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
 from framework.target import Target
@@ -45,6 +46,7 @@ class ImagesWithAngles(Data):
         mirror: list[Words] | None = None,
         jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08,
         skip_unreadable: bool = False,
+        writing: Writing,
     ) -> None:
         self.root = root
         self.csv = csv
@@ -55,6 +57,7 @@ class ImagesWithAngles(Data):
         self.mirror = tuple(mirror or ())
         self.jitter = jitter
         self.skip_unreadable = skip_unreadable
+        self.writing = writing
 
     def prepare(self) -> None:
         if self.root is None:
@@ -62,7 +65,8 @@ class ImagesWithAngles(Data):
         root = Path(self.root).expanduser()
         if not root.is_dir():
             raise DataError(f"data.root = {root}: no such folder; wanted the one that holds your images.")
-        table = read_table(root / self.csv, self.angle_columns, self.angles_in)
+        table = read_table(root / self.csv, self.angle_columns, self.angles_in, self.writing)
+        self.remarks = table.remarks
         for name in self.mirror:
             if name not in table.columns:
                 raise DataError(
@@ -74,7 +78,7 @@ class ImagesWithAngles(Data):
         self.groups = (root.resolve().name,)
         self.synthetic = False
         self._signs = [-1.0 if name in self.mirror else 1.0 for name in table.columns] if self.mirror else []
-        self._digest = hashlib.sha256(repr(table).encode()).hexdigest()
+        self._digest = hashlib.sha256(repr((table.columns, table.rows)).encode()).hexdigest()
         chosen = {split: [row for row in table.rows if row.split == split] for split in SPLITS}
         self._tables, self.skipped = images.load_splits(
             {split: [self._crop(root / row.file) for row in rows] for split, rows in chosen.items()},

@@ -12,7 +12,8 @@ from torch.utils.data import Dataset
 
 from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
-from framework.errors import DataError
+from framework.datasets.csv_columns import LabelledWriting
+from framework.errors import DataError, quoted
 from plugins.data.tabular.picture import bars
 from plugins.data.tabular.table import (
     Kind,
@@ -40,11 +41,13 @@ class Tabular(Data):
     Args:
         path: the file.
         target: the column to predict, or columns where they are numbers.
-        kind: what the target is: a class label, a real number, or an angle in degrees.
+        kind: what the target is: a class label, a real number, or an angle in degrees or radians.
         columns: what is read; None: every other column most of whose cells are numbers.
         validation, test: shares of the rows, drawn at random, where there is no column `split`.
         data_seed: of that draw, whatever the seed of the run.
         missing: what becomes of rows with an empty cell where a number or a label is wanted.
+        small_angles: angles in degrees may all lie within ±2π, which otherwise looks like radians and is refused.
+        writing: how the file, and others like it, are written.
     """
 
     bibtex = """@misc{tabular,
@@ -66,11 +69,15 @@ class Tabular(Data):
         test: Share = 0.15,
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
         missing: Missing = "error",
+        small_angles: bool = False,
+        writing: LabelledWriting,
     ) -> None:
         names = (target,) if isinstance(target, str) else tuple(dict.fromkeys(target))
         chosen = None if columns is None else tuple(columns)
         self.path = path
         self._trained: Reading | None = None
+        self.small_angles = small_angles
+        self.writing = writing
         self.question = Question(names, kind, chosen, validation, test, data_seed, missing)
 
     def prepare(self) -> None:
@@ -82,6 +89,8 @@ class Tabular(Data):
         self.groups = table.groups
         self.title = Path(self.path or "").stem
         self.skipped = table.skipped
+        names = ", ".join(map(quoted, self.question.target))
+        self.remarks = (f"predicted: the column {names}, data.kind={self.question.kind}", *table.remarks)
 
     @cached_property
     def _table(self) -> Table:
@@ -93,18 +102,24 @@ class Tabular(Data):
                 f"data.target = {list(asked.target)} with data.kind={asked.kind}: wanted one column, or several where "
                 "the kind is real or degrees."
             )
+        if self.small_angles and asked.kind != "degrees":
+            raise DataError(
+                f"data.small_angles=true changes nothing with data.kind={asked.kind}; wanted it with "
+                "data.kind=degrees. Leave it out."
+            )
         if asked.validation + asked.test >= 1:
             raise DataError(
                 f"data.validation + data.test = {asked.validation + asked.test:g}: wanted less than 1, so that rows "
                 "are left for training."
             )
-        return load(Path(self.path).expanduser(), asked, self._trained)
+        file = Path(self.path).expanduser()
+        return load(file, asked, self._trained, self.writing, small_angles=self.small_angles)
 
     def splits(self) -> Splits:
         return self._table.splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return read(files, self._reading)
+        return read(files, self._reading, self.writing)
 
     def inputs(self, given: Any) -> Tensor:
         """Of rows as the table has them: a CSV file, a DataFrame, a mapping by column, or an array."""

@@ -11,21 +11,28 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.data import Splits, as_inputs
+from framework.datasets.angles import unlike_degrees, unlike_radians
 from framework.datasets.csv_columns import (
+    Chosen,
     Columns,
-    mostly_numbers,
+    LabelledWriting,
+    Writing,
+    is_boolean,
     number,
     numbers,
+    numeric_columns,
     read_columns,
     require,
     tables,
+    told,
 )
 from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
-from framework.errors import DataError, did_you_mean
+from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.storage import text
 from framework.target import Target
 
-Kind = Literal["class", "real", "degrees"]
+Kind = Literal["class", "real", "degrees", "radians"]
 Missing = Literal["error", "skip"]
 SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
@@ -96,24 +103,36 @@ class Table(NamedTuple):
     sizes: dict[str, str]
     skipped: int
     digest: str
+    remarks: tuple[str, ...]
 
 
-def load(file: Path, question: Question, trained: Reading | None = None) -> Table:
+def load(
+    file: Path,
+    question: Question,
+    trained: Reading | None = None,
+    writing: Writing | None = None,
+    *,
+    small_angles: bool = False,
+) -> Table:
     """Read, check, split and standardise a table.
 
     Args:
         trained: how the model reads rows for which the table is; None: its own training rows say.
+        writing: how the file is written.
+        small_angles: whether angles in degrees may all lie within ±2π.
 
     Raises:
         DataError: the file, a column, a cell, a label or a split is not as wanted; names line and column.
     """
-    cells = read_columns(file)
+    cells = read_columns(file, writing or LabelledWriting())
     digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
-    columns = _inputs(cells, question) if trained is None else trained.columns
+    taken = _inputs(cells, question) if trained is None else _named(cells, question, trained.columns)
+    columns = taken.names
     require(cells, columns, "The trained model")
     otherwise = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
-    inputs = np.stack([numbers(cells, name, missing=otherwise) for name in columns], -1)
+    inputs = np.stack([numbers(cells, name, missing=otherwise, booleans=True) for name in columns], -1)
     values, absent = _targets(cells, question, otherwise)
+    _check_unit(cells, question, values, small_angles=small_angles)
     whole = ~(np.isnan(inputs).any(-1) | absent)
     rows = np.flatnonzero(whole)
     groups, group = _groups(file, cells, rows)
@@ -138,17 +157,17 @@ def load(file: Path, question: Question, trained: Reading | None = None) -> Tabl
     names = tuple(name for name, same in zip(columns, constant.tolist(), strict=True) if same)
     skipped = len(whole) - len(rows)
     reading = Reading(columns, scaling)
-    return Table(target, reading, names, groups, Splits(**parts), sizes, skipped, digest)
+    return Table(target, reading, names, groups, Splits(**parts), sizes, skipped, digest, told(taken))
 
 
-def read(files: Sequence[Path], reading: Reading) -> Fields:
+def read(files: Sequence[Path], reading: Reading, writing: Writing | None = None) -> Fields:
     """The same columns of other files, standardised as the training rows were, one sample a row.
 
     Raises:
         DataError: there is no file, or one cannot be read, lacks a column, or a cell of one is no finite number.
     """
     parts = []
-    for cells, inputs in tables(files, reading.columns, "The trained model"):
+    for cells, inputs in tables(files, reading.columns, "The trained model", writing or LabelledWriting()):
         rows = np.arange(len(inputs))
         parts.append(as_float32(cells, reading.columns, rows, standardised(inputs, reading.scaling)))
     inputs = torch.cat(parts)
@@ -229,7 +248,7 @@ def as_float32(
     return torch.from_numpy(narrow)
 
 
-def _inputs(cells: Columns, question: Question) -> tuple[str, ...]:
+def _inputs(cells: Columns, question: Question) -> Chosen:
     require(cells, question.target, "data.target")
     if question.columns is not None:
         require(cells, question.columns, "data.columns")
@@ -239,39 +258,80 @@ def _inputs(cells: Columns, question: Question) -> tuple[str, ...]:
             raise DataError(
                 f"data.columns names {min(known)!r}, which is what is to be predicted (data.target). Take it out."
             )
+        chosen = _named(cells, question, columns)
     else:
-        others = (name for name in cells.cells if name not in (*question.target, SPLIT, GROUP))
-        columns = tuple(name for name in others if mostly_numbers(cells, name))
-    if not columns:
+        chosen = numeric_columns(cells, (*question.target, SPLIT, GROUP), "data.columns")
+    if not chosen.names:
         raise DataError(
             f"{cells.file} has no column of numbers to read beside {', '.join(question.target)}; its columns: "
-            f"{', '.join(cells.cells)}. Name some with data.columns."
+            f"{shown(', '.join(cells.cells))}. Name some with data.columns."
+            + "".join(f" {quoted(name)}: {why}." for name, why in list(chosen.left_out.items())[:8])
         )
-    return columns
+    return chosen
+
+
+def _named(cells: Columns, question: Question, columns: tuple[str, ...]) -> Chosen:
+    """The columns that somebody names, and those that nobody does."""
+    known = (*columns, *question.target, SPLIT, GROUP)
+    others = [name for name in cells.cells if name not in known]
+    return Chosen(columns, dict(cells.left_out) | dict.fromkeys(others, "not among those to read"), {})
 
 
 def _targets(cells: Columns, question: Question, otherwise: str | None) -> tuple[np.ndarray, np.ndarray]:
     """The targets as the table has them, (row, name) numbers or (row,) labels, and whether a row has none."""
     if question.kind != "class":
+        for name in question.target:
+            if is_boolean(cells, name):
+                raise DataError(
+                    f"{cells.file}, column {name!r}: {cells.cells[name][0]!r} and the like are two words; wanted "
+                    f"numbers for data.kind={question.kind}. Set data.kind=class, or name another data.target."
+                )
         values = np.stack([numbers(cells, name, missing=otherwise) for name in question.target], -1)
         return values, np.asarray(np.isnan(values).any(-1))
     name = question.target[0]
     labels = cells.cells[name]
-    if otherwise is not None and "" in labels:
+    absent = np.array([label.lower() in cells.how.missing for label in labels])
+    if otherwise is not None and absent.any():
+        row = int(absent.argmax())
+        what = f"{labels[row]!r}, which says that there is no label" if labels[row] else "no label"
+        where = " Or set data.missing_words=[] where that is a label." if labels[row] else ""
         raise DataError(
-            f"{cells.file} line {cells.lines[labels.index('')]}, column {name!r}: no label. Write it, or {otherwise}."
+            f"{cells.file} line {cells.lines[row]}, column {name!r}: {what}. Write it, or {otherwise}.{where}"
         )
-    return np.array(labels, dtype=object), np.array([label == "" for label in labels])
+    return np.array(labels, dtype=object), absent
+
+
+def _check_unit(cells: Columns, question: Question, values: np.ndarray, *, small_angles: bool) -> None:
+    """Refuse angles that look like the other unit.
+
+    Raises:
+        DataError: says which, and what to set.
+    """
+    if question.kind not in ("degrees", "radians"):
+        return
+    for name, column in zip(question.target, values.T, strict=True):
+        if question.kind == "radians":
+            wrong = unlike_radians(column)
+            way = "Set data.kind=degrees, or wrap the angles into one turn"
+        else:
+            wrong = "" if small_angles else unlike_degrees(column)
+            way = "Set data.kind=radians, or data.small_angles=true where they are degrees"
+        if wrong:
+            raise DataError(f"{cells.file}, column {name!r}: {wrong}. {way}.")
 
 
 def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ...], Int[Tensor, "row"]]:
     if GROUP not in cells.cells:
         return (file.stem,), torch.zeros(len(rows), dtype=torch.int64)
     words = [cells.cells[GROUP][row] for row in rows]
-    if "" in words:
+    absent = [place for place, word in enumerate(words) if word.lower() in cells.how.missing]
+    if absent:
+        word = words[absent[0]]
+        why = f" ({word!r})" if word else ""
         raise DataError(
-            f"{cells.file} line {cells.lines[rows[words.index('')]]}, column `{GROUP}`: no name. Write one in every "
-            "row, or rename the column."
+            f"{cells.file} line {cells.lines[rows[absent[0]]]}, column `{GROUP}`: no name{why}. "
+            "Write one in every row, or rename the column."
+            + (" Or set data.missing_words=[] where that is a name." if word else "")
         )
     groups = sorted(set(words), key=_order)
     numbered = {name: index for index, name in enumerate(groups)}
@@ -321,6 +381,8 @@ def _encode(
         # whole turns are taken off before the unit is changed: their multiple of 2π would be rounded
         angle = wrap(torch.from_numpy(np.deg2rad(np.fmod(values[rows], 360.0))))
         return Target("angle", question.target), angle.float()
+    if question.kind == "radians":
+        return Target("angle", question.target), wrap(torch.from_numpy(values[rows])).float()
     labels = sorted(set(values[rows]), key=_order)
     _check_labels(cells, labels, rows, training, values, question.target[0])
     numbered = {label: index for index, label in enumerate(labels)}
@@ -340,17 +402,30 @@ def _check_labels(
             f"{cells.file}, column {name!r}: every row is {labels[0]!r}; wanted two classes or more. Add rows of "
             "others, or name another data.target."
         )
-    if len(labels) > max(MANY_LABELS, len(rows) / 2) and all(number(label) is not None for label in labels):
+    found = [text.value(label) for label in labels]
+    numeric = all(value is not None for value in found)
+    broken = any(value is not None and not value.is_integer() for value in found)
+    if numeric and len(labels) > (MANY_LABELS if broken else max(MANY_LABELS, len(rows) / 2)):
         raise DataError(
             f"{cells.file}, column {name!r}: {len(labels)} different numbers in {len(rows)} rows are no classes. Set "
             "data.kind=real or data.kind=degrees, or name another data.target."
         )
+    written: dict[float, str] = {}
+    for label, value in zip(labels, found, strict=True):
+        if value is not None and written.setdefault(value, label) != label:
+            raise DataError(
+                f"{cells.file}, column {name!r}: the labels {written[value]!r} and {label!r} are the same number; "
+                "wanted each class written in one way. Mend the column."
+            )
     unseen = set(labels) - set(values[training])
     if unseen:
         row = next(row for row in rows if values[row] in unseen)
+        real = (
+            " These look like numbers: data.kind=real predicts them." if numeric and len(labels) > 2 else ""
+        )
         raise DataError(
             f"{cells.file} line {cells.lines[row]}, column {name!r}: no training row is {values[row]!r}, so it cannot "
-            f"be learned. Add such rows, say in a column `{SPLIT}` which row is for what, or set another "
+            f"be learned.{real} Add such rows, say in a column `{SPLIT}` which row is for what, or set another "
             "data.data_seed."
         )
 

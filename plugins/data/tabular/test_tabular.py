@@ -145,7 +145,7 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
     [
         ("", "mine.csv is empty"),
         ("x,class", "has no row below its first line"),
-        ("x;class\n1;2", "is separated by semicolons"),
+        ("x class\n1 2", "is separated by blanks"),
         ("x,x,class\n1,2,a", "names the column 'x' twice"),
         (
             "x,klass\n1,a",
@@ -171,6 +171,22 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         ("split,x,class\ntrain,1,a\ntest,2,b", r"the validation split is empty .* column `split`"),
         ("split,x,class\ntrain,1,a\ntset,2,b", r"line 3, column `split`: 'tset'; .* Did you mean 'test'\?"),
         ("group,x,class\na,1,a\n,2,b", r"line 3, column `group`: no name"),
+        (
+            "group,x,class\na,1,a\nNA,2,b",
+            r"line 3, column `group`: no name \('NA'\).* data\.missing_words=\[\]",
+        ),
+        *(
+            (
+                with_cell(word, 9, 2),
+                rf"line 9, column 'class': '{word}', which says .* data\.missing_words=\[\]",
+            )
+            for word in ("nan", "NA", "N/A", "None", "null", "NaN", "-")
+        ),
+        (with_cell("1", 9, 2).replace(",b", ",1.0"), "labels '1' and '1.0' are the same number"),
+        (
+            "x,class\n" + "\n".join(f"{row},{max(row - 30, 0) if row < 45 else 3}" for row in range(90)),
+            r"no training row is '\d+', so .* These look like numbers: data\.kind=real predicts them",
+        ),
         (with_cell("1e300", 3), r"line 3, column 'x': '1e300' lies beyond single precision"),
     ],
 )
@@ -184,6 +200,47 @@ def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> No
     )
     with pytest.raises(DataError, match=message):
         prepared(file, data_seed=seed)
+
+
+def test_words_for_nothing_are_labels_where_that_is_said(tmp_path: Path) -> None:
+    text = "x,class\n" + "\n".join(f"{row},{('none', 'mild', 'NA')[row % 3]}" for row in range(60))
+    data = prepared(table(tmp_path, text), missing_words=[])
+    assert data.target.names == ("NA", "mild", "none")
+    kept = prepared(table(tmp_path, text), missing_words=["na"], missing="skip")
+    assert (kept.target.names, kept.skipped) == (("mild", "none"), 20)
+
+
+@pytest.mark.parametrize("kind", ["degrees", "radians"])
+def test_angles_in_the_other_unit_are_refused(tmp_path: Path, kind: str) -> None:
+    turn = np.linspace(-180, 180, 61).round(3)
+    written = {"degrees": np.deg2rad(turn).round(4), "radians": turn}[kind]
+    text = "x,angle\n" + "\n".join(f"{row * row},{value}" for row, value in enumerate(written))
+    file = table(tmp_path, text)
+    other = {"degrees": "radians", "radians": "degrees"}[kind]
+    with pytest.raises(DataError, match=rf"column 'angle': .* looks like {other}; .* Set data\.kind={other}"):
+        prepared(file, target="angle", kind=kind)
+    data = prepared(file, target="angle", kind=other)
+    angle, line = (fields(data, "train")[name] for name in ("target", "line"))
+    gap = angle[:, 0].double() - torch.deg2rad(torch.from_numpy(turn)[line - 2])
+    np.testing.assert_allclose(torch.remainder(gap + 1, 2 * math.pi) - 1, 0, atol=1e-3)
+    if kind == "degrees":
+        prepared(file, target="angle", kind=kind, small_angles=True)
+        with pytest.raises(DataError, match=r"small_angles=true changes nothing with data\.kind=real"):
+            prepared(file, target="angle", kind="real", small_angles=True)
+
+
+def test_what_is_read_predicted_and_left_out_is_said(tmp_path: Path) -> None:
+    text = "Unnamed: 0,a,flag,note,none,class\n"
+    text += "\n".join(
+        f"{row + 5},{row * row % 7},{('TRUE', 'false')[row % 2]},w,,{'ab'[row % 2]}" for row in range(40)
+    )
+    data = prepared(table(tmp_path, text))
+    assert data.columns == ("a", "flag")
+    assert data.remarks == (
+        "predicted: the column 'class', data.kind=class",
+        "left out: 'Unnamed: 0' (row numbers; data.columns reads it), 'note' (words), 'none' (empty)",
+        "'flag' holds TRUE and FALSE, read as 1 and 0",
+    )
 
 
 def test_wrong_questions_are_refused(tmp_path: Path) -> None:
@@ -279,7 +336,7 @@ def test_a_picture_has_a_bar_for_every_column() -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("kind", "radians"),
+        ("kind", "gradians"),
         ("missing", "drop"),
         ("validation", 0.0),
         ("test", math.nan),
