@@ -140,6 +140,8 @@ def test_a_run_killed_after_it_stopped_early_trains_no_further(
     assert told.findall(resumed.out) == told.findall(killed.out) != []
     again = (killed.folder / "results.json").read_text()
     assert json.loads(again)["log_likelihood"] == json.loads(results)["log_likelihood"]
+    for name in ("test/log_likelihood", "cost/milliseconds_per_sample"):
+        assert list(killed.values(name)) == [0], "logged once"
 
 
 def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, tmp_path: Path) -> None:

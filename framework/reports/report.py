@@ -52,8 +52,10 @@ def report_test(run: Run, session: Session) -> None:
     write_whole(path, json.dumps(results, indent=1).encode())
     numbers = {key: float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)}
     groups = {f"test/{name}": some for name, some in found.groups.items()}
+    known = _logged(run)
     for part, values in {"test": found.total, **groups, "cost": numbers}.items():
-        run.tracker.log_metrics({f"{part}/{key}": value for key, value in values.items()}, 0, 0)
+        named = {f"{part}/{key}": value for key, value in values.items()}
+        run.tracker.log_metrics({name: value for name, value in named.items() if name not in known}, 0, 0)
     run.tracker.log_artifact(path)
     rows = [  # groups of test samples are no rivals: nothing is bold
         results,
@@ -64,6 +66,11 @@ def report_test(run: Run, session: Session) -> None:
     if settings.pictures:
         _pictures(run, session, found, synthetic)
     _next_steps(run, spent, session.console)
+
+
+def _logged(run: Run) -> set[str]:
+    """Return the names of the numbers that a run logged before it was killed: what it computes is the same again."""
+    return {name for line in run.tracker.journal.lines() for name in line.values} if run.resumed else set()
 
 
 def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) -> None:
