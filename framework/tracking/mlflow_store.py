@@ -19,7 +19,7 @@ from framework.storage.enclosed import require_enclosed, require_plain_within
 from framework.storage.files import alone, remove_leftovers, replacing
 from framework.tracking.run_info import MODEL, RunInfo, read_run_info
 from framework.tracking.sender import Record, Store, reason
-from framework.tracking.stores import address, require_own_files, sqlite_path, without_password
+from framework.tracking.stores import address, require_own_files, sqlite_path, sqlite_uri, without_password
 
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
 # One retry instead of minutes of them: who calls this tries again by itself, and has to notice its end.
@@ -107,8 +107,10 @@ class MlflowStore(Store):
             self._client.log_inputs(self._run_id, [_dataset(batch[0])])
         else:
             metrics = [metric for record in batch for metric in self._metrics(record)]
-            params, tags = self._params_and_tags(batch)
+            params, tags, removed = self._params_and_tags(batch)
             self._log(metrics, params, tags)
+            for key in removed:
+                self._remove_tag(key)
             for metric in metrics:
                 self._stored[metric.key] = max(metric.step, self._stored.get(metric.key, metric.step))
             self._params |= {param.key: param.value for param in params}
@@ -190,9 +192,10 @@ class MlflowStore(Store):
             if after is None or not after < step <= until.get(key, after):
                 yield Metric(key, float(value), round(record["time"] * 1000), step)
 
-    def _params_and_tags(self, batch: Sequence[Record]) -> tuple[list[Param], list[RunTag]]:
+    def _params_and_tags(self, batch: Sequence[Record]) -> tuple[list[Param], list[RunTag], list[str]]:
+        """Return parameters, tags, and the keys of tags that were removed."""
         params: dict[str, str] = {}
-        tags: dict[str, str] = {}
+        tags: dict[str, str | None] = {}
         for record in batch:
             tags |= {self._name(key): value for key, value in record.get("tags", {}).items()}
             for name, value in record.get("params", {}).items():
@@ -202,7 +205,16 @@ class MlflowStore(Store):
                     params[key] = value
                 elif before != value:  # MLflow lets no parameter change
                     tags[f"changed.{key}"[:_LONGEST_NAME]] = value
-        return [Param(*item) for item in params.items()], [RunTag(*item) for item in tags.items()]
+        texts = [RunTag(key, value) for key, value in tags.items() if value is not None]
+        removed = [key for key, value in tags.items() if value is None]
+        return [Param(*item) for item in params.items()], texts, removed
+
+    def _remove_tag(self, key: str) -> None:
+        try:
+            self._client.delete_tag(self._run_id, key)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":  # it was never sent
+                raise
 
     def _log(self, metrics: Sequence[Metric], params: Sequence[Param], tags: Sequence[RunTag]) -> None:
         if not (metrics or params or tags):
@@ -326,7 +338,7 @@ def _make_database(path: Path, info: RunInfo) -> None:
     """Make an SQLite store aside and rename it: MLflow cannot mend one whose making was cut short."""
     remove_leftovers(path.parent)
     with replacing(path) as partial:
-        SqlAlchemyStore(f"sqlite:///{partial}", info.artifacts).engine.dispose()
+        SqlAlchemyStore(sqlite_uri(partial), info.artifacts).engine.dispose()
     # MLflow keeps its connections by address: they may lead to a deleted file that was there before.
     SqlAlchemyStore(info.uri, info.artifacts).engine.dispose()
 

@@ -9,7 +9,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 from framework.errors import ConfigError, DataError, shown
 from framework.storage.enclosed import require_enclosed, require_plain_within
@@ -19,6 +19,10 @@ SETTING = "MLFLOW_TRACKING_URI"
 _SQLITE = "sqlite:///"
 _BESIDE = ("", "-wal", "-shm", "-journal")
 """Endings of the files that SQLite opens with a database."""
+_MEANING = r"[%?\x00-\x1f\x7f]"
+"""Letters of a path that mean something else in an address of SQLAlchemy."""
+_ESCAPED = r"[%?#'\"\\\x00-\x1f\x7f]"
+"""Letters of a path that mean something else where MLflow keeps files: it decodes paths, and quotes them in SQL."""
 _SECRET = r"([?&][^=&\s]*(?:pass|pwd|token|secret)[^=&\s]*=)[^&\s]*"
 
 
@@ -43,10 +47,17 @@ def address(named: str | None, folder: Path) -> Address:
         named: `logger.uri` of this command.
 
     Raises:
-        ConfigError: MLflow cannot keep runs there.
+        ConfigError: MLflow cannot keep runs there, or in a folder of such a name.
     """
     given = named or os.environ.get(SETTING)
-    return Address(store_uri(given), True) if given else Address(default_uri(folder), False)
+    uri = store_uri(given) if given else default_uri(folder)
+    path = sqlite_path(uri)
+    if path is not None and re.search(r"[\ud800-\udfff]", str(path)):
+        raise ConfigError(
+            f"{shown(path)} lies in a folder whose name is not UTF-8, where MLflow keeps no run. Rename the folder, or "
+            "choose another store: add logger.uri=sqlite:///<file>, or logger=none."
+        )
+    return Address(uri, bool(given))
 
 
 def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> Address:
@@ -63,7 +74,7 @@ def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> A
     own = [Address(store_uri(uri), True) for uri in (named, os.environ.get(SETTING)) if uri]
     own += [Address(default_uri(place), False) for place in (folder, Path.cwd() / "outputs" / "run")]
     for one in own:
-        if without_password(one.uri) == without_password(recorded):
+        if _same(one.uri, recorded):
             return one
     told = shown(without_password(recorded))
     raise ConfigError(
@@ -74,7 +85,7 @@ def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> A
 
 def default_uri(folder: Path) -> str:
     """Return the SQLite store for a run folder: mlflow.db in the `outputs` folder around it, else beside it."""
-    return f"{_SQLITE}{_outputs(folder) / 'mlflow.db'}"
+    return sqlite_uri(_outputs(folder) / "mlflow.db")
 
 
 def store_uri(uri: str) -> str:
@@ -87,7 +98,7 @@ def store_uri(uri: str) -> str:
         path, question, query = uri.removeprefix(_SQLITE).partition("?")
         if path in ("", ":memory:"):
             raise ConfigError(f"logger.uri={uri} keeps nothing. Give a file: sqlite:///outputs/mlflow.db.")
-        return f"{_SQLITE}{Path(path).expanduser().absolute()}{question}{query}"
+        return f"{sqlite_uri(Path(unquote(path)).expanduser().absolute())}{question}{query}"
     if not re.match(r"(https?|(postgresql|mysql|mssql)(\+\w+)?)://.|databricks", uri):
         raise ConfigError(
             f"logger.uri={shown(without_password(uri))}: wanted sqlite:///<file>, the http(s)://<host>:<port> of a "
@@ -96,9 +107,17 @@ def store_uri(uri: str) -> str:
     return uri
 
 
+def sqlite_uri(path: Path) -> str:
+    """Return the address of an SQLite store, escaped where a letter of its path would mean something else there.
+
+    Then its slashes are escaped, too: MLflow makes the folder that it reads in an address, before it is decoded.
+    """
+    return _SQLITE + (quote(os.fsencode(path), safe="") if re.search(_MEANING, str(path)) else str(path))
+
+
 def sqlite_path(uri: str) -> Path | None:
     """Return the file of an SQLite store; None for any other."""
-    return Path(uri.removeprefix(_SQLITE).partition("?")[0]) if uri.startswith(_SQLITE) else None
+    return Path(unquote(uri.removeprefix(_SQLITE).partition("?")[0])) if uri.startswith(_SQLITE) else None
 
 
 def artifact_folder(uri: str, folder: Path) -> str | None:
@@ -107,9 +126,10 @@ def artifact_folder(uri: str, folder: Path) -> str | None:
     Absolute, since MLflow's own default depends on the working directory.
     """
     path = sqlite_path(uri)
-    if path is not None:
-        return str(path.parent / "artifacts")
-    return None if uri.startswith(("http", "databricks")) else str(_outputs(folder) / "artifacts")
+    if path is None and uri.startswith(("http", "databricks")):
+        return None
+    place = (path.parent if path else _outputs(folder)) / "artifacts"
+    return place.as_uri() if re.search(_ESCAPED, str(place)) else str(place)
 
 
 def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
@@ -134,7 +154,7 @@ def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
         if not place.is_relative_to(home) or ".." in place.parts:
             raise DataError(
                 f"The store {path}, which nobody named, keeps files in {shown(without_password(location))}; wanted a "
-                f"folder in {home}. If the store is yours, name it: add logger.uri={_SQLITE}{path}"
+                f"folder in {home}. If the store is yours, name it: add logger.uri={sqlite_uri(path)}"
             )
         require_plain_within(place, path.parent)
         if place != home:  # that holds the files of every run
@@ -161,6 +181,13 @@ def require_no_password(uri: str) -> None:
             f"are stored and other users see them. Put the whole address into the environment variable {SETTING} and "
             "leave logger.uri out; MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD serve for http, too."
         )
+
+
+def _same(one: str, other: str) -> bool:
+    """Whether two addresses name the same store, whatever their passwords, and whichever letters they escape."""
+    one, other = without_password(one), without_password(other)
+    same_file = sqlite_path(one) == sqlite_path(other) is not None
+    return one == other or (same_file and one.partition("?")[2] == other.partition("?")[2])
 
 
 def _outputs(folder: Path) -> Path:

@@ -1,0 +1,100 @@
+"""The default store lies in the folder of the runs, whatever that folder is called."""
+
+import os
+import sqlite3
+from pathlib import Path
+from urllib.request import url2pathname
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sqlalchemy.engine import make_url
+
+from framework.configuration.composition import in_quotes
+from framework.errors import ConfigError
+from framework.tracking.stores import (
+    Address,
+    address,
+    artifact_folder,
+    confirmed,
+    default_uri,
+    require_own_files,
+    sqlite_path,
+    store_uri,
+)
+from tests.conftest import TINY, Forks, command
+
+NAMES = (
+    "per%20cent", "100%", "%", "what?", "q?x=1&pass=2", "ha#sh", "sp ace", "'single'", "\"double\"", "'both\"",
+    "back\\slash", "new\nline", "umläut", "日本", "a:b@c", "semi;colon,comma", "file:x", "~", "{x}", "$HOME", "a+b",
+)  # fmt: skip
+ALL = "p%20c q?x=1#z 'b\"\\ü\nl"
+
+
+def require_in(name: str, base: Path) -> None:
+    folder = base / name / "outputs" / "run"
+    uri = default_uri(folder)
+    file = base / name / "outputs" / "mlflow.db"
+    assert make_url(uri).database == str(file) == str(sqlite_path(uri))
+    assert not make_url(uri).query
+    assert store_uri(uri) == uri, "the user may name the store as it is shown"
+    files = artifact_folder(uri, folder)
+    assert files is not None
+    # as mlflow.utils.file_utils.local_file_uri_to_path reads it
+    assert url2pathname(files.removeprefix("file://")) == str(file.with_name("artifacts"))
+    # MLflow makes the folder above what stands in the address
+    assert Path(uri.removeprefix("sqlite:///")).parent in (file.parent, Path())
+    require_own_files(uri, (f"{files}/1/artifacts",))
+    assert confirmed(uri, None, folder, folder / "run.json") == Address(uri, False)
+    literal = f"sqlite:///{file}"  # as earlier versions recorded it
+    if sqlite_path(literal) == file:
+        assert confirmed(literal, None, folder, folder / "run.json") == Address(uri, False)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_address_names_the_file(name: str, tmp_path: Path) -> None:
+    require_in(name, tmp_path)
+
+
+@given(st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1, max_size=30))
+def test_an_address_names_the_file_for_any_letters(name: str) -> None:
+    if name not in (".", ".."):
+        require_in(name, Path("/nowhere"))
+
+
+def test_a_relative_address_is_of_the_folder_that_the_command_runs_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / ALL).mkdir()
+    monkeypatch.chdir(tmp_path / ALL)
+    found = store_uri("sqlite:///a%20b/mlflow.db?timeout=1")
+    assert make_url(found).database == str(tmp_path / ALL / "a b" / "mlflow.db")
+    assert make_url(found).query == {"timeout": "1"}
+
+
+def test_a_folder_that_is_not_utf8_is_refused_before_training(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9/outputs/run"))
+    with pytest.raises(ConfigError, match=r"caf.*not UTF-8.*logger=none"):
+        address(None, folder)
+    other = f"sqlite:///{tmp_path}/mlflow.db"
+    assert address(other, folder) == Address(other, True)
+
+
+def test_runs_sweeps_and_sync_keep_the_store_in_their_folder(
+    forks: Forks, stranger_site: Path, tmp_path: Path
+) -> None:
+    base = tmp_path / "home" / ALL
+    base.mkdir(parents=True)
+    framework = command(forks, stranger_site, base)
+    swept = framework("-m", *TINY, "trainer.max_epochs=1", "pictures=false", folder=None)
+    assert swept.code == 0, swept.out
+    database = base / "outputs" / "mlflow.db"
+    with sqlite3.connect(database) as store:
+        runs = store.execute("SELECT run_uuid, status, artifact_uri FROM runs").fetchall()
+    assert [status for _, status, _ in runs] == ["FINISHED"] * 2
+    kept = {file.name for file in (base / "outputs" / "artifacts").rglob("*") if file.is_file()}
+    assert {"comparison.csv", "results.json", "model.ckpt"} <= kept
+    job = next((base / "outputs").rglob("journal.jsonl")).parent
+    synced = framework("mode=sync", f"mode.run={in_quotes(str(job))}", folder=None)
+    assert synced.code == 0, synced.out
+    assert list((tmp_path / "home").iterdir()) == [base], "nothing lies elsewhere"
