@@ -1,10 +1,15 @@
 """The contract of an encoder: one function a property, each reporting the worst case it saw."""
 
+import copy
 import math
+import time
 from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.func import functional_call, stack_module_state
 
 from framework.encoder import Encoder
 from framework.errors import UserError
@@ -16,10 +21,14 @@ from framework.testing.cloud_encoders import (
     other_shapes,
     padding,
 )
+from framework.testing.encoder_gradients import moved_a_little, of_weights
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import CloudRow, EncoderRow
 
 Make = Callable[[], Encoder]
+MANY, SOME = 131, 9
+"""Samples of a large batch; SOME where four take more processor time than SLOW."""
+SLOW = 0.03
 
 
 def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]) -> Iterator[Finding]:
@@ -38,18 +47,29 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
             return torch.rand(count, *row.input_shape, generator=generator)
         return torch.randn(count, *row.input_shape, generator=generator)
 
+    @cache
+    def slow() -> bool:
+        return _slow(make, inputs)
+
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "feature shapes": (0.0, lambda worst: _shapes(make, inputs, worst)),
         "number types": (0.0, lambda worst: _number_types(make, inputs, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, inputs, worst)),
-        "rows of a batch apart": (1e-4, lambda worst: _rows_apart(make, inputs, worst)),
+        "rows of a batch apart": (1e-4, lambda worst: _rows_apart(make, inputs, worst, slow=slow())),
         "state-dict round trip": (0.0, lambda worst: _round_trip(make, inputs, worst)),
+        "inputs are left as they are": (0.0, lambda worst: _untouched(make, inputs, worst)),
+        "what it says of itself": (1e-4, lambda worst: _claims(make, inputs, worst)),
         "gradients reach every parameter": (0.0, lambda worst: _gradients(make, inputs, worst)),
         "gradient": (1e-4, lambda worst: _against_differences(make, inputs, worst)),
+        "gradient in weights": (
+            5e-3,
+            lambda worst: of_weights(make, inputs, worst, slow=slow()),
+        ),
         "finite on extreme inputs": (0.0, lambda worst: _extremes(make, inputs, worst)),
     }
     if len(row.input_shape) == 3:
         checks["bytes are read as 0 to 1"] = (1e-5, lambda worst: _bytes(make, row, worst))
+        checks["all of an image counts"] = (0.0, lambda worst: _every_part(make, inputs, worst))
     if isinstance(row, CloudRow):
         clouds = different_clouds(*row.input_shape)
         checks |= {
@@ -86,38 +106,146 @@ def _number_types(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> 
 
 
 def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
-    pixels = torch.randint(0, 256, (3, *row.input_shape), dtype=torch.uint8)
+    """Also those of an image that is all but black, whose numbers a float might have."""
+    encoder = make()
+    for what, brightest in {"bytes": 256, "dark bytes": 2}.items():
+        pixels = torch.randint(0, brightest, (3, *row.input_shape), dtype=torch.uint8)
+        with torch.no_grad():
+            found, wanted = encoder(pixels), encoder(pixels.float() / 255)
+        scale = wanted.abs().amax().clamp(min=1e-6)
+        worst.see((found - wanted).abs() / scale, f"{what} against the same in [0, 1]")
+
+
+def _every_part(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+    """Another channel, or another quarter of the image, gives other features, with weights as after some training."""
+    encoder, batch = make(), inputs(2)
+    moved_a_little(encoder)
+    channels, height, width = batch.shape[1:]
+    whole = slice(None)
+    parts: dict[str, tuple[Any, ...]] = {
+        f"channel {channel}": (channel, whole, whole) for channel in range(channels)
+    }
+    for row in {0, height // 2} if height > 1 else {0}:
+        for column in {0, width // 2} if width > 1 else {0}:
+            place = slice(row, row + -(-height // 2)), slice(column, column + -(-width // 2))
+            parts[f"the quarter from {row}, {column}"] = (whole, *place)
+    generator = torch.Generator().manual_seed(SEED + 1)
+    other = torch.rand(batch.shape, generator=generator)
     with torch.no_grad():
-        found, wanted = make()(pixels), make()(pixels.float() / 255)
-    worst.see(
-        (found - wanted).abs() / wanted.abs().amax().clamp(min=1e-6), "bytes against the same in [0, 1]"
-    )
+        found = encoder(batch)
+        for what, place in parts.items():
+            changed = batch.clone()
+            changed[(whole, *place)] = other[(whole, *place)]
+            worst.count(torch.equal(encoder(changed), found), f"{what} changes nothing")
 
 
 def _repeatable(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+    """Whatever was encoded before; and evaluation changes no state."""
     with torch.no_grad():
-        encoder = make()
-        worst.same_bits("features of two calls", encoder(inputs(3)), encoder(inputs(3)))
-        worst.same_bits("features of two encoders of one seed", encoder(inputs(3)), make()(inputs(3)))
+        encoder, batch = make(), inputs(3)
+        before = {name: value.clone() for name, value in _state(encoder).items()}
+        first = encoder(batch)
+        worst.same_bits("features of two calls", encoder(batch), first)
+        for count in (5, 3):
+            encoder(inputs(7)[-count:])
+        worst.same_bits("features after other inputs", encoder(batch), first)
+        for name, value in _state(encoder).items():
+            worst.same_bits(f"state {name} after evaluation", value, before[name])
+        other = make()
+        other(inputs(7)[-4:])
+        worst.same_bits(
+            "features of another of one seed, which other inputs came to first", other(batch), first
+        )
 
 
-def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _state(encoder: Encoder) -> dict[str, Tensor]:
+    return {name: value for name, value in encoder.state_dict().items() if isinstance(value, Tensor)}
+
+
+def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst, *, slow: bool) -> None:
     """In evaluation a sample's features do not depend on its batch, up to the rounding of another matrix product."""
-    encoder, batch = make(), inputs(4)
-    with torch.no_grad():
+    encoder = make()
+
+    def compare(batch: Tensor, sizes: list[int]) -> None:
         whole = encoder(batch)
+        worst.same(f"features of {len(batch)}", tuple(whole.shape), (len(batch), *encoder.output_shape))
         scale = whole.abs().amax().clamp(min=1e-6)
-        for index in range(len(batch)):
-            alone = encoder(batch[index : index + 1])[0]
-            worst.see((whole[index] - alone).abs().max() / scale, f"sample {index} alone")
+        start = 0
+        for part in batch.split(sizes):
+            gap = (whole[start : start + len(part)] - encoder(part)).abs().flatten(1).amax(-1) / scale
+            said = f"of {len(batch)}, among {len(part)}"
+            worst.see(gap, lambda at, start=start, said=said: f"sample {start + at[0]} {said}")
+            start += len(part)
+
+    with torch.no_grad():
+        if slow:
+            compare(inputs(SOME), [1, SOME - 1])
+            return
+        compare(inputs(4), [1] * 4)
+        compare(inputs(MANY), [7] * (MANY // 7) + [MANY % 7])
+
+
+def _slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
+    encoder, batch = make(), inputs(4)
+    start = time.process_time()
+    with torch.no_grad():
+        encoder(batch)
+    return time.process_time() - start > SLOW
+
+
+def _untouched(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+    """An ensemble's other members read the same batch."""
+    encoder, batches = make(), {"floats": inputs(4)}
+    if batches["floats"].dim() == 4:
+        batches["bytes"] = (batches["floats"] * 255).round().clamp(0, 255).to(torch.uint8)
+    for what, batch in batches.items():
+        for training in (False, True):
+            given = batch.clone()
+            with torch.no_grad():
+                encoder.train(training)(given)
+            worst.same_bits(f"{what} after {'training' if training else 'evaluation'}", given, batch)
 
 
 def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
+    """Also of what training has moved beside the parameters: running means, say."""
     encoder = make()
     other = make(SEED + 7)  # so that a parameter which is not stored starts elsewhere
-    other.load_state_dict(encoder.state_dict())
+    for what, batches in {"the first state": 0, "the state after training": 2}.items():
+        with torch.no_grad():
+            for _ in range(batches):
+                encoder.train()(inputs(5))
+            wanted = encoder.eval()(inputs(3))
+            other.load_state_dict(encoder.state_dict())
+            worst.same_bits(f"features of {what}", other(inputs(3)), wanted)
     with torch.no_grad():
-        worst.same_bits("features of the stored state", other(inputs(3)), encoder(inputs(3)))
+        worst.same_bits("features of a copy", copy.deepcopy(encoder)(inputs(3)), encoder(inputs(3)))
+
+
+def _claims(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
+    """`fixed`: a function of the input alone. `vectorises`: several at once are each."""
+    encoder = make()
+    worst.count(False, "it says nothing of itself")
+    if not (encoder.fixed or encoder.vectorises):
+        return
+    other, batch = make(SEED + 7), inputs(3)
+    with torch.no_grad():
+        if encoder.fixed:
+            learned = [name for name, value in encoder.named_parameters() if value.requires_grad]
+            worst.same("parameters learned though fixed", learned, [])
+            wanted = encoder(batch)
+            worst.same_bits("fixed features with another seed", other(batch), wanted)
+            worst.same_bits("fixed features in training", encoder.train()(batch), wanted)
+            encoder.eval()
+        if encoder.vectorises and any(True for _ in encoder.parameters()):
+            both = [encoder, other]
+            state = stack_module_state(both)  # type: ignore[arg-type]  # modules
+            found = torch.vmap(lambda parts: functional_call(encoder, parts, (batch,)), randomness="same")(
+                state
+            )
+            for number, (one, each) in enumerate(zip(found, both, strict=True)):
+                wanted = each(batch)
+                scale = wanted.abs().amax().clamp(min=1e-6)
+                worst.see((one - wanted).abs() / scale, f"features of {number} of two at once")
 
 
 def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
@@ -126,12 +254,16 @@ def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> Non
     worst.count(False, "no parameters")
     if not any(True for _ in encoder.parameters()):
         return
+    missing = {name for name, parameter in encoder.named_parameters() if parameter.requires_grad}
     for _ in range(4):
         encoder(inputs(16)).square().sum().backward()
-    for name, parameter in encoder.named_parameters():
-        if parameter.requires_grad:
-            missing = parameter.grad is None or not parameter.grad.abs().sum() > 0
-            worst.count(missing, f"parameter {name}")
+        for name, parameter in encoder.named_parameters():
+            if parameter.grad is not None and parameter.grad.abs().sum() > 0:
+                missing.discard(name)
+        if not missing:
+            return
+    for name in sorted(missing):
+        worst.count(True, f"parameter {name}")
 
 
 def _against_differences(

@@ -1,0 +1,20 @@
+"""`mode=check` finds every wrong encoder that is planted, by the property meant for it, and none in right ones."""
+
+import pytest
+
+from framework.testing.encoders import examine_encoder
+from framework.testing.finding import require
+from framework.testing.rows import EncoderRow
+from tests.planted_encoders import ALL_FAULTS, RIGHT, Fault
+
+
+@pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
+def test_the_fault_is_found(fault: Fault) -> None:
+    findings = examine_encoder(EncoderRow("", fault.shape), fault.build)
+    assert fault.by in {finding.name for finding in findings if not finding.holds}
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_right_encoder_passes(name: str) -> None:
+    kind, shape = RIGHT[name]
+    require(*examine_encoder(EncoderRow("", shape), kind))
