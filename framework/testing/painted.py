@@ -109,6 +109,8 @@ def wrapping(scene: Scene) -> Texture:
 
 PART = 4
 """Pictures along each axis, moved by parts of a pixel, whose mean stands for one of areas."""
+ALONE = 6.0
+"""How many times as far as all together one parameter's gradient may be off."""
 
 
 def gradient(renderer: Renderer, worst: Worst) -> None:
@@ -186,3 +188,6 @@ def gradient(renderer: Renderer, worst: Worst) -> None:
         for name, a, b in zip(sorted(renderer.differentiable), found, wanted, strict=True)
     )
     worst.see(((one - other).norm() / other.norm()).reshape(1), lambda at: said)
+    # and each by itself, of which edges between pixels leave less that is exact
+    each = (one - other).abs() / other.abs().clamp(min=0.01 * other.norm().item())
+    worst.see(each / ALONE, lambda at: said)

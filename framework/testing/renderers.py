@@ -9,6 +9,15 @@ from torch import Tensor
 
 from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene
+from framework.testing.compared import (
+    color_gradient,
+    colors,
+    depth,
+    draws_points,
+    points,
+    several,
+    visibility,
+)
 from framework.testing.extremes import extremes
 from framework.testing.finding import Finding, Worst, examined
 from framework.testing.painted import barycentric, gradient, normal, texture, uv
@@ -16,6 +25,8 @@ from framework.testing.rows import RendererRow
 from framework.testing.scenes import SIZE, camera, empty, sphere, square
 
 Make = Callable[[], Renderer]
+OF_TRIANGLES = {"no holes", "sphere: depth, metres", "what the near plane cuts", "extreme scenes"}
+"""What nobody asks of one whose row says that it draws sets of points, and which does."""
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
@@ -35,6 +46,11 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "where the camera says": (0.0, _places),
         "what the near plane cuts": (2e-3, _cut),
         "extreme scenes": (0.0, extremes),
+        "colours": (2e-3, colors),
+        "visible faces": (0.0, visibility),
+        "depth, relative": (1e-3, depth),
+        "several scenes": (0.0, several),
+        "points": (0.0, points),
     }
     renderer = build()
     for channel, check in (("normal", normal), ("barycentric", barycentric), ("uv", uv)):
@@ -44,8 +60,12 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         checks["textures are drawn or refused"] = (1e-6, texture)
     if renderer.differentiable:
         checks["gradient"] = (0.05, gradient)
+        checks["gradient in colours"] = (5e-3, color_gradient)
+    left_out = {*row.leave_out}
+    if "no faces, nothing seen" in row.leave_out and draws_points(renderer):
+        left_out |= OF_TRIANGLES
     for name, (limit, check) in checks.items():
-        if name not in row.leave_out:
+        if name not in left_out:
             yield examined(
                 name,
                 row.limits.get(name, limit),

@@ -63,6 +63,7 @@ def checkpoint(
 POINTS_ARE_DRAWN = {
     "no faces, nothing seen": "it draws vertices, of a set of points too",
     "bad triangles are left out": "it draws vertices: those of a triangle without area too",
+    "points": "drawn weights paint them in any colour",
 }
 WHITE = {"nothing seen is background": 0.05}  # the drawn weights' answer to an empty picture
 UNBOUNDED_WHITE = {"nothing seen is background": 0.2}  # and where no sigmoid keeps it near 1

@@ -1,0 +1,124 @@
+"""Pictures of few triangles by brute force, in float64: every pixel's ray against every face. And scenes for them."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from framework.geometry.camera import Camera, look_from
+from framework.renderer import Scene
+from framework.testing.finding import SEED
+
+CLEAR = 0.6
+"""Pixels from a pixel's centre within which nothing else may be seen where a picture is compared."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What is seen in each pixel.
+
+    Attributes:
+        face: (height, width) int64, -1 for none.
+        depth: (height, width) metres, inf for none.
+        color: (height, width, channels), 0 for none.
+        weights: (height, width, vertices), how much of each vertex's colour is there.
+        clear: (height, width), whether the same face is seen around.
+    """
+
+    face: Tensor
+    depth: Tensor
+    color: Tensor
+    weights: Tensor
+    clear: Tensor
+
+
+def picture(scene: Scene) -> Picture:
+    """By the plane of each face and perspective-correct weights of its corners (Möller & Trumbore 1997)."""
+    assert scene.colors is not None
+    face, depth, weights = _first(scene, 0.0, 0.0)
+    shares = weights.new_zeros(*face.shape, len(scene.vertices))
+    if len(scene.faces):
+        shares.scatter_add_(-1, scene.faces.long()[face.clamp(min=0)], weights)
+    clear = torch.ones_like(face, dtype=torch.bool)
+    for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7)):
+        around, _, _ = _first(scene, CLEAR * row, CLEAR * column)
+        clear &= around == face
+    return Picture(face, depth, shares @ scene.colors.double(), shares, clear)
+
+
+def _first(scene: Scene, down: float, across: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Index, depth and weights of the nearest face of every pixel, moved by parts of one."""
+    seen = scene.camera
+    row, column = torch.meshgrid(
+        torch.arange(seen.height).double() + down, torch.arange(seen.width).double() + across, indexing="ij"
+    )
+    focal, principal = (torch.as_tensor(part).double() for part in (seen.focal, seen.principal))
+    ray = torch.cat(
+        [(torch.stack([column, row], -1) - principal) / focal, torch.ones_like(row)[..., None]], -1
+    )
+    if not len(scene.faces):
+        nothing = torch.full(row.shape, math.inf, dtype=torch.float64)
+        return torch.full(row.shape, -1), nothing, torch.zeros_like(ray)
+    vertices = scene.vertices.double() @ seen.rotation.double().T + seen.translation.double()
+    corners = vertices[scene.faces.long()]
+    # with corners (A, B, C) the ray's weights are r·(B×C), r·(C×A), r·(A×B), up to their sum
+    sides = torch.stack(
+        [torch.linalg.cross(corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]) for k in range(3)], 1
+    )
+    parts = torch.einsum("hwi,fki->hwfk", ray, sides)
+    total = parts.sum(-1)
+    depth = (corners[:, 0] * sides[:, 0]).sum(-1) / total
+    hit = ((parts >= 0).all(-1) | (parts <= 0).all(-1)) & (depth >= seen.near) & depth.isfinite()
+    nearest, face = depth.where(hit, math.inf).min(-1)
+    weights = (parts / total[..., None]).gather(2, face[..., None, None].expand(*face.shape, 1, 3))[:, :, 0]
+    none = nearest.isinf()
+    return face.where(~none, -1), nearest, weights.where(~none[..., None], 0.0)
+
+
+def camera(size: tuple[int, int]) -> Camera:
+    """Not one that hides an exchange: pixels are no squares, and the principal point is off the middle."""
+    plain = look_from(-0.5, 0.3, 0.4, distance=4.0, field_of_view=0.8, size=size)
+    (across, down), (column, row) = plain.focal, plain.principal
+    return replace(
+        plain, focal=(1.2 * across, 0.9 * down), principal=(column + 0.11 * size[1], row - 0.07 * size[0])
+    )
+
+
+def crossing(size: tuple[int, int] = (45, 141), count: int = 40, channels: int = 3) -> Scene:
+    """Large triangles across each other, each turned to the camera, among others that nobody sees: behind the camera,
+    aside, and without area. Vertices in another order, and one that no face has."""
+    generator = torch.Generator().manual_seed(SEED)
+    seen = camera(size)
+    depth = 3 + 3 * torch.rand(count, 1, 1, generator=generator, dtype=torch.float64)
+    depth = depth * (0.6 + 0.8 * torch.rand(count, 3, 1, generator=generator, dtype=torch.float64))
+    sides = torch.tensor([seen.width, seen.height]).double()
+    middle = torch.rand(count, 1, 2, generator=generator, dtype=torch.float64) * sides
+    around = torch.randn(count, 3, 2, generator=generator, dtype=torch.float64) * (0.4 * min(size) + 6)
+    depth[1:count:5] *= -1
+    middle[2:count:5] += 1e4
+    around[3:count:5] = 0
+    return _seen(seen, middle + around, depth, channels, generator)
+
+
+def floor(size: tuple[int, int] = (40, 53)) -> Scene:
+    """Two triangles from near to far: what is linear on the screen and what is in space are far apart."""
+    generator = torch.Generator().manual_seed(SEED)
+    pixels = torch.tensor([[[-9, 44.0], [62, 47], [36, 5]], [[-9, 44], [36, 5], [4, 3]]]).double()
+    depth = torch.tensor([[[1.1], [1.4], [30.0]], [[1.1], [30.0], [17.0]]]).double()
+    return _seen(camera(size), pixels, depth, 3, generator)
+
+
+def _seen(seen: Camera, pixels: Tensor, depth: Tensor, channels: int, generator: torch.Generator) -> Scene:
+    """Triangles (faces, 3) whose corners are seen at these pixels and depths."""
+    focal, principal = (torch.as_tensor(part).double() for part in (seen.focal, seen.principal))
+    corners = torch.cat([(pixels - principal) / focal, torch.ones_like(depth)], -1) * depth
+    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    away = (across * corners[:, 0]).sum(-1) > 0
+    corners[away] = corners[away].flip(1)
+    world = ((corners - seen.translation.double()) @ seen.rotation.double()).reshape(-1, 3)
+    order = torch.randperm(len(world) + 1, generator=generator)
+    vertices = torch.zeros(len(order), 3)
+    vertices[order[:-1]] = world.float()
+    colors = 0.1 + 0.8 * torch.rand(len(order), channels, generator=generator)
+    return Scene(vertices, order[:-1].reshape(-1, 3), colors, seen)
