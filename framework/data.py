@@ -73,6 +73,8 @@ class Data(ABC):
     """Shape of one input, without the batch dimension; of point clouds (points, columns), of the largest of them."""
     suffixes: tuple[str, ...] = ()
     """Of the files that `read` reads, in small letters, so that others may lie beside them; () where any may be one."""
+    companions: tuple[str, ...] = ()
+    """How the names of files end that are read along with another one and hold no samples, in small letters."""
     columns: tuple[str, ...] = ()
     """What the numbers of an input's last dimension are called, where they have names: ("x", "y", "z", "red", ...)."""
     plane: bool = False
@@ -216,6 +218,10 @@ def as_inputs(given: Any, shape: tuple[int, ...]) -> Tensor:
         raise DataError(
             f"{type(given).__name__} is no input of this model; wanted an array of inputs of shape {wanted}, or files."
         ) from error
+    if found.is_complex():
+        raise DataError(
+            "complex numbers are no input of this model; wanted real ones. Give their magnitudes, say."
+        )
     if found.dim() == len(shape):
         found = found[None]
     fixed = shape[1:] if len(shape) == 2 else shape

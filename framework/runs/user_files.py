@@ -31,9 +31,12 @@ def to_read(
     """The files to read, and those left out because they cannot be read; `console` is told of what is not read.
 
     Hidden files are ignored, and files whose suffix is not one of the data set's and of which it can read none (a
-    README, a table). What then cannot be read stays, and is an error later; where the data's `config` says to skip it,
-    it is left out.
+    README, a table), or that belong to others (`Data.companions`). What then cannot be read stays, and is an error
+    later; where the data's `config` says to skip it, it is left out.
     """
+    beside = {file for file in files if data.companions and file.name.lower().endswith(data.companions)}
+    _tell(console, "belong to others and are read with them", sorted(beside))
+    files = [file for file in files if file not in beside]
     kinds: dict[str, list[Path]] = {}
     for file in files:
         if not file.name.startswith("."):

@@ -43,6 +43,23 @@ def array(content: bytes) -> NDArray:
     return np.frombuffer(content, kind, count, start).reshape(shape, order=order).copy(order)
 
 
+def real(values: object, what: str) -> NDArray:
+    """An array as float64, of complex numbers too if none has an imaginary part.
+
+    Raises:
+        ValueError: some have; what a cast would drop without a word.
+    """
+    found = np.asarray(values)
+    if found.dtype.kind == "c":
+        if np.imag(found).any():
+            raise ValueError(
+                f"{what} holds complex numbers, of which the imaginary part would be lost; wanted real ones. Save "
+                "their magnitudes, numpy.abs"
+            )
+        found = np.real(found)
+    return found.astype(np.float64)
+
+
 def archive(content: bytes, names: Collection[str] | None = None) -> dict[str, NDArray]:
     """Those of the arrays of an .npz file that have one of these names, or all.
 

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from plugins.data.cest.fit import fit
 from plugins.data.cest.protocol import offsets_of, resampled
 from plugins.data.cest.spectrum import COUNT, Parameters, Preset, spectrum
 from plugins.data.cest.spectrum_picture import curve
-from plugins.data.cest.volumes import SUFFIXES, read_volume
+from plugins.data.cest.volumes import SUFFIXES, Volume, read_volume
 
 NotNegative = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 GENERATED, FITTED = "1", "3"
@@ -82,6 +83,7 @@ class CEST(Data, Mapped):
 }"""
     title = "cest"
     suffixes = SUFFIXES
+    companions = (".mask.nii.gz", ".mask.nii", ".offsets.txt")
 
     def __init__(
         self,
@@ -125,6 +127,7 @@ class CEST(Data, Mapped):
             spectra, self._fits(spectra), torch.from_numpy(volume.place), torch.from_numpy(volume.region)
         )
         self.groups = volume.regions
+        self.remarks = _remarks(volume, self.offsets)
         self.input_shape = (len(self.offsets),)
         self.columns = tuple(f"{offset:+.4f} ppm" for offset in self.offsets)
         self._splits = Splits(*(self._split(found, number, file) for number in range(3)))
@@ -235,6 +238,21 @@ class CEST(Data, Mapped):
 
     def picture(self, inputs: Tensor) -> np.ndarray:
         return curve(inputs.detach().cpu().double().numpy())
+
+
+def _remarks(volume: Volume, offsets: Sequence[float]) -> tuple[str, ...]:
+    """What of a volume is not read as it is."""
+    said = []
+    outside = math.prod(volume.shape) - len(volume.spectra) - volume.dropped
+    if outside:
+        said.append(f"left out: {outside} voxels outside the mask, or without a number")
+    if volume.dropped:
+        said.append(f"left out: {volume.dropped} voxels with a number that is not finite")
+    if volume.unread:
+        said.append(f"left out: {', '.join(volume.unread)} of the file")
+    if len(volume.offsets) != len(offsets) or not np.allclose(volume.offsets, offsets):
+        said.append(f"{len(volume.offsets)} offsets of the file, resampled at {len(offsets)}")
+    return tuple(said)
 
 
 def _digest(*tensors: Tensor) -> str:

@@ -1,5 +1,7 @@
 """Z-spectra: derivatives, fits against SciPy, files that are read and refused, splits without neighbours."""
 
+import gzip
+
 import mpmath
 import numpy as np
 import pytest
@@ -264,3 +266,61 @@ def test_maps_of_a_nifti_file_lie_where_it_lies(tmp_path, brain):
 def test_the_head_holds_nothing_that_was_fitted():
     head = LorentzianHead(Target("real", PRESETS["ten"].target))
     assert not head.state_dict()
+
+
+@pytest.mark.parametrize("kind", ["npz", "nii", "mask", "M0"])
+def test_an_imaginary_part_is_refused_and_not_lost(tmp_path, kind):
+    """Complex numbers without one are read."""
+    nibabel = pytest.importorskip("nibabel")
+    spectra = np.random.default_rng(0).uniform(0.3, 0.9, (3, 4, 1, 6))
+    arrays = {
+        "spectra": spectra,
+        "offsets": np.arange(6.0),
+        "mask": np.ones((3, 4, 1)),
+        "M0": np.ones((3, 4, 1)),
+    }
+    for part in (0j, 0.1j):
+        changed = {"npz": "spectra"}.get(kind, kind)
+        if kind == "nii":
+            nibabel.save(
+                nibabel.Nifti1Image((spectra + part).astype(np.complex64), np.eye(4)), tmp_path / "one.nii"
+            )
+            (tmp_path / "one.offsets.txt").write_text("0\n1\n2\n3\n4\n5\n")
+            file = tmp_path / "one.nii"
+        else:
+            file = tmp_path / "one.npz"
+            np.savez(file, **(arrays | {changed: arrays[changed] + part}))
+        if part:
+            with pytest.raises(
+                DataError, match=r"one\.(npz|nii).* complex numbers, .* magnitudes, numpy\.abs"
+            ):
+                read_volume(file)
+        else:
+            np.testing.assert_allclose(read_volume(file).spectra, spectra.reshape(12, 6), atol=1e-6)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("second", [False, True], ids=["NIfTI-1", "NIfTI-2"])
+@pytest.mark.parametrize("end", ["nii", "nii.gz", "NII"])
+@pytest.mark.parametrize("mask_end", ["nii", "nii.gz"])
+def test_both_versions_of_nifti_are_read_with_either_mask(tmp_path, order, second, end, mask_end):
+    nibabel = pytest.importorskip("nibabel")
+    kind = nibabel.Nifti2Image if second else nibabel.Nifti1Image
+    spectra = np.random.default_rng(0).uniform(0.3, 0.9, (3, 4, 1, 6)).astype(np.float32)
+    mask = np.arange(12).reshape(3, 4, 1) % 3 == 0
+
+    def save(name, array):
+        header = (nibabel.Nifti2Header if second else nibabel.Nifti1Header)(endianness=order)
+        header.set_data_dtype(array.dtype)
+        content = kind(array, np.eye(4), header).to_bytes()
+        (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith("gz") else content)
+
+    save(f"scan.{end}", spectra)
+    save(f"scan.mask.{mask_end}", mask.astype(np.uint8))
+    (tmp_path / "scan.offsets.txt").write_text("-5\n-2\n0\n2\n5\n9\n")
+    found = read_volume(tmp_path / f"scan.{end}")
+    np.testing.assert_array_equal(found.spectra, spectra[mask])
+    other = {"nii": "nii.gz", "nii.gz": "nii"}[mask_end]
+    save(f"scan.mask.{other}", mask.astype(np.uint8))
+    with pytest.raises(DataError, match=r"are beside it; wanted one mask"):
+        read_volume(tmp_path / f"scan.{end}")

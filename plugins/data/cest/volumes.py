@@ -10,12 +10,13 @@ from jaxtyping import Bool, Float, Int
 
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, shown
-from framework.storage.arrays import archive
+from framework.storage.arrays import archive, real
 from framework.storage.limits import MOST_OF_SPECTRA, MOST_VOXELS
 from framework.storage.reading import guarded, read_bytes, require_numbers
 
 SUFFIXES = (".mat", ".npz", ".nii", ".gz")
 SPECTRA = ("spectra", "rawData")
+KNOWN = ("offsets", "M0", "mask", "region", "affine")
 UNSATURATED = 100.0
 """From this offset on, ppm, nothing is saturated: such images are M0, by which the others are divided."""
 PLAUSIBLE = 2.0
@@ -36,6 +37,7 @@ class Volume(NamedTuple):
     regions: names.
     left_out: (dropped, 3), voxels of the mask with a number that is not finite.
     affine: of a NIfTI file, voxels to millimetres; None of others.
+    unread: names of what else the file holds.
     """
 
     offsets: Float[np.ndarray, "offset"]
@@ -46,6 +48,7 @@ class Volume(NamedTuple):
     regions: tuple[str, ...]
     left_out: Int[np.ndarray, "dropped 3"]
     affine: Float[np.ndarray, "4 4"] | None = None
+    unread: tuple[str, ...] = ()
 
     @property
     def dropped(self) -> int:
@@ -91,7 +94,7 @@ def _volume(found: Mapping[str, Any], size: int) -> Volume:
     name = next((name for name in SPECTRA if name in found), None)
     if name is None or "offsets" not in found:
         raise DataError(f"it holds {shown(', '.join(found)) or 'nothing'}. {WANTED}")
-    spectra, offsets = np.asarray(found[name], np.float64), np.asarray(found["offsets"], np.float64).ravel()
+    spectra, offsets = real(found[name], name), real(found["offsets"], "offsets").ravel()
     if not 2 <= spectra.ndim <= 4 or spectra.shape[-1] != len(offsets):
         raise DataError(f"{name} is of shape {spectra.shape} for {len(offsets)} offsets. {WANTED}")
     if not np.isfinite(offsets).all() or len(np.unique(offsets)) < len(offsets):
@@ -119,12 +122,19 @@ def _volume(found: Mapping[str, Any], size: int) -> Volume:
         )
     region = found.get("region")
     regions = ("voxels",) if region is None else ("healthy", "tumour")
-    numbers = np.zeros(shape, np.int64) if region is None else np.asarray(region, np.int64).reshape(shape)
+    numbers = (
+        np.zeros(shape, np.int64)
+        if region is None
+        else real(region, "region").astype(np.int64).reshape(shape)
+    )
     if numbers.min() < 0 or numbers.max() >= len(regions):
         raise DataError(f"regions {numbers.min()} to {numbers.max()}; wanted 0 (healthy) and 1 (tumour).")
     place = np.argwhere(kept)
     left_out = np.argwhere(inside & ~whole)
-    return Volume(offsets, spectra[kept], place, numbers[kept], shape, regions, left_out, found.get("affine"))
+    unread = tuple(shown(other, 40) for other in found if other not in (name, *KNOWN))[:12]
+    return Volume(
+        offsets, spectra[kept], place, numbers[kept], shape, regions, left_out, found.get("affine"), unread
+    )
 
 
 def _normalised(spectra: np.ndarray, offsets: np.ndarray, given: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +143,7 @@ def _normalised(spectra: np.ndarray, offsets: np.ndarray, given: Any) -> tuple[n
     if far.all():
         raise DataError(f"every offset is {UNSATURATED:g} ppm or more. They are to be in ppm, not in Hz.")
     if given is not None:
-        whole = np.asarray(given, np.float64).reshape(*spectra.shape[:-1], 1)
+        whole = real(given, "M0").reshape(*spectra.shape[:-1], 1)
     elif far.any():
         whole = spectra[..., far].mean(-1, keepdims=True)
     else:
@@ -147,4 +157,4 @@ def _mask(given: Any, spectra: np.ndarray) -> Bool[np.ndarray, "x y z"]:
     """Which voxels are meant; where nobody says, those with any number other than 0."""
     if given is None:
         return np.asarray(np.nan_to_num(spectra, nan=1.0).any(-1))
-    return np.asarray(np.nan_to_num(np.asarray(given, np.float64).reshape(spectra.shape[:-1])) > 0)
+    return np.asarray(np.nan_to_num(real(given, "mask").reshape(spectra.shape[:-1])) > 0)

@@ -13,14 +13,25 @@ from torch.utils.data import Dataset
 
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
+from framework.datasets.csv_columns import Writing
 from framework.datasets.fields import Fields
-from framework.errors import DataError
+from framework.errors import DataError, shown
 from framework.geometry.meshes import stream
+from framework.storage.arrays import real
 from framework.storage.generated import read_mark
 from framework.target import Target
 from plugins.data.table_tennis.physics import Constants
 from plugins.data.table_tennis.picture import side_view
-from plugins.data.table_tennis.recordings import SUFFIXES, Flight, distinct, flights_of, irregular, listed
+from plugins.data.table_tennis.recordings import (
+    SUFFIXES,
+    Flight,
+    TimesIn,
+    distinct,
+    flights_of,
+    irregular,
+    listed,
+    other_columns,
+)
 from plugins.data.table_tennis.simulator import Simulation, simulated
 from plugins.data.table_tennis.windows import CITED, PARTS, Grid, Window, prefix, windows
 
@@ -44,6 +55,8 @@ class TableTennis(Data):
         data_seed: of that draw, whatever the seed of the run.
         forget: share of the seen frames that are hidden from each training window anew.
         unreadable: what becomes of files that cannot be read.
+        times_in: the unit of the files' times.
+        writing: how CSV files are written.
         simulation: what is simulated.
         constants: of the ball and the table that are simulated.
     """
@@ -62,6 +75,8 @@ class TableTennis(Data):
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
         forget: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0,
         unreadable: Literal["error", "skip"] = "error",
+        times_in: TimesIn = "seconds",
+        writing: Writing,
         simulation: Simulation,
         constants: Constants,
     ) -> None:
@@ -72,6 +87,8 @@ class TableTennis(Data):
         self.forget = forget
         self.varies = forget > 0
         self.unreadable = unreadable
+        self.times_in: TimesIn = times_in
+        self.writing = writing
         self.simulation = simulation
         self.constants = constants
         self.input_shape = (self.grid.observed * len(PARTS),)
@@ -111,17 +128,32 @@ class TableTennis(Data):
         self.target = Target("real", self.grid.names, tuple(train.mean(0).tolist()), tuple(scale.tolist()))
         self.synthetic = read_mark(root) is not None if root.is_dir() else False
         self.skipped = left_out
+        first = listed(root)[0]
+        others = other_columns(first, self.writing)
+        said = (
+            (others, f"left out: the columns {shown(', '.join(others))} of {first.name}"),
+            (self.repeated, f"left out: {self.repeated} repeated flights"),
+            (
+                self.short,
+                f"left out: {self.short} flights too short to read {self.grid.least} frames and predict",
+            ),
+            (self.lost, f"{self.lost} frames are missing, by the times of the others"),
+        )
+        self.remarks = tuple(remark for counts, remark in said if counts)
 
     def _found(self, root: Path) -> tuple[list[Flight], int]:
         flights, left_out = [], 0
         for file in listed(root):
             try:
-                flights += flights_of(file, self.grid.step)
+                flights += self._flights_of(file)
             except DataError:
                 if self.unreadable == "error":
                     raise
                 left_out += 1
         return flights, left_out
+
+    def _flights_of(self, file: Path) -> list[Flight]:
+        return flights_of(file, self.grid.step, self.times_in, self.writing)
 
     def splits(self) -> Splits:
         return Splits(**self._tables)
@@ -132,7 +164,7 @@ class TableTennis(Data):
             raise DataError(
                 "No file was given; wanted a flight as CSV with the columns t, x, y, z, or as *.mat."
             )
-        flights = [flight for file in files for flight in flights_of(Path(file), self.grid.step)]
+        flights = [flight for file in files for flight in self._flights_of(Path(file))]
         return Fields(
             input=torch.stack([self._last(flight) for flight in flights]), index=torch.arange(len(flights))
         )
@@ -149,7 +181,10 @@ class TableTennis(Data):
     def inputs(self, given: Any) -> Tensor:
         """Of files, of one flight as an array (frame, 4) of t, x, y, z, or of inputs as they are."""
         if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == 4:
-            table = given.astype(float)
+            try:
+                table = real(given, "the given flight")
+            except ValueError as error:
+                raise DataError(f"{error}.") from error
             return self._last(Flight("the given flight", table[:, 0], table[:, 1:]))[None]
         return Data.inputs(self, given)
 

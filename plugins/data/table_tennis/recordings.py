@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from framework.datasets.csv_columns import numbers, read_columns, require
+from framework.datasets.csv_columns import Writing, numbers, read_columns, require
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, shown
+from framework.storage.arrays import real
 
 COLUMNS = ("t", "x", "y", "z")
 TRUE = ("true_x", "true_y", "true_z")
@@ -18,6 +19,10 @@ ALIKE = 1e-4
 """Metres by which frames of one flight in two recordings may differ."""
 COMPARED = 8
 """Frames from the beginning by which a flight is known again."""
+SLOWEST = 1.0
+"""Seconds from frame to frame that data.step may be."""
+TimesIn = Literal["seconds", "milliseconds", "microseconds"]
+SECONDS: dict[TimesIn, float] = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6}
 FARTHEST = 100.0
 """Metres from the origin within which a ball is believed to be."""
 
@@ -57,25 +62,41 @@ def listed(root: Path) -> list[Path]:
     return found
 
 
-def flights_of(file: Path, step: float) -> list[Flight]:
+def flights_of(
+    file: Path, step: float, times_in: TimesIn = "seconds", writing: Writing | None = None
+) -> list[Flight]:
     """The flights of one file: of a CSV file one, of a MATLAB file all.
 
     Args:
         step: seconds between two frames, as the config says.
+        times_in: the unit of the file's times.
+        writing: how a CSV file is written.
 
     Raises:
         DataError: the file is damaged, or a flight's times or places are wrong; says which and where.
     """
     if file.suffix.lower() == ".mat":
-        return [_checked(flight, step) for flight in _from_matlab(file)]
-    columns = read_columns(file)
+        return [_checked(_in_seconds(flight, times_in), step, times_in) for flight in _from_matlab(file)]
+    columns = read_columns(file, writing)
     require(columns, COLUMNS, "data.root")
     times, *places = (numbers(columns, name, missing="") for name in COLUMNS)
     truth = None
     if all(name in columns.cells for name in TRUE):
         truth = np.stack([numbers(columns, name, missing="") for name in TRUE], -1)
     flight = Flight(str(file), times, np.stack(places, -1), truth)
-    return [_checked(flight, step, columns.lines)]
+    return [_checked(_in_seconds(flight, times_in), step, times_in, columns.lines)]
+
+
+def _in_seconds(flight: Flight, times_in: TimesIn) -> Flight:
+    return flight if times_in == "seconds" else flight._replace(times=flight.times * SECONDS[times_in])
+
+
+def other_columns(file: Path, writing: Writing | None) -> list[str]:
+    """What a CSV file holds beside a flight."""
+    if file.suffix.lower() == ".mat":
+        return []
+    columns = read_columns(file, writing)
+    return [*columns.left_out, *(name for name in columns.cells if name not in (*COLUMNS, *TRUE))]
 
 
 def _from_matlab(file: Path) -> list[Flight]:
@@ -83,7 +104,7 @@ def _from_matlab(file: Path) -> list[Flight]:
     found = read_variables(file)
     held: Any = found.get("ballTrain")
     if isinstance(held, Mapping) and "data" in held:
-        tables = [np.asarray(one, float) for one in np.atleast_1d(held["data"])]
+        tables = [real(one, "a flight") for one in np.atleast_1d(held["data"])]
     elif "time" in found and "ball" in found:
         pairs = zip(np.atleast_1d(found["time"]), np.atleast_1d(found["ball"]), strict=False)
         tables = [_joined(time, ball) for time, ball in pairs]
@@ -102,12 +123,14 @@ def _from_matlab(file: Path) -> list[Flight]:
 
 
 def _joined(time: Any, ball: Any) -> np.ndarray:
-    time, ball = np.atleast_1d(np.asarray(time, float)), np.atleast_2d(np.asarray(ball, float))
+    time, ball = np.atleast_1d(real(time, "time")), np.atleast_2d(real(ball, "ball"))
     same = time.ndim == 1 and ball.ndim == 2 and len(time) == len(ball)
     return np.column_stack([time, ball]) if same else ball
 
 
-def _checked(flight: Flight, step: float, lines: Sequence[int] | None = None) -> Flight:
+def _checked(
+    flight: Flight, step: float, times_in: TimesIn = "seconds", lines: Sequence[int] | None = None
+) -> Flight:
     """The flight itself.
 
     Raises:
@@ -126,7 +149,8 @@ def _checked(flight: Flight, step: float, lines: Sequence[int] | None = None) ->
         row = int(wrong.argmax())
         raise DataError(
             f"{where(row)}: t, x, y, z = {times[row]:g}, {', '.join(f'{one:g}' for one in places[row])}; wanted "
-            f"seconds, and metres within {FARTHEST:g} of the origin. Mend the frame or take it out."
+            f"seconds, and metres within {FARTHEST:g} of the origin. Mend the frame or take it out"
+            f"{_millimetres(places)}."
         )
     gaps = np.diff(times)
     if (gaps <= 0).any():
@@ -138,10 +162,25 @@ def _checked(flight: Flight, step: float, lines: Sequence[int] | None = None) ->
     usual = float(np.median(gaps))
     if not 0.6 < usual / step < 1.6:
         raise DataError(
-            f"{name} has a frame every {1000 * usual:.3g} ms; data.step says one every {1000 * step:.3g} ms. Set "
-            f"data.step={usual:.4g}."
+            f"{name} has a frame every {1000 * usual:.4g} ms where its times are {times_in}; data.step says one every "
+            f"{1000 * step:.3g} ms. {_other_rate(usual, step, times_in)}"
         )
     return flight
+
+
+def _other_rate(usual: float, step: float, times_in: TimesIn) -> str:
+    """What to do about frames every `usual` seconds."""
+    for unit, seconds in SECONDS.items():
+        if unit != times_in and 0.6 < usual / SECONDS[times_in] * seconds / step < 1.6:
+            return f"Set data.times_in={unit}."
+    if 0 < usual <= SLOWEST:
+        return f"Set data.step={usual:.4g}."
+    return f"Frames are at most {SLOWEST:g} s apart, in seconds or in data.times_in. Mend the times."
+
+
+def _millimetres(places: Float[np.ndarray, "frame 3"]) -> str:
+    usual = float(np.median(np.abs(places).max(1)))
+    return "; divide all of them by 1000 if they are millimetres" if usual > FARTHEST else ""
 
 
 def distinct(flights: Sequence[Flight]) -> tuple[list[Flight], int]:

@@ -79,6 +79,46 @@ def test_another_frame_rate_is_told_with_the_remedy(tmp_path: Path) -> None:
     write_csv(tmp_path / "slow.csv", rows)
     with pytest.raises(DataError, match=r"a frame every 64 ms.*Set data.step=0.064"):
         prepared(root=str(tmp_path))
+    rows[:, 0] *= 1e5
+    write_csv(tmp_path / "slow.csv", rows)
+    with pytest.raises(
+        DataError, match=r"at most 1 s apart, in seconds or in data\.times_in\. Mend the times"
+    ):
+        prepared(root=str(tmp_path))
+
+
+@pytest.mark.parametrize("unit, seconds", [("milliseconds", 1e-3), ("microseconds", 1e-6), ("seconds", 1.0)])
+@pytest.mark.parametrize("said", ["seconds", "milliseconds", "microseconds"])
+def test_times_in_another_unit_are_read_as_that_is_said(
+    tmp_path: Path, unit: str, seconds: float, said: str
+) -> None:
+    """And where another unit is said, the message names the right one, which the schema then takes."""
+    tables = [table(number) for number in range(4)]
+    for number, rows in enumerate(tables):
+        write_csv(tmp_path / f"{number}.csv", np.column_stack([rows[:, 0] / seconds, rows[:, 1:]]))
+    if said == unit:
+        data = prepared(root=str(tmp_path), times_in=said, future=5)
+        first = data.read([tmp_path / "0.csv"])[0]["input"].view(20, 5)
+        np.testing.assert_allclose(first[-1, 1:4], tables[0][-1, 1:], atol=1e-5)
+        np.testing.assert_allclose(first[-2, 0], -0.016, atol=1e-6)
+    else:
+        with pytest.raises(DataError, match=rf"0\.csv has a frame every .* Set data\.times_in={unit}\."):
+            prepared(root=str(tmp_path), times_in=said, future=5)
+
+
+def test_millimetres_and_other_columns_are_said(tmp_path: Path) -> None:
+    for number in range(4):
+        file = write_csv(tmp_path / f"{number}.csv", table(number))
+        head, *lines = file.read_text().splitlines()
+        file.write_text("\n".join([f"{head},spin,note", *(f"{line},3,x" for line in lines)]))
+    assert prepared(root=str(tmp_path), future=5).remarks[0] == "left out: the columns spin, note of 0.csv"
+    rows = table(0)
+    rows[:, 1:] *= 1000
+    write_csv(tmp_path / "0.csv", rows)
+    with pytest.raises(
+        DataError, match=r"0\.csv line 2: .* divide all of them by 1000 if they are millimetres"
+    ):
+        prepared(root=str(tmp_path), future=5)
 
 
 def test_a_missing_frame_is_masked_and_a_gap_in_the_future_leaves_the_window_out() -> None:

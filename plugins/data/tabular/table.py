@@ -30,6 +30,7 @@ from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
 from framework.errors import DataError, did_you_mean, quoted, shown
 from framework.storage import text
+from framework.storage.arrays import real
 from framework.target import Target
 
 Kind = Literal["class", "real", "degrees", "radians"]
@@ -189,7 +190,7 @@ def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
             )
         given = np.stack([np.atleast_1d(np.asarray(given[name])) for name in reading.columns], -1)
     try:
-        rows = np.asarray(given, np.float64)
+        rows = real(given, "it")
     except (TypeError, ValueError) as error:
         raise DataError(
             f"{str(error)[:200]}; wanted rows of numbers: {', '.join(reading.columns)}."
