@@ -24,8 +24,21 @@ class UserError(Exception):
 def printable(text: str, kept: str = "\n\t") -> str:
     """Return a text in which nothing steers a terminal: other letters than the `kept` are written out."""
     return "".join(
-        letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in text
+        letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in encodable(text)
     )
+
+
+def encodable(text: str) -> str:
+    r"""Return a text whose bytes that are not UTF-8, as in names of files, are written out as \xe9.
+
+    Python stands for each of them by a lone surrogate (PEP 383), which no text file, font or database takes.
+    """
+    return re.sub("[\ud800-\udfff]", _written_out, text)
+
+
+def _written_out(letter: re.Match[str]) -> str:
+    number = ord(letter[0])
+    return f"\\x{number - 0xDC00:02x}" if 0xDC80 <= number <= 0xDCFF else f"\\u{number:04x}"
 
 
 def _sentence(said: str, kind: type[UserError]) -> str:

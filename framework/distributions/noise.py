@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from framework.storage.names import as_bytes
+
 
 @dataclass(frozen=True)
 class Draw:
@@ -49,5 +51,5 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
 
 def hashed(*parts: int | str) -> int:
     """64 bits that depend on every part, the same on every machine."""
-    digest = hashlib.blake2b("|".join(map(str, parts)).encode(), digest_size=8).digest()
+    digest = hashlib.blake2b(as_bytes("|".join(map(str, parts))), digest_size=8).digest()
     return int.from_bytes(digest, "little")

@@ -6,6 +6,9 @@ from pathlib import Path
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from framework.errors import encodable
 
 # Okabe & Ito 2008, told apart by colour-blind people; without the yellow, too pale for lines on white.
 BLUE, RED, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
@@ -32,6 +35,8 @@ def saved(figure: Figure, path: Path, pictures: bool | str) -> Path:
     kind = pictures if isinstance(pictures, str) else "png"
     path = path.with_name(f"{path.name}.{kind}")
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    for text in figure.findobj(Text):
+        text.set_text(encodable(text.get_text()))  # fonts draw no byte that is not UTF-8
     with rc_context({"pdf.fonttype": 42, "svg.hashsalt": path.stem}):
         figure.savefig(path, dpi=110, metadata=dated.get(kind))
     return path

@@ -13,6 +13,7 @@ from framework.errors import DataError, did_you_mean, shown
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import COLOURS, Parsed
 from framework.geometry.ply import ply
+from framework.storage.names import as_bytes
 from framework.storage.reading import guarded, read_bytes
 
 READERS: dict[str, Callable[[bytes], Parsed]] = {
@@ -196,5 +197,5 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
 
 def stream(seed: int, name: str) -> np.random.Generator:
     """The random numbers of a file, whatever was read before it; `name` is the file's own, without folders."""
-    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+    digest = hashlib.blake2b(as_bytes(name), digest_size=8).digest()
     return np.random.default_rng([seed, int.from_bytes(digest, "little")])

@@ -24,6 +24,7 @@ from framework.runs.session import begin, record_citations
 from framework.runs.user_files import UNREADABLE, to_read
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import write_whole
+from framework.storage.names import spelled
 from framework.storage.plain_values import read_json
 from framework.storage.progress import Work
 from framework.training.batches import Batches
@@ -105,7 +106,7 @@ def run(config: Config) -> None:
             raise
         describe(collection, parts)  # again, where another job failed meanwhile
         if bad:
-            left_out = "".join(f"{file.relative_to(collection.root).as_posix()}\n" for file in bad)
+            left_out = "".join(f"{spelled(file.relative_to(collection.root))}\n" for file in bad)
             write_whole(collection.into / UNREADABLE, left_out.encode())
         left = len(collection.missing())
         console.print(
@@ -146,10 +147,6 @@ def collected(root: Path, into: Path, part: int) -> Collection:
     )
     if not names:
         raise DataError(f"mode.files={root} is no folder that holds files. Give the folder to encode.")
-    if broken := [name for name in names if "\n" in name]:
-        raise DataError(
-            f"{root}: the name {broken[0]!r} has two lines, and would be two in {NAMES}. Rename it."
-        )
     return Collection(root, names, part, into)
 
 
@@ -159,7 +156,7 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: there are parts of something else.
     """
-    text = "".join(f"{name}\n" for name in collection.names).encode()
+    text = "".join(f"{spelled(name)}\n" for name in collection.names).encode()
     said = {
         "version": 1,
         **config,

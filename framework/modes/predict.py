@@ -24,6 +24,7 @@ from framework.prediction import answers, named
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, to_read
+from framework.storage.names import spelled
 from framework.target import Target
 from framework.training.batches import told
 
@@ -47,7 +48,7 @@ def run(config: Config) -> None:
         files, bad = to_read(session.data, files, session.parts["data"], session.console)
     with opened(session.config) as run:
         if bad:
-            (run.folder / UNREADABLE).write_text("".join(f"{file}\n" for file in bad), encoding="utf-8")
+            (run.folder / UNREADABLE).write_text("".join(f"{spelled(file)}\n" for file in bad), encoding="utf-8")
         images = run.folder / "images"
         rows, mapped = predictions(
             session.predictor, session.data, session.target, files, session.settings, images, options.interval
@@ -133,9 +134,9 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
     if not files:
         return [f"test {number}" for number in range(samples)]
     if samples == len(files):
-        return [str(file) for file in files]
+        return [spelled(file) for file in files]
     counts = [len(data.read([file])) for file in files]  # type: ignore[arg-type]
-    return [f"{file} row {row}" for file, count in zip(files, counts, strict=True) for row in range(count)]
+    return [f"{spelled(file)} row {row}" for file, count in zip(files, counts, strict=True) for row in range(count)]
 
 
 def _text(value: Tensor) -> str:

@@ -16,7 +16,7 @@ import yaml
 from framework.configuration.config import Config
 from framework.configuration.paths import paths_of, words
 from framework.configuration.settings import Settings, store_experiment
-from framework.errors import DataError, UserError
+from framework.errors import DataError, UserError, encodable
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, package_versions
 from framework.runs.repository import git_commit
@@ -199,7 +199,7 @@ def _record(run: Run, error: BaseException) -> None:
     """Leave the traceback and the sentence with the run."""
     path = run.folder / "traceback.txt"
     with suppress(OSError):  # of a full disk there is no more to be said than the error itself
-        write_whole(path, "".join(traceback.format_exception(error)).encode())
+        write_whole(path, encodable("".join(traceback.format_exception(error))).encode())
         run.tracker.log_artifact(path)
     sentence = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     if isinstance(error, Stopped):

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from framework.data import Data
 from framework.errors import DataError
+from framework.storage.names import spelled
 from framework.storage.progress import tracked
 
 UNREADABLE = "unreadable.txt"
@@ -63,5 +64,5 @@ def to_read(
 
 def _tell(console: Console, what: str, files: Sequence[Path]) -> None:
     if files:
-        named = ", ".join(file.name for file in files[:10]) + (", …" if len(files) > 10 else "")
+        named = ", ".join(spelled(file.name) for file in files[:10]) + (", …" if len(files) > 10 else "")
         console.print(f"{len(files)} files {what}: {named}", soft_wrap=True, highlight=False)

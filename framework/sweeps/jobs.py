@@ -20,6 +20,7 @@ from framework.errors import ConfigError, UserError
 from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
 from framework.storage.enclosed import read_plain, read_stream
 from framework.storage.files import write_whole
+from framework.storage.names import as_bytes
 from framework.storage.reading import guarded
 from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
@@ -94,7 +95,7 @@ class Job:
 
 def hashed(*parts: str) -> str:
     """A short name for texts that tells them apart."""
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+    return hashlib.sha256(as_bytes("\0".join(parts))).hexdigest()[:16]
 
 
 def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:

@@ -13,10 +13,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import final
 
-from framework.errors import CheckpointError, DataError, shown
+from framework.errors import CheckpointError, DataError, encodable, shown
 from framework.storage.cache import folder as cache_folder
 from framework.storage.enclosed import require_enclosed, require_plain_within
 from framework.storage.files import alone, remove_leftovers, replacing
+from framework.storage.names import path_of, spelled
 from framework.tracking.run_info import MODEL, RunInfo, read_run_info
 from framework.tracking.sender import Record, Store, reason
 from framework.tracking.stores import address, require_own_files, sqlite_path, sqlite_uri, without_password
@@ -71,7 +72,7 @@ class MlflowStore(Store):
             raise RuntimeError(f"run {run.info.run_id} was deleted there; restore it in MLflow")
         elif info.status == "RUNNING":
             self._client.update_run(run.info.run_id, status="RUNNING")
-            self._client.set_tag(run.info.run_id, _FOLDER, str(folder))  # it may have been moved
+            self._client.set_tag(run.info.run_id, _FOLDER, spelled(folder))  # it may have been moved
         self.identity = {
             "run_id": run.info.run_id,
             "experiment_id": run.info.experiment_id,
@@ -179,11 +180,13 @@ class MlflowStore(Store):
         return found[0] if found else None
 
     def _created(self, info: RunInfo, experiment_id: str) -> Run:
-        tags = {_KEY: info.key, _FOLDER: str(self._folder), "mlflow.user": _user()}
+        tags = {_KEY: info.key, _FOLDER: spelled(self._folder), "mlflow.user": _user()}
         tags |= {"mlflow.source.name": "python -m framework", "mlflow.source.type": "LOCAL"}
         if info.parent:
             tags["mlflow.parentRunId"] = info.parent
-        return self._client.create_run(experiment_id, int(info.started * 1000), tags, info.run_name)
+        return self._client.create_run(
+            experiment_id, int(info.started * 1000), tags, encodable(info.run_name)
+        )
 
     def _metrics(self, record: Record) -> Iterator[Metric]:
         after, until = self.replay["replay_after"], self.replay["replay_until"]
@@ -197,9 +200,11 @@ class MlflowStore(Store):
         params: dict[str, str] = {}
         tags: dict[str, str | None] = {}
         for record in batch:
-            tags |= {self._name(key): value for key, value in record.get("tags", {}).items()}
+            tags |= {
+                self._name(key): value and encodable(value) for key, value in record.get("tags", {}).items()
+            }
             for name, value in record.get("params", {}).items():
-                key = self._name(name)
+                key, value = self._name(name), encodable(value)
                 before = self._params.get(key, params.get(key))
                 if before is None:
                     params[key] = value
@@ -247,10 +252,10 @@ class MlflowStore(Store):
 
 def _dataset(record: Record) -> DatasetInput:
     """What the column `Dataset` of MLflow shows: name and digest, and on a click all that is known of the data."""
-    facts: dict[str, str] = record["facts"]
+    facts: dict[str, str] = {key: encodable(fact) for key, fact in record["facts"].items()}
     digest = facts.get("sha256") or hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     dataset = Dataset(
-        record["dataset"],
+        encodable(record["dataset"]),
         digest[:_DIGEST],
         source_type="local",
         source=json.dumps({"root": facts.get("root", "")}),
@@ -283,7 +288,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
     client = MlflowClient(tracking_uri=store.uri)
     try:
         run = client.get_run(run_id)
-        made = Path(run.data.tags.get(_FOLDER, ""))
+        made = path_of(run.data.tags.get(_FOLDER, ""))
         # a store that nobody named may have come with somebody's folder, and says nothing of other folders
         trusted = store.named or (path is not None and made.resolve().is_relative_to(path.parent.resolve()))
         if _FOLDER in run.data.tags and trusted and _holds(made, run_id):

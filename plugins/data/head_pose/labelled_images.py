@@ -19,6 +19,7 @@ from framework.datasets.fields import Fields
 from framework.datasets.images import Crop, Crops
 from framework.errors import DataError
 from framework.storage.generated import read_mark
+from framework.storage.names import as_bytes
 from plugins.data.head_pose.archive import Source
 
 SPLITS = Splits._fields
@@ -200,5 +201,5 @@ def _digest(samples: Mapping[str, Sequence[Labelled]]) -> str:
     digest = hashlib.sha256()
     for split in SPLITS:
         for sample in samples[split]:
-            digest.update(f"{split} {sample.file.name} {sample.angles}\n".encode())
+            digest.update(as_bytes(f"{split} {sample.file.name} {sample.angles}\n"))
     return digest.hexdigest()

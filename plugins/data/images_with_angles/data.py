@@ -16,6 +16,7 @@ from framework.datasets import given_images, images
 from framework.datasets.csv_columns import Writing
 from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
+from framework.storage.names import spelled
 from framework.target import Target
 from plugins.data.images_with_angles.table import SPLITS, read_table
 
@@ -75,7 +76,7 @@ class ImagesWithAngles(Data):
                 )
         self.target = Target("angle", table.columns)
         self.input_shape = (self.channels, self.image_size, self.image_size)
-        self.groups = (root.resolve().name,)
+        self.groups = (spelled(root.resolve().name),)
         self.synthetic = False
         self._signs = [-1.0 if name in self.mirror else 1.0 for name in table.columns] if self.mirror else []
         self._digest = hashlib.sha256(repr((table.columns, table.rows)).encode()).hexdigest()

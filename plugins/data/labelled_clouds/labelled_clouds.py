@@ -17,6 +17,7 @@ from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture, images
 from framework.errors import DataError
 from framework.geometry.meshes import READERS
+from framework.storage.names import as_bytes, spelled
 from framework.target import Target
 from plugins.data.labelled_clouds.folders import Listed
 from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, load, unlabelled
@@ -74,7 +75,7 @@ class LabelledClouds(Data):
 
     def prepare(self) -> None:
         found = self.found()
-        self.target = Target("class", found.classes)
+        self.target = Target("class", tuple(map(spelled, found.classes)))
         self.input_shape = (found.packed.largest(), len(self.columns))
         self.synthetic, self.skipped = found.synthetic, found.skipped
         clouds = apart(found)
@@ -169,4 +170,4 @@ def require_samples(sizes: Mapping[str, int], where: str) -> None:
 def digest(names: Sequence[str], labels: Sequence[int], splits: Sequence[str]) -> str:
     """A hash over names, labels and splits."""
     lines = (f"{split} {label} {name}\n" for name, label, split in zip(names, labels, splits, strict=True))
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+    return hashlib.sha256(as_bytes("".join(lines))).hexdigest()

@@ -27,6 +27,7 @@ from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.storage import cache
 from framework.storage.arrays import archive
 from framework.storage.files import replacing
+from framework.storage.names import as_bytes
 from framework.storage.progress import tracked
 from framework.storage.reading import guarded, read_bytes
 
@@ -190,7 +191,8 @@ def _key(files: Sequence[Path], root: Path, how: Reading) -> str:
     digest = hashlib.sha256(f"{VERSION} {how}\n".encode())
     for file in files:
         state = file.stat()
-        digest.update(f"{file.relative_to(root).as_posix()} {state.st_size} {state.st_mtime_ns}\n".encode())
+        name = as_bytes(file.relative_to(root).as_posix())
+        digest.update(name + f" {state.st_size} {state.st_mtime_ns}\n".encode())
     return digest.hexdigest()[:32]
 
 

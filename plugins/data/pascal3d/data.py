@@ -21,6 +21,7 @@ from framework.errors import DataError, did_you_mean
 from framework.renderer import Renderer
 from framework.storage import cache
 from framework.storage.generated import read_mark
+from framework.storage.names import as_bytes
 from framework.target import Target
 from plugins.data.pascal3d import layout
 from plugins.data.pascal3d.generator import VERSION, generated
@@ -280,5 +281,5 @@ def _digest(samples: Mapping[str, Sequence[Sample]]) -> str:
     for split, chosen in samples.items():
         for annotation, _ in chosen:
             line = f"{split} {annotation.image.name} {annotation.box} {annotation.angles}\n"
-            digest.update(line.encode())
+            digest.update(as_bytes(line))
     return digest.hexdigest()
