@@ -259,7 +259,7 @@ ROWS = {
     "faust": (
         DataRow(
             "four people",
-            {"points": 200},
+            {"points": 200, **DOLL},
             write=people,
             synthetic=False,
             files=meshes,
