@@ -6,12 +6,13 @@ from contextlib import nullcontext
 from functools import cached_property
 from typing import Literal
 
-from torch import Size, Tensor, stack
+from torch import Size, Tensor
 from torch.distributions import Distribution
 
 from framework.data import Batch, Frame
 from framework.distributions.circular import wrap
 from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.intervals import DRAWS, Interval, middle
 from framework.distributions.moved import Moved
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import Estimate, estimate, images, marginal, median
@@ -91,13 +92,10 @@ class Prediction:
         with self._draw("point"):
             return median(self.density, self.samples)
 
-    def interval(self, mass: float, draws: int = 999) -> Tensor:
-        """The middle `mass` of the draws of each real, (2, batch, number): lower and upper ends."""
+    def interval(self, mass: float, draws: int = DRAWS) -> Interval:
+        """The middle `mass` of each real or angle, (batch, number) each (`framework.distributions.intervals`)."""
         with self._draw("interval"):
-            drawn = self.density.sample(Size((draws,))).sort(0).values
-        # of n sorted draws the i-th is the quantile i / (n + 1)
-        below = min(draws // 2, max(0, round((1 - mass) / 2 * (draws + 1)) - 1))
-        return stack([drawn[below], drawn[-1 - below]])
+            return middle(self.density, mass, draws)
 
     def deviation(self, draws: int = 999) -> Tensor:
         """The standard deviation of each real, (batch, number). Where the density does not know its own it is that

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import integrate, stats
-from torch.distributions import Independent, MultivariateNormal, Normal, StudentT
+from torch.distributions import HalfNormal, Independent, MultivariateNormal, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
@@ -50,15 +50,15 @@ def test_tails_ends_and_points():
 
 
 def test_what_is_not_known_is_none():
-    student = Independent(StudentT(torch.full((2, 1), 3.0)), 1)
+    half = Independent(HalfNormal(torch.full((2, 1), 3.0)), 1)
     value = torch.zeros(2, 1)
-    assert cdf(student, value) is None
+    assert cdf(half, value) is None
     assert (
-        cdf(Mixture(torch.zeros(2, 2), Independent(StudentT(torch.full((2, 2, 1), 3.0)), 1)), value) is None
+        cdf(Mixture(torch.zeros(2, 2), Independent(HalfNormal(torch.full((2, 2, 1), 3.0)), 1)), value) is None
     )
-    assert cdf(Stacked([student, normal(value, value + 1)]), value[..., None]) is None
+    assert cdf(Stacked([half, normal(value, value + 1)]), value[..., None]) is None
     assert arc(Cardioid(value), value, value + 1) is None
-    assert mahalanobis(student, value) is None
+    assert mahalanobis(half, value) is None
     assert normals(marginal(normal(torch.zeros(2, 3), torch.ones(2, 3)), 1)) is not None
     assert normals(normal(torch.zeros(2, 3), torch.ones(2, 3))) is None  # of several numbers
 

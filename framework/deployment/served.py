@@ -27,6 +27,7 @@ from framework.deployment.request_bodies import MOST_CONTENT, MOST_FILES, MOST_I
 from framework.deployment.request_bounds import TICKET, bound_server
 from framework.distributions.noise import Draw
 from framework.errors import DataError, UserError, quoted, shown
+from framework.evaluation.promises import promised
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
 from framework.prediction import answers, named
@@ -67,7 +68,7 @@ class Served:
 
     @torch.no_grad()
     def answer(self, given: Any) -> pd.DataFrame:
-        """A row a sample; an image is a PNG in base64.
+        """A row a sample, with the set that the model promises (`promised`); an image is a PNG in base64.
 
         Args:
             given: what `framework.load`'s model takes, but files only as `pathlib.Path`; or the content of files: a
@@ -100,7 +101,8 @@ class Served:
                 labels = {"class": [target.names[label] for label in mode.tolist()]}
             else:
                 labels, found = {}, {**found, **named(target, mode, "_mode")}
-            parts.append(pd.DataFrame({**labels, **{key: column.numpy() for key, column in found.items()}}))
+            numbers = {key: column.numpy() for key, column in found.items()}
+            parts.append(pd.DataFrame({**labels, **numbers, **promised(target, prediction)}))
         return pd.concat(parts, ignore_index=True)
 
     def warm_up(self) -> None:

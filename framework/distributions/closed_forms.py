@@ -53,8 +53,8 @@ def _(density: Independent, value: Tensor) -> Estimate:
     return Estimate(log_mean, debiased, error, factors.samples.sum(-1), factors.unresolved.any(-1))
 
 
-_ON_THE_LINE = (Normal, torchs.Laplace, torchs.Cauchy, torchs.Gumbel)
-"""Densities of all reals whose distribution function torch knows; that of others is wrong outside of the support."""
+_ON_THE_LINE = (Normal, torchs.Laplace, torchs.Cauchy, torchs.Gumbel, torchs.StudentT)
+"""Densities of all reals whose distribution function is known; that of others is wrong outside of the support."""
 
 
 @marginal.register
@@ -90,12 +90,22 @@ def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distr
     return kind(**changed, validate_args=False)
 
 
+def _below(base: Distribution, value: Tensor) -> Tensor:
+    """The distribution function of one of those densities, float64; Student's, which torch has not, is SciPy's."""
+    if not isinstance(base, torchs.StudentT):
+        return base.cdf(value)
+    from scipy.special import stdtr  # importing SciPy takes longer than most commands need it
+
+    freedom, standard = torch.broadcast_tensors(base.df, (value - base.loc) / base.scale)
+    return torch.from_numpy(stdtr(freedom.cpu().numpy(), standard.cpu().numpy())).to(value.device)
+
+
 @each_cdf.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     if isinstance(density.base_dist, _ON_THE_LINE):
         base = _of_each(density.base_dist, Tensor.double)
         if base is not None:
-            return base.cdf(value.double())
+            return _below(base, value.double())
     return None if len(density.event_shape) == 3 else each_cdf.dispatch(Distribution)(density, value)
 
 

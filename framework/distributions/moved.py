@@ -11,6 +11,7 @@ from framework.distributions.protocol import (
     Estimate,
     Normals,
     Slope,
+    ValueSet,
     about,
     cdf,
     estimate,
@@ -25,6 +26,7 @@ from framework.distributions.protocol import (
     slope,
     take,
     tempered,
+    value_set,
 )
 
 
@@ -171,3 +173,42 @@ def _(density: Moved) -> Tensor:
 @scales.register
 def _(density: Moved) -> Tensor:
     return scales(density.density) * density.scale[..., 0]
+
+
+class MovedSet(ValueSet):
+    """The set of Y in the frame of X = location + scale · Y.
+
+    Args:
+        inner: the set of Y.
+        density: of X.
+    """
+
+    def __init__(self, inner: ValueSet, density: Moved) -> None:
+        self.inner = inner
+        self.density = density
+        self.promised = inner.promised
+
+    def contains(self, value: Tensor) -> Tensor:
+        return self.inner.contains(self.density.inner(value))
+
+    def size(self) -> Tensor:
+        return self.inner.size() * self.density.scale.double().prod(-1)
+
+    def empty(self) -> Tensor:
+        return self.inner.empty()
+
+    def parts(self) -> list[list[int]] | list[list[tuple[float, float]]] | None:
+        found = self.inner.parts()
+        if found is None:
+            return None
+        location, scale = (
+            one.double().flatten().tolist() for one in (self.density.location, self.density.scale)
+        )
+        frames = zip(found, location, scale, strict=True)
+        return [[(at + by * part[0], at + by * part[1]) for part in parts] for parts, at, by in frames]  # type: ignore[index]
+
+
+@value_set.register
+def _(density: Moved) -> MovedSet | None:
+    found = value_set(density.density)
+    return None if found is None else MovedSet(found, density)

@@ -346,7 +346,13 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
 
 
 class ValueSet(ABC):
-    """The values, one set for each item of the batch, among which the target is said to lie."""
+    """The values, one set for each item of the batch, among which the target is said to lie.
+
+    Attributes:
+        promised: the share of targets that the sets are said to hold at least; None where nothing is said.
+    """
+
+    promised: float | None = None
 
     @abstractmethod
     def contains(self, value: Tensor) -> Tensor:
@@ -360,12 +366,20 @@ class ValueSet(ABC):
     def empty(self) -> Tensor:
         """Whether nothing is in the set, bool (*batch)."""
 
+    def parts(self) -> "list[list[int]] | list[list[tuple[float, float]]] | None":
+        """What the set of each item of the flattened batch is made of, ascending: labels of classes; (low, high) of
+        one real; of one angle radians, from low in [-π, π) counter-clockwise to high, at most a turn on.
+
+        Default: None, the set cannot be listed. What is listed is what predictions print.
+        """
+        return None
+
 
 @singledispatch
 def value_set(density: Distribution) -> ValueSet | None:
     """The set that comes with the density.
 
     Default: None, it has none. Structures answer None too: what was promised of a density is not so of a mixture, a
-    power or a marginal of it.
+    power or a marginal of it. In another frame (`moved.Moved`) it is the same set.
     """
     return None

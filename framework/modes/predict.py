@@ -2,9 +2,10 @@
 PNG files beside it, and maps where the data set draws them."""
 
 import csv
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
@@ -16,11 +17,14 @@ from framework.configuration.settings import Settings
 from framework.data import Data, Mapped
 from framework.datasets.fields import as_batch
 from framework.datasets.png import png
+from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
+from framework.distributions.protocol import value_set
 from framework.errors import DataError
+from framework.evaluation.promises import ends, promised, require_interval, require_promised
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
-from framework.prediction import answers, named
+from framework.prediction import Prediction, answers
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, to_read
@@ -28,9 +32,12 @@ from framework.storage.names import spelled
 from framework.target import Target
 from framework.training.batches import told
 
+ERRORS = ("_low_error", "_high_error", "_low_error_deg", "_high_error_deg")
+ENDS = ("_low", "_high", "_low_deg", "_high_deg")
+
 
 class PredictOptions(Options):
-    """What to predict for: a file or a folder of files, or the test split; and the mass of intervals of reals."""
+    """What to predict for: a file or a folder of files, or the test split; and the mass of intervals."""
 
     files: str | None = None
     interval: Annotated[float, Field(gt=0, lt=1)] | None = None
@@ -42,13 +49,15 @@ def run(config: Config) -> None:
     files = _files(Path(options.files).expanduser()) if options.files else []
     session = for_trained(config, prepare=not files)
     if options.interval:
-        session.target.require("real", by="mode.interval")
+        require_interval(session.target, options.interval, by="mode.interval")
     bad: list[Path] = []
     if len(files) > 1:
         files, bad = to_read(session.data, files, session.parts["data"], session.console)
     with opened(session.config) as run:
         if bad:
-            (run.folder / UNREADABLE).write_text("".join(f"{spelled(file)}\n" for file in bad), encoding="utf-8")
+            (run.folder / UNREADABLE).write_text(
+                "".join(f"{spelled(file)}\n" for file in bad), encoding="utf-8"
+            )
         images = run.folder / "images"
         rows, mapped = predictions(
             session.predictor, session.data, session.target, files, session.settings, images, options.interval
@@ -60,6 +69,12 @@ def run(config: Config) -> None:
             writer.writerows(rows)
         run.tracker.log_artifact(path)
         session.console.print(f"{len(rows)} predictions in {path}", soft_wrap=True)
+        if options.interval and any(key.endswith(ERRORS) for key in rows[0]):
+            session.console.print(
+                f"ends of intervals are order statistics of {DRAWS:,} draws where their standard error, in columns of "
+                "their own, is not 0: the densities do not know their distribution function.",
+                soft_wrap=True,
+            )
         if isinstance(session.data, Mapped) and mapped:
             for written in _maps(session.data, files, mapped, run.folder / "maps"):
                 run.tracker.log_artifact(written, "maps")
@@ -87,8 +102,9 @@ def predictions(
     images: Path,
     mass: float | None = None,
 ) -> tuple[list[dict[str, str]], list[tuple[Tensor, Tensor]]]:
-    """One row a sample: its name, the point prediction, intervals of that mass, and the density's entropy in nats. And
-    of each batch, where maps are drawn, what is predicted with its standard deviation, (batch, number).
+    """One row a sample: its name, the point prediction, the density's entropy in nats, and the set that the model
+    promises or the interval of that mass, with standard errors where its ends are drawn. And of each batch, where maps
+    are drawn, what is predicted with its standard deviation, (batch, number).
 
     Predicted images are written into the folder `images`; the row names the file.
     """
@@ -103,11 +119,9 @@ def predictions(
         columns = answers(target, prediction)
         if isinstance(data, Mapped) and files:
             mapped.append((prediction.point.cpu(), prediction.deviation().cpu()))
-        if mass:
-            for end, values in zip(("_low", "_high"), prediction.interval(mass), strict=True):
-                columns |= named(target, values, end)
+        columns = {**columns, **_intervals(target, prediction, mass)}
         for row in range(len(batch["index"])):
-            values = {key: _text(column[row]) for key, column in columns.items()}
+            values = {key: text(column[row], key) for key, column in columns.items()}
             if target.kind == "class":
                 values = {"class": target.names[int(prediction.point[row])], **values}
             elif target.kind == "image":
@@ -116,7 +130,22 @@ def predictions(
                 file.write_bytes(png(prediction.image("color")[row]))
                 values = {"image": f"{images.name}/{file.name}", **values}
             rows.append({"sample": names[len(rows)], **values})
+    errors = [key for key in rows[0] if key.endswith(ERRORS)] if mass else []
+    if all(row[key] == "0" for row in rows for key in errors):
+        rows = [{key: value for key, value in row.items() if key not in errors} for row in rows]
     return rows, mapped
+
+
+def _intervals(
+    target: Target, prediction: Prediction, mass: float | None
+) -> Mapping[str, Sequence[Any] | Tensor]:
+    """Columns of the set that comes with the density; of one without a set those of intervals of a mass."""
+    sets = value_set(prediction.density)
+    if sets is None:
+        return ends(target, prediction.interval(mass)) if mass else {}
+    if mass:
+        require_promised(sets, mass, by="mode.interval")
+    return promised(target, prediction)
 
 
 def _maps(
@@ -136,8 +165,18 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
     if samples == len(files):
         return [spelled(file) for file in files]
     counts = [len(data.read([file])) for file in files]  # type: ignore[arg-type]
-    return [f"{spelled(file)} row {row}" for file, count in zip(files, counts, strict=True) for row in range(count)]
+    return [
+        f"{spelled(file)} row {row}"
+        for file, count in zip(files, counts, strict=True)
+        for row in range(count)
+    ]
 
 
-def _text(value: Tensor) -> str:
-    return f"{float(value):.10g}"  # of a large number in the user's unit the small digits count
+def text(value: str | float | Tensor, key: str) -> str:
+    """A cell of the table; of a large number in the user's unit the small digits count, of an interval's ends all."""
+    if isinstance(value, str):
+        return value
+    number = float(value)
+    if math.isnan(number):
+        return "nan"
+    return f"{number:.{15 if key.endswith(ENDS) else 10}g}"

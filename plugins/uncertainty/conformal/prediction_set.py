@@ -43,12 +43,20 @@ class PredictionSet(Mixture, ValueSet):
         density: any.
         threshold: the largest score in the set, a scalar; infinite for everything.
         score: which.
+        promised: as of `ValueSet`.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
-    def __init__(self, density: Distribution, threshold: Float[Tensor, ""], score: Score) -> None:
+    def __init__(
+        self,
+        density: Distribution,
+        threshold: Float[Tensor, ""],
+        score: Score,
+        promised: float | None = None,
+    ) -> None:
         self.density = density
+        self.promised = promised
         self.threshold = threshold
         self.score: Score = score
         # the number type of log_prob: of classes that of one label's, otherwise that of a sample of nothing
@@ -138,6 +146,12 @@ class PredictionSet(Mixture, ValueSet):
                 "contains(value), or a set of the marginal() of each."
             )
         return self._ends.intervals
+
+    def parts(self) -> list[list[int]] | list[list[tuple[float, float]]] | None:
+        if self._classes:
+            labels = self.labels().reshape(-1, len(self._log_labels))
+            return [row.nonzero().flatten().tolist() for row in labels]
+        return self.intervals() if self._one else None
 
     @property
     def _classes(self) -> bool:

@@ -88,7 +88,7 @@ class Conformal(Uncertainty):
         require_state(self, threshold=(-math.inf, math.inf))
 
     def forward(self, inputs: Tensor) -> PredictionSet:
-        return PredictionSet(self.model(inputs), self.threshold, self.score)
+        return PredictionSet(self.model(inputs), self.threshold, self.score, 1 - self.miscoverage)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         return self.model.loss(inputs, target)

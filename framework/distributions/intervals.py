@@ -1,0 +1,334 @@
+"""The middle of a density of reals or angles: quantiles where its distribution function is known, draws otherwise."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.batch_shapes import Reshaped
+from framework.distributions.circular import Circular, circular_median, wrap
+from framework.distributions.circular_moments import circular_moments
+from framework.distributions.closed_forms import normal_quantile
+from framework.distributions.moved import Moved
+from framework.distributions.protocol import Normals, arc, cdf, marginal, normals, peaks, scales
+from framework.errors import UserError
+
+DRAWS = 9999
+"""Draws of each density whose distribution function is not known; the mass between two of them is right to 0.003."""
+ROUNDS = 200
+"""Most narrowings of a bracket: it ends earlier, at the last digits of its distance from the density's middle."""
+EXACT = 1e-12
+"""Width of a bracket at its end, relative to that distance."""
+AROUND = 24
+"""Angles on which the middle of a density of one angle is first looked for, besides those about its peaks."""
+RUNGS, NARROWER = 16, 8.0
+"""Arcs among which the one that holds a mass is first looked for, each so much narrower than the one before."""
+_FURTHEST = 1100
+"""Doublings of a bracket: from the smallest to the largest number."""
+_FEW = 5.0
+"""Draws that must lie beyond an end for the error of that end to be known."""
+
+
+class Interval(NamedTuple):
+    """The middle part of each number's density, (*batch, number) each, float64.
+
+    Attributes:
+        low, high: the ends, outside of each of which half of the rest of the mass lies. Of angles in radians, `low` in
+            [-π, π) and the arc runs counter-clockwise to `high`, at most one turn on; either half of it, from the
+            circular median, has half of the mass.
+        low_error, high_error: standard errors of the ends in their unit; 0 where they were computed without draws,
+            infinite where draws do not reach so far.
+    """
+
+    low: Tensor
+    high: Tensor
+    low_error: Tensor
+    high_error: Tensor
+
+    @property
+    def drawn(self) -> bool:
+        """Whether an end is left to chance."""
+        return bool(((self.low_error != 0) | (self.high_error != 0)).any())
+
+
+@torch.no_grad()
+def middle(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
+    """The middle `mass` of each number of a density of reals or angles.
+
+    Ends are computed from `normals`, `cdf` or `arc`, or from the Fourier series of an angle's density
+    (`circular_moments`), where these are known; otherwise they are order statistics of `draws` draws.
+
+    Args:
+        density: event_shape (number,).
+        mass: in (0, 1).
+    """
+    if isinstance(density, Moved):  # in float64, so that a location far from 0 costs no digit
+        inner = middle(density.density, mass, draws)
+        location, scale = density.location.double(), density.scale.double()
+        ends = (location + scale * end for end in inner[:2])
+        return Interval(*ends, *(scale * error for error in inner[2:]))
+    angles = isinstance(density.support, Circular)
+    if density.event_shape.numel() == 1:
+        known = _angle(density, mass) if angles else _real(density, mass)
+        if known is None:
+            return _of_draws(density, mass, draws)
+        missing = known.low.isnan()
+        # of a density that is NaN nothing is known, and draws say no more
+        lost = missing & ~density.log_prob(density.sample()).isnan().unsqueeze(-1)
+        return _where(lost, _of_draws(density, mass, draws), known) if bool(lost.any()) else known
+    try:
+        parts = [marginal(density, index) for index in range(density.event_shape[0])]
+    except UserError:
+        return _of_draws(density, mass, draws)
+    found = [middle(part, mass, draws) for part in parts]
+    return Interval(*(torch.cat(ends, -1) for ends in zip(*found, strict=True)))
+
+
+def _where(chosen: Tensor, one: Interval, other: Interval) -> Interval:
+    return Interval(*(torch.where(chosen, *pair) for pair in zip(one, other, strict=True)))
+
+
+def _exact(low: Tensor, high: Tensor) -> Interval:
+    """Of ends (*batch,) that were computed."""
+    none = torch.zeros_like(low).unsqueeze(-1)
+    return Interval(low.unsqueeze(-1), high.unsqueeze(-1), none, none)
+
+
+def _tails(mass: float) -> Tensor:
+    """Masses below the two ends, (2,)."""
+    return torch.tensor([(1 - mass) / 2, (1 + mass) / 2], dtype=torch.float64)
+
+
+def _real(density: Distribution, mass: float) -> Interval | None:
+    """Of one real whose distribution function is known."""
+    below = _tails(mass)
+    known = normals(density)
+    if known is not None:
+        return _exact(*_of_normals(known, below.to(known.mean)))
+    like = density.sample(torch.Size((33,))).double()
+    below = below.to(like.device)
+    if cdf(density, like[0].to(density.sample().dtype)) is None:
+        return None
+    return _exact(*_outward(partial(_cdf_of, density), below, like.squeeze(-1)))
+
+
+def _cdf_of(density: Distribution, value: Float[Tensor, "place *batch"]) -> Tensor:
+    found = cdf(density, value.unsqueeze(-1))
+    assert found is not None
+    return found
+
+
+def _of_normals(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, "place *batch"]:
+    """Quantiles of mixtures of normals, which lie between those of the components."""
+    z = normal_quantile(below).reshape(-1, *(1,) * known.mean.dim())
+    each = known.mean + z * known.scale  # (place, *batch, component)
+    if known.mean.shape[-1] == 1:
+        return each.squeeze(-1)
+    weights = known.log_weights.exp()
+    counts = weights > 0
+    low = torch.where(counts, each, math.inf).amin(-1)
+    high = torch.where(counts, each, -math.inf).amax(-1)
+
+    def mass_below(value: Tensor) -> Tensor:
+        residual = value.unsqueeze(-1) - known.mean
+        standard = torch.where(residual == 0, residual, residual / known.scale)
+        return torch.where(counts, weights * torch.special.ndtr(standard), 0.0).sum(-1)
+
+    wanted = below.reshape(-1, *(1,) * (known.mean.dim() - 1))
+    center = torch.where(counts, known.mean, 0.0).sum(-1) / counts.sum(-1).clamp(min=1)
+    return reached(mass_below, wanted, low, high, center)
+
+
+def _outward(
+    mass_below: Callable[[Tensor], Tensor], below: Float[Tensor, "place"], drawn: Float[Tensor, "draw *batch"]
+) -> Float[Tensor, "place *batch"]:
+    """Quantiles of any density of one real, in a bracket that grows from a few draws until it holds them."""
+    center = drawn.median(0).values
+    drawn = drawn.sort(0).values
+    wide = drawn[-1 - len(drawn) // 4] - drawn[len(drawn) // 4]
+    # of draws that are all the same number the last digit is the width
+    step = torch.maximum(wide, 1e-7 * center.abs()).clamp(min=1e-300)
+    wanted = below.reshape(-1, *(1,) * center.dim())
+    low, high = (
+        (center - step).expand(len(below), *center.shape),
+        (center + step).expand(len(below), *center.shape),
+    )
+    for _ in range(_FURTHEST):
+        above, under = mass_below(low) > wanted, mass_below(high) < wanted
+        if not bool((above | under).any()):
+            break
+        step = 2 * step
+        low, high = torch.where(above, center - step, low), torch.where(under, center + step, high)
+    return reached(mass_below, wanted, low, high, center)
+
+
+def reached(
+    rising: Callable[[Tensor], Tensor], wanted: Tensor, low: Tensor, high: Tensor, center: Tensor
+) -> Tensor:
+    """Where a function that never falls reaches `wanted`; NaN where the function is.
+
+    Inverse quadratic interpolation where it is safe and bisection elsewhere (Chandrupatla 1997), item by item.
+
+    Args:
+        low, high: a bracket.
+        center: the bracket ends at EXACT of its distance from here, or where two neighbouring numbers are left.
+    """
+    wanted, low, high = torch.broadcast_tensors(wanted, low, high)
+    a, b = high, low
+    over_a, over_b = rising(a) - wanted, rising(b) - wanted
+    broken = over_a.isnan() | over_b.isnan()
+    part = torch.full_like(a, 0.5)
+    best, least_over = (
+        torch.where(over_a.abs() < over_b.abs(), a, b),
+        torch.minimum(over_a.abs(), over_b.abs()),
+    )
+    for _ in range(ROUNDS):
+        place = a + part * (b - a)
+        over = rising(place) - wanted
+        same = (over >= 0) == (over_a >= 0)
+        # c is the end that was given up: the third point of the parabola
+        c, over_c = torch.where(same, a, b), torch.where(same, over_a, over_b)
+        b, over_b = torch.where(same, b, a), torch.where(same, over_b, over_a)
+        a, over_a = place, over
+        best = torch.where(over.abs() <= least_over, place, best)
+        least_over = torch.minimum(least_over, over.abs())
+        least = torch.maximum(EXACT * (best - center).abs(), 4e-16 * best.abs()) + 1e-320
+        width = (b - a).abs()
+        if bool(((width <= least) | (least_over == 0) | broken).all()):
+            break
+        across, rise = (a - b) / (c - b), (over_a - over_b) / (over_c - over_b)
+        safe = (1 - (1 - across).sqrt() < rise) & (rise < across.sqrt())
+        found = over_a / (over_b - over_a) * over_c / (over_b - over_c) + (c - a) / (b - a) * over_a / (
+            over_c - over_a
+        ) * over_b / (over_c - over_b)
+        part = torch.where(safe & found.isfinite(), found, 0.5)
+        edge = (least / (2 * width)).nan_to_num(nan=0.5).clamp(max=0.5)
+        part = torch.maximum(edge, torch.minimum(part, 1 - edge))
+    return torch.where(broken, math.nan, best)
+
+
+def _angle(density: Distribution, mass: float) -> Interval | None:
+    """Of one angle; NaN where neither arcs nor the Fourier series are known."""
+    flat = Reshaped(density, (density.batch_shape.numel(),))
+    if not len(flat.batch_shape) or flat.batch_shape.numel() == 0:
+        return None
+    law = _arcs(flat)
+    support = density.support
+    assert isinstance(support, Circular)
+    low, high = support.ranges[0] if support.ranges is not None else (-math.pi, math.pi)
+    if high - low < 2 * math.pi - 1e-9:  # a part of the circle has a first and a last angle
+        below = _tails(mass).to(flat.sample().device).unsqueeze(-1)
+        places = below.new_full((2, flat.batch_shape[0]), low)
+
+        def mass_below(value: Tensor) -> Tensor:
+            return law(places.expand_as(value), value)
+
+        ends = reached(mass_below, below, places, torch.full_like(places, high), places)
+        return _exact(*(end.reshape(density.batch_shape) for end in ends))
+    center = _circular_center(law, flat)
+    ahead = _reach(lambda width: law(center.expand_as(width), center + width), mass / 2, center)
+    behind = _reach(lambda width: law(center - width, center.expand_as(width)), mass / 2, center)
+    first = wrap(center - behind)
+    return _exact(*(end.reshape(density.batch_shape) for end in (first, first + behind + ahead)))
+
+
+def _reach(
+    mass_within: Callable[[Tensor], Tensor], wanted: float, center: Float[Tensor, "item"]
+) -> Float[Tensor, "item"]:
+    """The width, radians up to π, within which the mass is `wanted`."""
+    power = torch.arange(RUNGS, dtype=torch.float64, device=center.device).unsqueeze(-1)
+    rungs = (math.pi * NARROWER**-power).expand(RUNGS, len(center))
+    enough = (mass_within(rungs) >= wanted).sum(0).clamp(min=1)  # falling
+    high = math.pi * NARROWER ** (1.0 - enough)
+    low = torch.where(enough < RUNGS, high / NARROWER, 0.0)
+    none = torch.zeros_like(center)
+    return reached(mass_within, torch.full_like(center, wanted), low, high, none)
+
+
+def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
+    """The mass from one angle counter-clockwise to another, (*sample, item) each; NaN of items of which it is not
+    known."""
+    probe = torch.zeros((*flat.batch_shape, 1), dtype=torch.float64, device=flat.sample().device)
+    if arc(flat, probe, probe + 1) is not None:
+
+        def known(start: Tensor, end: Tensor) -> Tensor:
+            found = arc(flat, start.unsqueeze(-1), end.unsqueeze(-1))
+            assert found is not None
+            return found
+
+        return known
+    series = circular_moments(flat)
+
+    def summed(start: Tensor, end: Tensor) -> Tensor:
+        return torch.where(series.resolved, series.arc(*torch.broadcast_tensors(start, end)), math.nan)
+
+    return summed
+
+
+def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution) -> Float[Tensor, "item"]:
+    """The angle of least expected deviation (thesis eq. 3.23), [-π, π).
+
+    The deviation falls where less than half of the mass lies on the half turn behind an angle and rises where more
+    does, so that its minima are where that mass reaches one half; of several the lowest on the nodes is taken.
+    """
+    nodes = _nodes(flat)
+    behind = law(nodes - math.pi, nodes) - 0.5  # half the slope of the deviation
+    last = torch.cat([nodes[1:], nodes[:1] + 2 * math.pi])
+    ends = torch.cat([behind[1:], behind[:1]])
+    # the deviation at each node, by the trapezium rule on its slope
+    deviation = ((behind + ends) * (last - nodes)).cumsum(0)
+    deviation = torch.cat([torch.zeros_like(deviation[:1]), deviation[:-1]])
+    lowest = torch.minimum(deviation, torch.cat([deviation[1:], deviation[:1]]))
+    crosses = (behind < 0) & (ends >= 0)
+    index = torch.where(crosses, lowest, math.inf).argmin(0, keepdim=True)
+    start, stop = nodes.gather(0, index).squeeze(0), last.gather(0, index).squeeze(0)
+    found = reached(
+        lambda angle: law(angle - math.pi, angle), torch.full_like(start, 0.5), start, stop, start
+    )
+    # of a density without a middle, the uniform one, any angle will do: its mode
+    mode = flat.mode.squeeze(-1).double()
+    return wrap(torch.where(crosses.any(0) | behind.isnan().any(0), found, mode))
+
+
+def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
+    """Ascending angles in [-π, π): all around, and about each peak as near as it is narrow."""
+    places = wrap(peaks(flat).squeeze(-1).double())
+    width = scales(flat).double().nan_to_num(nan=1.0, posinf=1.0)
+    near = torch.tensor([-3, -1, 0, 1, 3], dtype=torch.float64, device=places.device)
+    around = (places + near.reshape(-1, 1, 1) * width).flatten(0, 1)
+    even = torch.linspace(-math.pi, math.pi, AROUND + 1, dtype=torch.float64, device=places.device)[:-1]
+    found = torch.cat([wrap(around), even.unsqueeze(-1).expand(-1, places.shape[-1])])
+    return found.sort(0).values
+
+
+def _of_draws(density: Distribution, mass: float, draws: int) -> Interval:
+    """Order statistics: of n draws the i-th is the quantile i / (n + 1); of angles about their circular median."""
+    drawn = density.sample(torch.Size((draws,))).double()
+    angles = isinstance(density.support, Circular)
+    middle_angle = circular_median(drawn) if angles else torch.zeros_like(drawn[0])
+    support = density.support
+    if isinstance(support, Circular) and support.ranges is not None:
+        part = [high - low < 2 * math.pi - 1e-9 for low, high in support.ranges]
+        middle_angle = torch.where(torch.tensor(part, device=drawn.device), 0.0, middle_angle)
+    ordered = (wrap(drawn - middle_angle) if angles else drawn).sort(0).values
+    tail = (1 - mass) / 2
+    rank = min(draws // 2, max(0, round(tail * (draws + 1)) - 1))
+    low, high = ordered[rank], ordered[-1 - rank]
+    # the rank of a quantile among n draws is binomial: one standard deviation of it, to either side
+    spread = max(1, round(math.sqrt(draws * tail * (1 - tail))))
+    first, last = max(0, rank - spread), min(draws - 1, rank + spread)
+    errors = [
+        (ordered[last] - ordered[first]) / 2,
+        (ordered[-1 - first] - ordered[-1 - last]) / 2,
+    ]
+    if draws * tail < _FEW:
+        errors = [torch.full_like(error, math.inf) for error in errors]
+    if angles:
+        start = wrap(middle_angle + low)
+        return Interval(start, start + (high - low), *errors)
+    return Interval(low, high, *errors)

@@ -1,0 +1,116 @@
+"""What a model promises beside its density, as predictions print it: the set in which the target is said to lie."""
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.distributions.intervals import Interval
+from framework.distributions.protocol import ValueSet, value_set
+from framework.errors import ConfigError
+from framework.prediction import Prediction
+from framework.target import Target
+
+Ends = Sequence[tuple[float, float]]
+
+
+@torch.no_grad()
+def promised(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
+    """Columns of the set that comes with each density (`protocol.value_set`), in the user's names and units; none of a
+    density without one.
+
+    - of classes `set`, a JSON list of their names, and `set_size`, how many;
+    - of one real `x_set`, a JSON list of [low, high] pairs, with its first and last end, `x_low` and `x_high`, and
+      `set_size`, the length of all pairs together; ends may be infinite, and of an empty set they are NaN;
+    - of one angle the same in degrees, counter-clockwise from `x_low_deg` in [-180, 180) to `x_high_deg`, which may lie
+      beyond 180: the shortest arc that holds the set;
+    - of several numbers `set_size` alone, the volume: in radians of angles.
+    """
+    sets = value_set(prediction.density)
+    if sets is None:
+        return {}
+    degrees = target.kind == "angle" and len(target.names) == 1
+    unit = 180 / math.pi if degrees else 1.0
+    size = {"set_size_deg" if degrees else "set_size": (unit * sets.size()).tolist()}
+    parts = sets.parts()
+    if parts is None:
+        return size
+    if target.kind == "class":
+        named = [[target.names[int(label)] for label in row] for row in parts]  # type: ignore[call-overload]
+        return {"set": [json.dumps(row, ensure_ascii=False) for row in named], **size}
+    name, end = target.names[0], "_deg" if degrees else ""
+    listed: list[Ends] = [[(unit * low, unit * high) for low, high in row] for row in parts]  # type: ignore[misc]
+    hulls = [_arc_around(row) if degrees else _around(row) for row in listed]
+    return {
+        f"{name}_low{end}": [low for low, _ in hulls],
+        f"{name}_high{end}": [high for _, high in hulls],
+        f"{name}_set{end}": [json.dumps([list(ends) for ends in row]) for row in listed],
+        **size,
+    }
+
+
+def _around(ends: Ends) -> tuple[float, float]:
+    return (ends[0][0], ends[-1][1]) if ends else (math.nan, math.nan)
+
+
+def _arc_around(arcs: Ends) -> tuple[float, float]:
+    """The shortest arc that holds ascending arcs, degrees: all but the widest gap between two of them."""
+    if not arcs:
+        return math.nan, math.nan
+    starts = [low for low, _ in arcs]
+    gaps = [after - high for (_, high), after in zip(arcs, [*starts[1:], starts[0] + 360], strict=True)]
+    last = max(range(len(gaps)), key=gaps.__getitem__)
+    first = (last + 1) % len(arcs)
+    high = arcs[last][1]
+    return starts[first], high if first == 0 else high + 360
+
+
+def require_interval(target: Target, mass: float, by: str) -> None:
+    """Refuse to give intervals of what has none.
+
+    Raises:
+        ConfigError: the target is not of reals or angles.
+    """
+    if target.kind not in ("real", "angle"):
+        has = {"class": "the probability of each class is a column", "image": "metrics give those of images"}
+        raise ConfigError(
+            f"{by}={mass:g} gives the ends of intervals of reals and angles, but this model predicts "
+            f"{target.kind} targets ({target.told}): {has[target.kind]}. Leave {by} out."
+        )
+
+
+def require_promised(sets: ValueSet, mass: float, by: str) -> None:
+    """Refuse an interval beside a set that promises something else: its columns would be read as the promise.
+
+    Raises:
+        ConfigError: says which mass is promised.
+    """
+    if (
+        sets.promised is not None
+        and math.isclose(sets.promised, mass, abs_tol=1e-9)
+        and sets.parts() is not None
+    ):
+        return
+    if sets.promised is None or sets.parts() is None:
+        raise ConfigError(
+            f"{by}={mass:g} asks for the ends of an interval, but this model predicts a set in which the target lies, "
+            f"and it has no such ends. Leave {by} out: the set's columns are printed without it."
+        )
+    raise ConfigError(
+        f"{by}={mass:g}, but the sets of this model promise to hold {sets.promised:g} of the targets, and no other "
+        f"interval of it promises anything. Give {by}={sets.promised:g}, or leave it out: the set is printed anyway."
+    )
+
+
+def ends(target: Target, interval: Interval) -> dict[str, Tensor]:
+    """Columns of the ends of intervals, (batch,) each, and of their standard errors; angles in degrees, `low` in
+    [-180, 180), from there counter-clockwise to `high`."""
+    unit, end = (180 / math.pi, "_deg") if target.kind == "angle" else (1.0, "")
+    return {
+        f"{name}_{field}{end}": unit * values[:, index]
+        for field, values in interval._asdict().items()
+        for index, name in enumerate(target.names)
+    }
