@@ -3,6 +3,7 @@
 import io
 import os
 import struct
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,7 @@ def at(folder, suffix, content):
 
 # ---- files that are read --------------------------------------------------------------------------------
 
+STL = binary_stl(TETRAHEDRON[FACES])
 TETRAHEDRA = {
     "off": (".off", text_off()),
     "off of the release: counts behind the word": (".off", text_off(header="OFF4 4 0\n")),
@@ -124,6 +126,42 @@ def test_text_stl_of_several_solids(tmp_path):
     mesh = read(at(tmp_path, ".STL", content))
     assert mesh.faces.shape == (3, 3)
     np.testing.assert_array_equal(mesh.vertices[3:6], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+def spelled_stl(case, gap, name, eol):
+    """The tetrahedron as text, with keywords in a case, "end" apart from what is ended, and a name of the solid."""
+    lines = [f"solid{name}"]
+    for corners in TETRAHEDRON[FACES]:
+        lines += ["facet normal 0 0 0", "outer loop", *(f"vertex {a} {b} {c}" for a, b, c in corners)]
+        lines += [f"end{gap}loop", f"end{gap}facet"]
+    return eol.join([*map(case, lines), case(f"end{gap}solid{name}"), ""]).encode()
+
+
+@pytest.mark.parametrize("case", [str.lower, str.upper, str.title], ids=lambda case: case.__name__)
+@pytest.mark.parametrize("gap", ["", " ", "\t"])
+def test_text_stl_is_read_however_its_keywords_are_written(tmp_path, case, gap):
+    for name, eol in product(("", " me", " end facet", " vertex 1 2"), ("\n", "\r\n", "\n\n  ")):
+        content = spelled_stl(case, gap, name, eol)
+        mesh = read(at(tmp_path, ".stl", content))
+        np.testing.assert_array_equal(mesh.vertices[mesh.faces], TETRAHEDRON[FACES])
+        for damaged in (
+            content.rstrip().rsplit(b"\n", 1)[0],
+            content.replace(case("vertex 0").encode(), b"vortex 0", 1),
+        ):
+            with pytest.raises(DataError, match="are opened"):
+                read(at(tmp_path, ".stl", damaged))
+
+
+@pytest.mark.parametrize("blank", [b"\n", b"\r\n", b" \n", b"\x1a"])
+@pytest.mark.parametrize(
+    "suffix, content", [(".stl", STL), (".ply", binary_ply("<")), (".ply", binary_ply(">"))]
+)
+def test_a_line_may_end_behind_a_binary_file(tmp_path, suffix, content, blank):
+    mesh = read(at(tmp_path, suffix, content + blank))
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], TETRAHEDRON[FACES])
+    for more in (b"\0", b"x", 9 * blank):
+        with pytest.raises(DataError, match="bytes follow"):
+            read(at(tmp_path, suffix, content + more))
 
 
 CLOUDS = {
@@ -247,7 +285,6 @@ def test_names_of_columns_may_hold_any_letter(tmp_path, letter, eol):
 
 # ---- files that are refused ------------------------------------------------------------------------------
 
-STL = binary_stl(TETRAHEDRON[FACES])
 STRIPS = b"element tristrips 1\nproperty list int int vertex_indices\n"
 PLANE = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n" + END + b"0 0\n"
 OTHER = b"ply\nformat ascii 1.0\nelement point 0\n" + END
@@ -276,7 +313,7 @@ BROKEN = {
     "stl: too long": (".stl", STL + b"\0", "has 285 bytes"),
     "stl: empty": (".stl", b"", "announces 0 faces"),
     "stl: text cut short": (".stl", b"solid a\n" + FACET + FACET[:60], "2 facets are opened, 1 ended"),
-    "stl: no end": (".stl", b"solid a\n" + FACET, "wanted 3 a facet and an endsolid"),
+    "stl: no end": (".stl", b"solid a\n" + FACET, "1 solids are opened, 0 ended"),
     "stl: a word": (".stl", b"solid a\n" + FACET.replace(b"1 0 0", b"1 o 0") + b"endsolid", "got 'o'"),
     "ply: no header": (".ply", b"ply\nformat ascii 1.0\n", "a line end_header"),
     "ply: no format": (".ply", b"ply\nelement vertex 0\n" + END, "no line format"),

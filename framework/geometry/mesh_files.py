@@ -26,6 +26,10 @@ OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "n
 """What files call the columns that have a name of their own here."""
 
 
+PADDING = 8
+"""Most blank bytes that may follow a binary file."""
+
+
 class Parsed(NamedTuple):
     """What a file holds: `attributes` has one column for each of `columns`, whose values are as the file has them."""
 
@@ -272,29 +276,50 @@ def obj(content: bytes) -> Parsed:
 
 
 def stl(content: bytes) -> Parsed:
-    """STL, binary or text; every face has corners of its own."""
+    """STL, binary or text, its keywords in capitals or not; every face has corners of its own."""
     promised = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
-    if len(content) == 84 + 50 * promised:
+    wanted = 84 + 50 * promised
+    if 84 <= wanted <= len(content) and ends_well(content, wanted):
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-        corners = np.frombuffer(content, record, offset=84)["corners"].astype(np.float64).reshape(-1, 3)
+        table = np.frombuffer(content, record, promised, offset=84)
+        corners = table["corners"].astype(np.float64).reshape(-1, 3)
     elif text.plain(content).lstrip()[:5].lower() == b"solid" and b"\0" not in content:
-        lines = [line.split() for line in text_lines(content, b"//")]
-        place = placed(content, b"//", key=b"vertex")
-        corners = rows([b" ".join(line[1:]) for line in lines if line[0] == b"vertex"], "vertex", 3, place)
-        opened = sum(line[0] == b"facet" for line in lines)
-        ended = sum(line[0] == b"endfacet" for line in lines)
-        solids = [line[0] for line in lines if line[0] in (b"solid", b"endsolid")]
-        if opened != ended or len(corners) != 3 * opened or solids.count(b"endsolid") * 2 != len(solids):
-            raise ValueError(
-                f"{opened} facets are opened, {ended} ended, with {len(corners)} corners; wanted 3 a facet and an "
-                "endsolid; it is cut short"
-            )
+        corners = _stl_text(content)
     else:
+        rest = len(content) - wanted
+        fault = "it is cut short, or no STL" if promised < 0 or rest < 0 else f"{rest} bytes follow"
         raise ValueError(
-            f"it has {len(content)} bytes and announces {max(promised, 0)} faces, which take "
-            f"{84 + 50 * max(promised, 0)}; it is cut short, or no STL"
+            f"it has {len(content)} bytes and announces {max(promised, 0)} faces, which take {max(wanted, 84)}; {fault}"
         )
     return Parsed(corners, np.arange(len(corners)).reshape(-1, 3))
+
+
+def _stl_text(content: bytes) -> Float[np.ndarray, "corners 3"]:
+    lines = [line.split() for line in text_lines(content, b"//")]
+    keys = [line[0].lower() for line in lines]
+    # also "end solid", "end facet"
+    keys = [
+        key + line[1].lower() if key == b"end" and len(line) > 1 else key
+        for key, line in zip(keys, lines, strict=True)
+    ]
+    chosen = [number for number, key in enumerate(keys) if key == b"vertex"]
+    every = placed(content, b"//")
+    corners = rows(
+        [b" ".join(lines[number][1:]) for number in chosen], "vertex", 3, lambda line: every(chosen[line])
+    )
+    opened, ended = keys.count(b"facet"), keys.count(b"endfacet")
+    solids, closed = keys.count(b"solid"), keys.count(b"endsolid")
+    if opened != ended or len(corners) != 3 * opened or solids != closed:
+        raise ValueError(
+            f"{opened} facets are opened, {ended} ended, with {len(corners)} corners; {solids} solids are opened, "
+            f"{closed} ended; wanted 3 corners a facet, and an end of each; it is cut short"
+        )
+    return corners
+
+
+def ends_well(content: bytes, end: int) -> bool:
+    """Whether after `end` a binary file has nothing, or only what editors and transfers put there: a line's end."""
+    return len(content) - end <= PADDING and not content[end:].strip(b" \t\r\n\x1a")
 
 
 def xyz(content: bytes) -> Parsed:

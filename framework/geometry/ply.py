@@ -17,6 +17,7 @@ from framework.geometry.mesh_files import (
     Parsed,
     Place,
     column_names,
+    ends_well,
     fans,
     placed,
     polygons,
@@ -168,7 +169,7 @@ def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, 
         else:
             found, start = _lists(body, start, element, order)
             faces = found if element.name == "face" else faces
-    if start != len(body):
+    if start > len(body) or not ends_well(body, start):
         raise ValueError(f"{len(body) - start} bytes follow what its header announces")
     return vertices, faces
 
