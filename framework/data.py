@@ -110,6 +110,15 @@ class Data(ABC):
             DataError: a missing root, a wrong layout, an unreadable file, a label that is not finite, an empty split.
         """
 
+    def check_files(self) -> None:  # noqa: B027 - most data have nothing to look at
+        """Look whether a user's own files are as `prepare` wants them, as far as that takes seconds.
+
+        A sweep asks before its jobs start. By default nothing is looked at.
+
+        Raises:
+            DataError: as `prepare`.
+        """
+
     @abstractmethod
     def splits(self) -> Splits:
         """The three splits. Items are dicts of tensors without batch dimension; a dataset that can fetch many items

@@ -339,3 +339,28 @@ def test_a_column_written_otherwise_is_refused_and_read_by_the_setting_that_is_t
     assert numeric_columns(told_of, ("file",), "data.columns").names == ("a", "b")
     np.testing.assert_array_equal(numbers(told_of, "a", missing=""), np.full(30, wanted))
     np.testing.assert_array_equal(numbers(told_of, "b", missing=""), np.arange(30) / 8)
+
+
+WORDS = (
+    "0.png",
+    "img001.png",
+    "S001",
+    "A1",
+    "12:30",
+    "2024-01-01",
+    "1/2",
+    "v1.2.3",
+    "192.168.0.1",
+    "north",
+    "-",
+    "#5",
+)
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_words_with_figures_are_left_out_and_not_taken_for_numbers(tmp_path: Path, word: str) -> None:
+    file = tmp_path / "one.csv"
+    file.write_text("a;b\n" + "".join(f"{word};{row / 8}\n" for row in range(30)), encoding="utf-8")
+    chosen = numeric_columns(read_columns(file, Writing()), (), "data.columns")
+    assert chosen.names == ("b",)
+    assert chosen.left_out["a"] in ("words", "empty")

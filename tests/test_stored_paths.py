@@ -155,6 +155,7 @@ def test_what_is_said_to_be_words_is_no_path() -> None:
         "tabular.units",
         "tabular.missing_words",
         "images_with_angles.units",
+        "table_tennis.units",
         "images_with_angles.angle_columns",
         "images_with_angles.mirror",
         "point_cloud_folder.columns",

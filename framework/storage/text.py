@@ -227,7 +227,7 @@ def _with_unit(word: str) -> Mended | None:
     if found is None or not (found[2] or found[4]) or (found[1] and not found[2]):
         return None
     unit = found[2] or found[4]
-    if found[2] and found[4]:
+    if (found[2] and found[4]) or found[3].endswith("."):  # the name of a file, 0.png
         return None
     inner = found[1] + found[3]
     if value(inner) is not None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from framework.configuration.assembly import build_data
 from framework.configuration.config import Config
 from framework.errors import ConfigError, UserError
 from framework.tracking.signals import ending_with_parent
@@ -16,7 +17,7 @@ COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework.sweeps.rehearsa
 
 
 def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> None:
-    """Check the configs of trainings as far as that needs no data.
+    """Check the configs of trainings, and of their data what a look at the user's files says (`Data.check_files`).
 
     Args:
         jobs: overrides and composed values of each.
@@ -53,10 +54,14 @@ def _told(overrides: Sequence[str], message: str) -> str:
 
 def main() -> None:
     """Read jobs from standard input; print the first mistake and exit with 2."""
+    looked_at: set[str] = set()
     for overrides, values in json.load(sys.stdin):
         try:
-            _ = Config.of(values, Path(), overrides).parts
-        except ConfigError as error:
+            parts = Config.of(values, Path(), overrides).parts
+            if repr(parts["data"]) not in looked_at:
+                looked_at.add(repr(parts["data"]))
+                build_data(parts).check_files()
+        except UserError as error:
             sys.stdout.write(_told(overrides, str(error)))
             sys.exit(2)
 

@@ -18,7 +18,7 @@ from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
 from framework.storage.names import spelled
 from framework.target import Target
-from plugins.data.images_with_angles.table import SPLITS, read_table
+from plugins.data.images_with_angles.table import SPLITS, Table, read_table
 
 
 class ImagesWithAngles(Data):
@@ -61,12 +61,7 @@ class ImagesWithAngles(Data):
         self.writing = writing
 
     def prepare(self) -> None:
-        if self.root is None:
-            raise DataError("data.root is not set; wanted the folder that holds your images and their table.")
-        root = Path(self.root).expanduser()
-        if not root.is_dir():
-            raise DataError(f"data.root = {root}: no such folder; wanted the one that holds your images.")
-        table = read_table(root / self.csv, self.angle_columns, self.angles_in, self.writing)
+        root, table = self._labels()
         self.remarks = table.remarks
         for name in self.mirror:
             if name not in table.columns:
@@ -95,6 +90,18 @@ class ImagesWithAngles(Data):
                     f"The {split} split is empty ({len(table.rows)} images in all, {self.skipped} unreadable). Add "
                     f"images, or say with a column `split` which are for {', '.join(SPLITS)}."
                 )
+
+    def _labels(self) -> tuple[Path, Table]:
+        """The folder, and what its table says."""
+        if self.root is None:
+            raise DataError("data.root is not set; wanted the folder that holds your images and their table.")
+        root = Path(self.root).expanduser()
+        if not root.is_dir():
+            raise DataError(f"data.root = {root}: no such folder; wanted the one that holds your images.")
+        return root, read_table(root / self.csv, self.angle_columns, self.angles_in, self.writing)
+
+    def check_files(self) -> None:
+        self._labels()
 
     def _crop(self, file: Path) -> Crop:
         return Crop(file, None, 0.0, self.image_size, self.channels, upright=True)

@@ -115,6 +115,9 @@ class Tabular(Data):
         file = Path(self.path).expanduser()
         return load(file, asked, self._trained, self.writing, small_angles=self.small_angles)
 
+    def check_files(self) -> None:
+        _ = self._table
+
     def splits(self) -> Splits:
         return self._table.splits
 
