@@ -9,7 +9,27 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.density_head import DensityHead
-from framework.distributions.protocol import arc, cdf, each_cdf, estimate, exactly, images, marginal, median
+from framework.distributions.protocol import (
+    Estimate,
+    Normals,
+    Slope,
+    about,
+    arc,
+    cdf,
+    each_cdf,
+    estimate,
+    exactly,
+    images,
+    mahalanobis,
+    marginal,
+    median,
+    normals,
+    peaks,
+    pick,
+    scales,
+    slope,
+    tempered,
+)
 from framework.target import Target
 from framework.testing.densities import CHECKS, examine_densities
 from framework.testing.finding import Finding
@@ -78,7 +98,55 @@ class Changed(Distribution):
         return self.ask("support")
 
 
-estimate.register(Changed, exactly)
+@estimate.register
+def _(density: Changed, value: Tensor) -> Estimate:
+    if "estimate" in density.parts:
+        return density.parts["estimate"](density.density, value)
+    return exactly(density, value)
+
+
+@tempered.register
+def _(density: Changed, temperature: Tensor) -> Distribution:
+    return density.parts.get("tempered", tempered)(density.density, temperature)
+
+
+@pick.register
+def _(density: Changed, index: Tensor) -> Distribution:
+    if "sample" in density.parts:
+        return pick.dispatch(Distribution)(density, index)
+    return density.parts.get("pick", pick)(density.density, index)
+
+
+@slope.register
+def _(density: Changed, value: Tensor) -> Slope | None:
+    return density.parts.get("slope", slope)(density.density, value)
+
+
+@about.register
+def _(density: Changed, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+    if "log_prob" in density.parts:
+        return about.dispatch(Distribution)(density, index, place)
+    return density.parts.get("about", about)(density.density, index, place)
+
+
+@normals.register
+def _(density: Changed) -> Normals | None:
+    return density.parts.get("normals", normals)(density.density)
+
+
+@mahalanobis.register
+def _(density: Changed, value: Tensor) -> Tensor | None:
+    return density.parts.get("mahalanobis", mahalanobis)(density.density, value)
+
+
+@peaks.register
+def _(density: Changed) -> Tensor:
+    return density.parts.get("peaks", peaks)(density.density)
+
+
+@scales.register
+def _(density: Changed) -> Tensor:
+    return density.parts.get("scales", scales)(density.density)
 
 
 @marginal.register
@@ -154,6 +222,7 @@ class Fault:
         parts: the answers that are replaced.
         only: the one property that is to find it; "" where several may.
         config: of the sound head.
+        head: builds the wrong head for a target, where answers of a sound one will not do.
     """
 
     name: str
@@ -161,9 +230,11 @@ class Fault:
     parts: Parts
     only: str = ""
     config: Mapping[str, Any] = field(default_factory=dict)
+    head: Callable[[Target], DensityHead] | None = None
 
-    def findings(self) -> Iterator[Finding]:
-        """Every finding; those of densities first where they are to find it, since nobody need ask further."""
+    def findings(self, only: str = "") -> Iterator[Finding]:
+        """Every finding, or that of one property; those of densities first where they are to find it, since nobody
+        need ask further."""
         kinds = {
             "angle": VonMisesHead,
             "real": GaussianHead,
@@ -171,11 +242,14 @@ class Fault:
             "image": LaplaceImageHead,
         }
 
-        def build() -> DensityHead:
-            return Faulty(kinds[self.target.kind](self.target, **self.config), self.parts)
+        def of(target: Target) -> DensityHead:
+            if self.head is not None:
+                return self.head(target)
+            return Faulty(kinds[target.kind](target, **self.config), self.parts)
 
-        cases = predicted if self.target.kind == "angle" and not self.config else None
-        subject = HeadSubject(HeadRow(self.name, self.target, cases=cases), build)
+        cases = predicted if self.target.kind == "angle" and not self.config and self.head is None else None
+        row = HeadRow(self.name, self.target, cases=cases)
+        subject = HeadSubject(row, lambda: of(self.target), of=of, only=only)
         groups = [examine_head(subject), examine_densities(subject)]
         for group in groups[::-1] if self.only in OF_DENSITIES else groups:
             yield from group

@@ -1,6 +1,7 @@
 """Quadrature of a density of one or two numbers that follows it, however narrow: boxes split where they disagree."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -35,6 +36,7 @@ class Boxes:
         weight: (node, rows) volume of each node. Σ weight · exp(log_prob) is the integral.
         border: of one number (box + 1, rows) ascending, mass (box, rows) between them.
         way: the coordinates in which boxes are cut.
+        low, high: of the boxes in these coordinates, (box, rows, number).
     """
 
     value: Tensor
@@ -43,6 +45,8 @@ class Boxes:
     border: Tensor
     mass: Tensor
     way: "_Map"
+    low: Tensor
+    high: Tensor
 
     def mean(self, of: Tensor) -> Tensor:
         """∫ p f of f (node, rows)."""
@@ -51,6 +55,23 @@ class Boxes:
 
     def entropy(self) -> Tensor:
         return -self.mean(self.log_prob)
+
+    def doubt(self, of: Callable[[Tensor], Tensor]) -> Tensor:
+        """How far ∫ p f, f of values, may be off, (rows): boxes are cut for p, not for f, and end somewhere.
+
+        By how much the coarser rule differs, and what a tail that falls as slowly as a power leaves beyond the ends.
+        """
+        shares = []
+        for points in RULES[self.low.shape[-1]]:
+            value, log_prob, weight = _nodes(self.way, self.low, self.high, points)
+            share = weight * log_prob.exp()
+            part = torch.where(share > 0, share * of(value).reshape(share.shape), 0.0).sum(1)
+            shares.append(part)
+        rules = (shares[0] - shares[1]).abs().sum(0)
+        if self.way.angles:
+            return rules
+        outermost = (self.low == self.way.ends[0]).any(-1) | (self.high == self.way.ends[1]).any(-1)
+        return rules + 100 * torch.where(outermost, shares[0].abs(), 0.0).sum(0)
 
     def below(self, value: Tensor) -> Tensor:
         """Mass from the first border to `value` (several, rows) of one number; of angles from half a turn before the
@@ -299,4 +320,4 @@ def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
         mass = mass.gather(0, order)
         ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
         border = way.to(ends.unsqueeze(-1))[0][..., 0]
-    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, way)
+    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, way, low, high)

@@ -191,7 +191,10 @@ def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
 
     config = resolve("density_head", {"name": name, **row.config})
 
-    subject = HeadSubject(row, lambda: ready(build("density_head", config, target=row.target), row.target))
+    def of(target: Target) -> Any:
+        return ready(build("density_head", config, target=target), target)
+
+    subject = HeadSubject(row, lambda: of(row.target), of=of)
     yield from examine_head(subject)
     yield from examine_densities(subject)
 

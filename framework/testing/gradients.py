@@ -1,7 +1,9 @@
 """Gradients of a head's loss: against finite differences, and nothing to gain by leaving the truth."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,12 +11,16 @@ from torch import Tensor
 from framework.testing.finding import SEED, Worst, seed
 from framework.testing.heads import HeadSubject, as_type, seeded
 
+STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
+"""Of central differences, relative to raw numbers above 1; those after the third where the first three disagree."""
+
 
 def gradient(subject: HeadSubject, worst: Worst) -> None:
     """Derivatives of the loss in every raw number, and along one direction in parameters, against central differences.
 
     Each row by itself, at random targets and at draws; of three steps the one that agrees best, as the smallest is
-    lost in rounding and the largest may reach across a kink.
+    lost in rounding and the largest may reach across a kink. Where none does, the step follows the density's own width:
+    of ever smaller ones the one that agrees best with the next, whatever the derivative says.
     """
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
@@ -39,31 +45,63 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
             for column, direction in _directions(argument, name == "raw numbers", size, number):
                 slope = slopes * direction
                 analytic = slope.sum(-1) if name == "raw numbers" else slope.sum()
-                errors, numeric = [], analytic
-                for step in (1e-4, 1e-5, 1e-6):
-                    step = step * max(1.0, size)
-                    ends = []
-                    with torch.no_grad():
-                        for sign in (1, -1):
-                            argument += sign * step * direction
-                            ends.append(loss())
-                            argument -= sign * step * direction
-                        if name != "raw numbers":
-                            ends = [end.sum() for end in ends]
-                    numeric = (ends[0] - ends[1]) / (2 * step)
-                    # what rounding of the two losses, and of raw numbers on the way, does to their difference
-                    noise = 16 * torch.finfo(torch.float64).eps * ends[0].abs() / step
-                    least = 1e-3 * slopes.norm(dim=-1) if name == "raw numbers" else 1.0
-                    scale = numeric.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
-                    errors.append(((analytic - numeric).abs() - noise).clamp(min=0) / scale)
+                least = 1e-3 * slopes.norm(dim=-1) if name == "raw numbers" else 1.0
+
+                at = partial(difference, loss, argument, direction, whole=name != "raw numbers")
+                steps = [max(1.0, size) * step for step in STEPS]
+                found = [at(step) for step in steps[:3]]
+                errors = [one.error(analytic, least) for one in found]
+                error = torch.stack(errors).amin(0)
+                if bool((error > 1e-7).any()):
+                    # narrower than the steps, or a kink within them: smaller ones, until two agree with each other
+                    found += [at(step) for step in steps[3:]]
+                    error = torch.minimum(error, most_certain(found).error(analytic, least))
+                numeric = most_certain(found).slope
                 # differences of large losses know fewer digits
                 worst.see(
-                    torch.stack(errors).amin(0) * (1.0 if size <= 3 else 1e-3),
+                    error * (1.0 if size <= 3 else 1e-3),
                     lambda at, name=name, size=size, column=column, analytic=analytic, numeric=numeric: (
                         f"in {name}{column} of size {size:g}, row {at}: {analytic[at].item():.9g}, "
                         f"by differences {numeric[at].item():.9g}"
                     ),
                 )
+
+
+class Difference(NamedTuple):
+    """A central difference of a loss, and what rounding of the two losses may add to it."""
+
+    slope: Tensor
+    noise: Tensor
+
+    def error(self, analytic: Tensor, least: Tensor | float) -> Tensor:
+        """Of a derivative, beyond the noise, relative to the slope where that is no less than `least` and 1e-3."""
+        scale = self.slope.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
+        return ((analytic - self.slope).abs() - self.noise).clamp(min=0) / scale
+
+
+@torch.no_grad()
+def difference(
+    loss: Callable[[], Tensor], argument: Tensor, direction: Tensor, step: float, whole: bool
+) -> Difference:
+    """Along a direction of the argument, of each row's loss or of their sum."""
+    ends = []
+    for sign in (1, -1):
+        argument += sign * step * direction
+        ends.append(loss())
+        argument -= sign * step * direction
+    if whole:
+        ends = [end.sum() for end in ends]
+    # what rounding of the two losses, and of raw numbers on the way, does to their difference
+    noise = 16 * torch.finfo(torch.float64).eps * ends[0].abs() / step
+    return Difference((ends[0] - ends[1]) / (2 * step), noise)
+
+
+def most_certain(found: Sequence[Difference]) -> Difference:
+    """Of each row the difference that the one before differs from least, beside its own noise."""
+    slope, noise = (torch.stack(parts) for parts in zip(*found, strict=True))
+    doubt = (slope[1:] - slope[:-1]).abs() + noise[1:]
+    best = doubt.nan_to_num(nan=math.inf).argmin(0, keepdim=True)
+    return Difference(slope[1:].gather(0, best)[0], noise[1:].gather(0, best)[0])
 
 
 def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterator[tuple[str, Tensor]]:

@@ -5,6 +5,7 @@ What the head's densities must satisfy is in framework.testing.densities.
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,6 +27,10 @@ SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
 """Raw numbers of these sizes, and of the largest a type holds, are fed in as they may come from a diverging network."""
 
 
+MANY_ROWS = 300
+"""Of a batch whose first and last rows are predicted alone too."""
+MOST_COLUMNS = 24
+"""Raw numbers of which each is changed by itself."""
 PATIENCE = 20.0
 """Seconds of processor time for one check."""
 
@@ -36,11 +41,15 @@ class HeadSubject:
 
     Attributes:
         seconds: what a check may take: little, once one has not ended.
+        of: builds it for another target; None where nobody asks how the target's unit is read.
+        only: the one property to examine; "" for all.
     """
 
     row: HeadRow
     build: Callable[[], DensityHead]
     seconds: float = PATIENCE
+    of: Callable[[Target], DensityHead] | None = None
+    only: str = ""
 
     def examined(self, name: str, limit: float, look: Callable[[Worst], None]) -> Finding:
         """The finding of one check, with the row's limit where it has its own."""
@@ -48,6 +57,10 @@ class HeadSubject:
         if found.worst.startswith("TooSlow"):
             self.seconds = 1.0
         return found
+
+    def wants(self, name: str) -> bool:
+        """Whether a property is to be examined."""
+        return name not in self.row.leave_out and self.only in ("", name)
 
     def make(self) -> DensityHead:
         """A fresh head in evaluation mode."""
@@ -92,18 +105,22 @@ def ready(head: DensityHead, target: Target) -> DensityHead:
 
 
 def values(target: Target, batch: tuple[int, ...]) -> Tensor:
-    """Seeded targets: angles over several turns, reals of size 1, labels."""
+    """Seeded targets: angles over several turns, reals of size 1 (in the target's unit, if it has one), labels."""
     generator = torch.Generator().manual_seed(SEED + 1)
     if target.kind == "class":
         return torch.randint(len(target.names), batch, generator=generator)
     scale = 6.0 if target.kind == "angle" else 1.0
-    return scale * torch.randn(*batch, *target.event_shape, generator=generator)
+    found = scale * torch.randn(*batch, *target.event_shape, generator=generator)
+    if target.scale:
+        found = torch.tensor(target.location).double() + torch.tensor(target.scale).double() * found
+    return found
 
 
 def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     """Every property of the head itself, cheapest first."""
     from framework.testing.gradients import gradient, proper
     from framework.testing.precision import precision, reference
+    from framework.testing.units import TOLERANCE, units
 
     checks = (
         ("batch shapes", 0.0, _shapes),
@@ -116,6 +133,10 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("knobs turn", 0.0, _knobs),
         ("finite for any raw numbers", 0.0, _finite_anywhere),
         ("calibrate does not harm", 1e-5, _calibrated),
+        ("calibrate reads every row alike", 1e-5, _calibrated_backwards),
+        ("every raw number counts", 0.0, _all_read),
+        ("several values at once", 1e-5, _several_values),
+        ("target's unit", TOLERANCE, units),
         ("loss gradient", 1e-6, gradient),
         ("loss is least for its own density", 6.0, proper),
         ("float32 against float64", 32.0, precision),
@@ -123,7 +144,9 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("log_prob, float32", 2e-6, lambda subject, worst: reference(subject, worst, torch.float32)),
     )
     for name, limit, check in checks:
-        if name in subject.row.leave_out or (name.startswith("log_prob") and subject.row.cases is None):
+        if not subject.wants(name) or (name.startswith("log_prob") and subject.row.cases is None):
+            continue
+        if name == "target's unit" and (subject.of is None or subject.row.target.kind != "real"):
             continue
         yield subject.examined(name, limit, lambda worst, check=check: check(subject, worst))
 
@@ -217,6 +240,9 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
     with torch.no_grad():
         head = subject.make()
         first = everything(head)
+        density, many = head.eval()(raw), torch.Size((64,))
+        seed(SEED)
+        worst.count(torch.equal(density.sample(many), density.sample(many)), "two draws are the same")
         head.eval()(2 + 3 * raw).sample()
         head.train().loss(2 + 3 * raw, value)
         for what, other in {"two runs": head, "two heads": subject.make()}.items():
@@ -225,7 +251,10 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
-    """A row's loss has no gradient in another row, nor changes with it: no density depends on its neighbours."""
+    """A row's loss has no gradient in another row, nor changes with it: no density depends on its neighbours.
+
+    Nor does it depend on how many there are, as far as nothing is drawn.
+    """
     found = []
     for factor in (1.0, -3.0):
         head, raw, value = subject.make(), subject.raws(4), subject.values(4)
@@ -234,9 +263,37 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
             seed(SEED)
             density = head(raw)
             found.append({"log_prob": density.log_prob(value)[2], "mode": density.mode[2].float()})
+            entropies = []
+            for number in (0, 1):
+                seed(number)
+                entropies.append(density.entropy()[2])
+            if torch.equal(*entropies):  # nothing is drawn
+                found[-1]["entropy"] = entropies[0]
+            for name in ("mean", "variance"):
+                with suppress(NotImplementedError, AttributeError):
+                    found[-1][name] = getattr(density, name)[2].float()
             seed(SEED)
             found[-1]["loss"] = head.train().loss(raw, value)[2]
-    for name, alone in found[0].items():
+    if not subject.draws():
+        head, raw, value = subject.make(), subject.raws(MANY_ROWS), subject.values(MANY_ROWS)
+        with torch.no_grad():
+            for start in (0, MANY_ROWS - 3):
+                few = slice(start, start + 3)
+                whole, part = head(raw), head(raw[few])
+                where = f"of rows {start} to {start + 2} among {MANY_ROWS}"
+                for name, big, small in (
+                    ("log_prob", whole.log_prob(value)[few], part.log_prob(value[few])),
+                    ("mode", whole.mode[few].float(), part.mode.float()),
+                ):
+                    gap = (big - small).abs() > 1e-4 * small.abs().clamp(min=1)
+                    worst.count(gap, f"{name} {where}")
+            grid, line = head(raw[:6].unflatten(0, (3, 2))), head(raw[:6])
+            value = value[:6]
+            big, small = grid.log_prob(value.unflatten(0, (3, 2))).flatten(), line.log_prob(value)
+            gap = (big - small).abs() > 1e-4 * small.abs().clamp(min=1)
+            worst.count(gap, "log_prob of a batch (3, 2), of one (6,)")
+    for name in found[0].keys() & found[1].keys():
+        alone = found[0][name]
         gap = (found[1][name] - alone).abs() > 1e-5 * alone.abs().clamp(min=1)
         worst.count(gap, f"{name} of row 2 where the others change")
     raw = subject.raws(4).requires_grad_()
@@ -328,6 +385,62 @@ def _calibrated(subject: HeadSubject, worst: Worst) -> None:
         after = head(raw).log_prob(value).double().mean()
     loss = (before - after).clamp(min=0) / before.abs().clamp(min=1) if after.isfinite() else after
     worst.see(loss, f"{before.item():.6g} before, {after.item():.6g} after")
+
+
+def _calibrated_backwards(subject: HeadSubject, worst: Worst) -> None:
+    """calibrate fits the same to rows in another order: rows whose targets are twice as far come last, or first."""
+    if subject.draws():
+        worst.count(False, "draws in log_prob")
+        return
+    raw, value = subject.raws(64), subject.values(64)
+    if value.is_floating_point() and subject.row.target.kind == "real":
+        value[32:] = 2 * value[32:]
+    found = []
+    with torch.no_grad():
+        for order in (torch.arange(64), torch.arange(63, -1, -1)):
+            head = subject.make()
+            head.calibrate(raw[order], value[order])
+            found.append(head(raw).log_prob(value).double())
+    gap = (found[0] - found[1]).abs() / found[0].abs().clamp(min=1)
+    worst.see(gap, "log_prob after rows in reversed order")
+
+
+def _all_read(subject: HeadSubject, worst: Worst) -> None:
+    """Each raw number changes the loss of some target at some size: none is read and then left out."""
+    head, columns = subject.make().double().train(), range(subject.size)
+    if head.direct:
+        worst.count(False, "it reads features, which are not made for it")
+        return
+    unread = set(columns)
+    for size in (0.3, 1.0, 3.0):
+        raw, value = (size * subject.raws(8)).double(), as_type(subject.values(8), torch.float64)
+        with torch.no_grad():
+            seed(SEED)
+            before = head.loss(raw, value)
+            for column in sorted(unread)[:MOST_COLUMNS]:
+                other = raw.clone()
+                other[:, column] = 0.4 - 0.9 * raw[:, column]
+                seed(SEED)
+                if not torch.equal(head.loss(other, value), before):
+                    unread.remove(column)
+            if len(unread) > max(0, subject.size - MOST_COLUMNS):
+                continue
+            unread = set()
+            break
+    worst.count(bool(unread), f"raw numbers that change no loss: {sorted(unread)[:8]}")
+
+
+def _several_values(subject: HeadSubject, worst: Worst) -> None:
+    """log_prob of values (5, *batch) is that of each by itself."""
+    with torch.no_grad():
+        density, value = subject.make()(subject.raws(4)), subject.values(5, 4)
+        found = density.log_prob(value)
+        if subject.draws():
+            worst.count(False, "draws in log_prob")
+            return
+        alone = torch.stack([density.log_prob(one) for one in value])
+    gap = (found - alone).abs() / alone.abs().clamp(min=1)
+    worst.see(gap, lambda at: f"value {at[0]} of row {at[1]}")
 
 
 def seeded(head: DensityHead, raw: Tensor) -> Distribution:

@@ -22,16 +22,18 @@ def outlier(head: DensityHead) -> Iterator[Case]:
     yield Case("κ = 1e6, 3 rad off", raw, value, log_prob)
 
 
+FLOOR = {"tempered: power": "the component is raised to it, and the floor stays"}
 ROWS = {
     "uniform_floor": (
-        HeadRow("one angle", ONE, {"weight": 0.125}, cases=outlier),
-        HeadRow("three angles", THREE, {"weight": 0.01}),
+        HeadRow("one angle", ONE, {"weight": 0.125}, cases=outlier, leave_out=FLOOR),
+        HeadRow("three angles", THREE, {"weight": 0.01}, leave_out=FLOOR),
         HeadRow(
             "rotations",
             THREE,
             {"weight": 0.5, "component": {"name": "matrix_fisher"}},
             leave_out={
-                "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles"
+                "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles",
+                **FLOOR,
             },
         ),
         HeadRow("classes", CLASSES, {"weight": 0.01, "component": {"name": "categorical"}}),

@@ -1,0 +1,280 @@
+"""Density heads that are wrong in what they may be asked beyond log_prob and draws, and in how they read targets."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.protocol import (
+    Slope,
+    about,
+    each_cdf,
+    estimate,
+    exactly,
+    marginal,
+    normals,
+    one_normal,
+    pick,
+    scales,
+    slope,
+)
+from framework.target import Target
+from plugins.density_head.gaussian.density import Gaussian
+from plugins.density_head.von_mises.density import VonMises
+from tests.planted_heads import CLASSES, HEIGHT, IMAGE, ONE, PLACE, Fault, Faulty
+from tests.right_heads import LaplaceHead, Logistic, LogisticHead, Product, StudentTHead
+
+POINT = Target("real", ("x", "y", "z"))
+
+
+def first_row_only(density: Gaussian, index: Tensor) -> Distribution:
+    """Of every row the items of the first."""
+    return pick(Gaussian(*(part[:1].expand_as(part) for part in (density.location, density.scale))), index)
+
+
+def changed_slope(density: Distribution, value: Tensor, pull: float, stiffness: float) -> Slope:
+    found = slope(density, value)
+    assert found is not None
+    return Slope(found.log_prob, pull * found.pull, stiffness * found.stiffness)
+
+
+class NoJacobian(LaplaceHead):
+    """A log-density of the standardised number, of values in the target's unit."""
+
+    def forward(self, raw: Tensor) -> Distribution:
+        return Shifted(super().forward(raw), self.unit.log_volume)
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(target)
+
+
+class Shifted(Product):
+    """Another constant in log_prob and entropy."""
+
+    def __init__(self, density: Distribution, by: float) -> None:
+        assert isinstance(density, Product)
+        self.by = by
+        super().__init__(density.kind, *density.parameters)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return super().log_prob(value) + self.by
+
+    def entropy(self) -> Tensor:
+        return super().entropy() - self.by
+
+
+class LossOfTheStandardised(StudentTHead):
+    """Its loss takes the place of the target's unit for the standardised one."""
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(self.unit.standardised(target))
+
+
+class RootOfScale(LogisticHead):
+    """Takes the target's scale for a variance."""
+
+    def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        place, scale = super().parameters_of(raw)
+        return place, scale if self.unit.scale is None else scale / self.unit.scale.sqrt()
+
+
+class NoLocation(LogisticHead):
+    """Scales, and does not shift."""
+
+    def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        place, scale = super().parameters_of(raw)
+        return place if self.unit.location is None else place - self.unit.location, scale
+
+
+class FirstScale(LogisticHead):
+    """The first number's scale for all."""
+
+    def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        place, scale = super().parameters_of(raw)
+        return place, scale if self.unit.scale is None else scale / self.unit.scale * self.unit.scale[0]
+
+
+class StandardisedDraws(LogisticHead):
+    """Draws and the median stay in the standardised unit."""
+
+    def forward(self, raw: Tensor) -> Logistic:
+        return Standard(*self.parameters_of(raw), self.unit.standardised)
+
+
+class Standard(Logistic):
+    def __init__(self, place: Tensor, scale: Tensor, standardised: Any) -> None:
+        self.standardised = standardised
+        super().__init__(place, scale)
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        return self.standardised(super().sample(sample_shape))
+
+
+class CalibratedTwice(LogisticHead):
+    """calibrate multiplies with the target's scale once more."""
+
+    @torch.no_grad()
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        super().calibrate(raw, target)
+        if self.unit.scale is not None:
+            self.factor.mul_(self.unit.scale[0])
+
+
+class FirstHalf(LogisticHead):
+    """calibrate reads the first half of the rows."""
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        super().calibrate(raw[: len(raw) // 2], target[: len(raw) // 2])
+
+
+class Unread(LogisticHead):
+    """Asks for a number more than it reads."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self.size += 1
+
+    def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        place, scale = raw[..., :-1].chunk(2, -1)
+        finite = raw[..., -1:].clamp(-1, 1) * 0
+        scale = scale.clamp(-9, 9).exp() + finite
+        return place.clamp(-1e6, 1e6), scale
+
+
+class OneScaleForAll(LogisticHead):
+    """Two numbers share a scale, and each has a raw number for one."""
+
+    def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        place, scale = super().parameters_of(raw)
+        return place, scale[..., :1].expand_as(scale)
+
+
+class LightTails(StudentTHead):
+    """The normaliser of a normal density."""
+
+    def forward(self, raw: Tensor) -> Distribution:
+        return Shifted(super().forward(raw), 0.05)
+
+
+class NarrowSlope(StudentTHead):
+    """The gradient of the loss is a tenth off where the scale is below 1e-3."""
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        place, scale = self.parameters_of(raw)
+        place = torch.where(scale < 1e-3, 0.9 * place + 0.1 * place.detach(), place)
+        return -Product(torch.distributions.StudentT, torch.full_like(place, 2.5), place, scale).log_prob(
+            target
+        )
+
+
+def reseeding(density: Distribution, shape: torch.Size) -> Tensor:
+    torch.default_generator.manual_seed(0)
+    return density.sample(shape)
+
+
+def mixed_rows(head: Faulty, raw: Tensor) -> Distribution:
+    """Batches of two dimensions are read in another order."""
+    return head.sound(raw if raw.dim() < 3 else raw.transpose(0, 1).reshape(raw.shape))
+
+
+def cut_batch(head: Faulty, raw: Tensor) -> Distribution:
+    """The last rows of a batch above 256 get the first one's numbers."""
+    if raw.dim() == 2 and len(raw) > 256:
+        raw = torch.cat([raw[:256], raw[:1].expand(len(raw) - 256, -1)])
+    return head.sound(raw)
+
+
+FURTHER_FAULTS = (
+    # estimate
+    Fault("estimate 0.05 nats high", ONE,
+          {"estimate": lambda d, v: exactly(d, v)._replace(log_mean=d.log_prob(v) + 0.05)}, "estimate"),
+    Fault("estimate of a density that draws nothing has an error", HEIGHT,
+          {"estimate": lambda d, v: exactly(d, v)._replace(standard_error=0 * d.log_prob(v) + 0.1)}, "estimate"),
+    Fault("estimate of classes is debiased by a tenth", CLASSES,
+          {"estimate": lambda d, v: estimate(d, v)._replace(debiased=d.log_prob(v) + 0.1)}, "estimate"),
+    Fault("estimate of the first value for all", HEIGHT,
+          {"estimate": lambda d, v: exactly(d, v[:1].expand_as(v))}, "estimate"),
+    Fault("estimate without the second number", PLACE,
+          {"estimate": lambda d, v: exactly(marginal(d, 0), v[..., :1])}, "estimate"),
+    # tempered
+    Fault("power: σ T instead of σ √T", HEIGHT,
+          {"tempered": lambda d, t: Gaussian(d.location, d.scale * t)}, "tempered: power"),
+    Fault("power: κ T instead of κ / T", ONE,
+          {"tempered": lambda d, t: VonMises(d.location, d.concentration * t)}, "tempered: power"),
+    Fault("power: the density itself", HEIGHT, {"tempered": lambda d, t: d}, "tempered: power"),
+    Fault("power about another place", HEIGHT,
+          {"tempered": lambda d, t: Gaussian(d.location * t, d.scale * t.sqrt())}, "tempered: power"),
+    Fault("power of the first number only", PLACE,
+          {"tempered": lambda d, t: Gaussian(d.location, d.scale * torch.stack([t.sqrt(), t / t]))}, "tempered: power"),
+    # pick
+    Fault("pick: the next item", HEIGHT, {"pick": lambda d, i: pick(d, 1 - i)}, "pick"),
+    Fault("pick: the first item always", ONE, {"pick": lambda d, i: pick(d, 0 * i)}, "pick"),
+    Fault("pick: items of the first row", HEIGHT, {"pick": first_row_only}, "pick"),
+    Fault("pick: scales of the next item", HEIGHT,
+          {"pick": lambda d, i: pick(Gaussian(d.location, d.scale.flip(-2)), i)}, "pick"),
+    Fault("a mixture draws the other component", CLASSES, {"pick": lambda d, i: pick(d, 1 - i)},
+          "mixture: samples follow log_prob"),
+    # slope, about, normals, peaks and scales
+    Fault("slope: half the stiffness", HEIGHT, {"slope": lambda d, v: changed_slope(d, v, 1, 0.5)}, "slope"),
+    Fault("slope: the pull pushes", ONE, {"slope": lambda d, v: changed_slope(d, v, -1, 1)}, "slope"),
+    Fault("slope: of log_prob without the constant", HEIGHT,
+          {"slope": lambda d, v: slope(d, v)._replace(log_prob=d.log_prob(v) + d.scale.log().sum(-1))}, "slope"),  # pyright: ignore
+    Fault("about: adds the place", HEIGHT, {"about": lambda d, i, p: about(d, i, -p)}, "about"),
+    Fault("about: forgets the place", ONE, {"about": lambda d, i, p: about(d, i, 0 * p)}, "about"),
+    Fault("about: rows in order whatever the index", HEIGHT,
+          {"about": lambda d, i, p: about(d, tuple(one.sort().values for one in i), p)}, "about"),
+    Fault("normals: variances for deviations", HEIGHT,
+          {"normals": lambda d: one_normal(d.location, d.scale.square())}, "normals"),
+    Fault("normals: about 0", HEIGHT,
+          {"normals": lambda d: normals(d)._replace(mean=0 * d.location.double())}, "normals"),  # pyright: ignore
+    Fault("distance without the scales", PLACE,
+          {"mahalanobis": lambda d, v: (v - d.location).square().sum(-1).double()}, "normals"),
+    Fault("scales: logarithms", HEIGHT, {"scales": lambda d: scales(d).log() - 9}, "peaks and scales"),
+    Fault("peaks without the peak's dimension", HEIGHT, {"peaks": lambda d: d.mode}, "peaks and scales"),
+    # of several numbers
+    Fault("each_cdf at half the scale", IMAGE,
+          {"each_cdf": lambda d, v: each_cdf(d, d.location + 2 * (v - d.location))}, "each_cdf", {"scale": "number"}),
+    Fault("mean of the first number for all", POINT, {"mean": lambda d: d.location[..., :1].expand_as(d.location)},
+          "mean and variance"),
+    Fault("variance of three numbers is the deviation", POINT, {"variance": lambda d: d.scale}, "mean and variance"),
+    Fault("median with the numbers exchanged", PLACE, {"median": lambda d, n: d.location.flip(-1)}, "median"),
+    Fault("marginals of three reals exchanged", POINT, {"marginal": lambda d, i: marginal(d, 2 - i)}, "marginals"),
+    # targets with location and scale
+    Fault("no Jacobian of the target's scale", HEIGHT, {}, "target's unit", head=NoJacobian),
+    Fault("loss of the standardised target", HEIGHT, {}, "target's unit", head=LossOfTheStandardised),
+    Fault("the root of the target's scale", HEIGHT, {}, "target's unit", head=RootOfScale),
+    Fault("the target's location is forgotten", PLACE, {}, "target's unit", head=NoLocation),
+    Fault("the first number's scale for all", PLACE, {}, "target's unit", head=FirstScale),
+    Fault("draws in the standardised unit", HEIGHT, {}, "target's unit", head=StandardisedDraws),
+    Fault("calibrated in the target's unit twice", HEIGHT, {}, "target's unit", head=CalibratedTwice),
+    # rows, values, raw numbers
+    Fault("calibrate reads the first half", HEIGHT, {}, "calibrate reads every row alike", head=FirstHalf),
+    Fault("a raw number is not read", HEIGHT, {}, "every raw number counts", head=Unread),
+    Fault("two numbers share the first's scale", PLACE, {}, "every raw number counts", head=OneScaleForAll),
+    Fault("log_prob of the first of several values", HEIGHT,
+          {"log_prob": lambda d, v: d.log_prob(v[:1].expand_as(v) if v.dim() > 2 else v)}, "several values at once"),
+    Fault("entropy is the batch's mean", HEIGHT,
+          {"entropy": lambda d: d.entropy().mean() + 0 * d.entropy()}, "rows of a batch apart"),
+    Fault("rows beyond 256 are the first", ONE, {"forward": cut_batch}, "rows of a batch apart"),
+    Fault("a batch of two dimensions is transposed", HEIGHT, {"forward": mixed_rows}, "rows of a batch apart"),
+    Fault("draws seed the generator", HEIGHT, {"sample": reseeding}, "same seed, same bits"),
+    # heavy tails
+    Fault("a heavy tail that is 5 % too high", HEIGHT, {}, "integral", head=LightTails),
+    Fault("a heavy tail's gradient is a tenth off where it is narrow", HEIGHT, {}, "loss gradient", head=NarrowSlope),
+    Fault("a wide logistic has the deviation of a normal", HEIGHT,
+          {}, "mean and variance", head=lambda target: Renamed(target)),
+)  # fmt: skip
+
+
+class Renamed(LogisticHead):
+    """Variance s² instead of π² s² / 3."""
+
+    def forward(self, raw: Tensor) -> Logistic:
+        return OfScale(*self.parameters_of(raw))
+
+
+class OfScale(Logistic):
+    @property
+    def variance(self) -> Tensor:
+        return self.width.square()

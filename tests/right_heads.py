@@ -1,0 +1,357 @@
+"""Density heads as somebody else may write them, right in everything: `mode=check` must refuse none."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Laplace, StudentT, constraints
+
+from framework.density_head import DensityHead
+from framework.distributions.circular import circular, wrap
+from framework.distributions.protocol import (
+    arc,
+    cdf,
+    each_cdf,
+    estimate,
+    exactly,
+    marginal,
+    median,
+    pick,
+    take,
+    turn,
+)
+from framework.heads.parameters import require_finite
+from framework.heads.unit import Unit
+from framework.target import Target
+from framework.testing.densities import examine_densities
+from framework.testing.finding import Finding
+from framework.testing.heads import HeadSubject, examine_head
+from framework.testing.rows import HeadRow
+
+LARGEST = 1e6
+"""Places and logarithms of scales are cut off here and at ±SCALES."""
+SCALES = 9.0
+
+
+class _OfReals(DensityHead):
+    """A place and a scale for each number, in the target's unit."""
+
+    bibtex = ""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("real", by=type(self).__name__)
+        self.unit = Unit.of(target)
+        self.size = 2 * len(target.names)
+
+    def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        place, scale = require_finite(raw, self.size).chunk(2, -1)
+        place, scale = place.clamp(-LARGEST, LARGEST), scale.clamp(-SCALES, SCALES).exp()
+        place, scale, _ = self.unit.given_back(place, scale)
+        return place, scale
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        pass
+
+
+class Product(Distribution):
+    """Independent numbers, each of one of torch's densities; unlike torch's own of a batch of no rows too. Nothing is
+    registered but what the base asks for."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.real_vector
+
+    def __init__(self, kind: Callable[..., Distribution], *parameters: Tensor) -> None:
+        self.kind, self.parameters = kind, parameters
+        self.each = kind(*parameters, validate_args=False)
+        shape = torch.Size(self.each.batch_shape)
+        super().__init__(torch.Size(shape[:-1]), torch.Size(shape[-1:]), validate_args=False)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.each.mode
+
+    @property
+    def mean(self) -> Tensor:
+        return self.each.mean
+
+    @property
+    def variance(self) -> Tensor:
+        return self.each.variance
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.each.log_prob(value).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        return self.each.sample(torch.Size(sample_shape))
+
+    def entropy(self) -> Tensor:
+        return self.each.entropy().sum(-1)
+
+
+estimate.register(Product, exactly)
+
+
+@marginal.register
+def _(density: Product, index: int) -> Product:
+    return Product(density.kind, *(one[..., index : index + 1] for one in density.parameters))
+
+
+class StudentTHead(_OfReals):
+    """Student's t of 2.5 degrees of freedom: its tails are heavy, its fourth moment is infinite."""
+
+    freedom = 2.5
+
+    def forward(self, raw: Tensor) -> Distribution:
+        place, scale = self.parameters_of(raw)
+        return Product(StudentT, torch.full_like(place, self.freedom), place, scale)
+
+
+class CauchyHead(StudentTHead):
+    """One degree of freedom: neither mean nor variance."""
+
+    freedom = 1.0
+
+
+class LearnedTHead(DensityHead):
+    """Student's t whose degrees of freedom are predicted, from the docstring of the base alone: it does not read the
+    target's location and scale."""
+
+    bibtex = ""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("real", by="LearnedTHead")
+        self.size = 3 * len(target.names)
+
+    def forward(self, raw: Tensor) -> Distribution:
+        place, scale, freedom = require_finite(raw, self.size).chunk(3, -1)
+        place, scale = place.clamp(-LARGEST, LARGEST), scale.clamp(-SCALES, SCALES).exp()
+        return Product(StudentT, 1 + 30 * torch.sigmoid(freedom), place, scale)
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        pass
+
+
+class LaplaceHead(_OfReals):
+    """Laplace, by torch."""
+
+    def forward(self, raw: Tensor) -> Distribution:
+        return Product(Laplace, *self.parameters_of(raw))
+
+
+class Logistic(Distribution):
+    """Independent logistic densities, e^-z / s (1 + e^-z)², with everything in closed form that is."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.real_vector
+
+    def __init__(self, place: Tensor, scale: Tensor) -> None:
+        self.place, self.width = place, scale
+        super().__init__(place.shape[:-1], place.shape[-1:], validate_args=False)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.place
+
+    @property
+    def mean(self) -> Tensor:
+        return self.place
+
+    @property
+    def variance(self) -> Tensor:
+        return (math.pi * self.width).square() / 3
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        size = ((value - self.place) / self.width).abs()
+        return (-size - 2 * torch.log1p((-size).exp()) - self.width.log()).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape) + self.place.shape
+        drawn = torch.rand(shape, dtype=self.place.dtype).clamp(min=torch.finfo(self.place.dtype).tiny)
+        return self.place + self.width * torch.logit(drawn, eps=torch.finfo(self.place.dtype).eps / 2)
+
+    def entropy(self) -> Tensor:
+        return (self.width.log() + 2).sum(-1)
+
+
+estimate.register(Logistic, exactly)
+
+
+@marginal.register
+def _(density: Logistic, index: int) -> Logistic:
+    return Logistic(density.place[..., index : index + 1], density.width[..., index : index + 1])
+
+
+@median.register
+def _(density: Logistic, samples: int) -> Tensor:
+    return density.place
+
+
+@pick.register
+def _(density: Logistic, index: Tensor) -> Logistic:
+    return Logistic(take(density.place, index), take(density.width, index))
+
+
+@each_cdf.register
+def _(density: Logistic, value: Tensor) -> Tensor:
+    return torch.sigmoid((value.double() - density.place.double()) / density.width.double())
+
+
+@cdf.register
+def _(density: Logistic, value: Tensor) -> Tensor:
+    return torch.sigmoid((value.double() - density.place.double()) / density.width.double())[..., 0]
+
+
+class LogisticHead(_OfReals):
+    """Logistic densities, with one factor of all scales fitted to the validation set."""
+
+    factor: Tensor
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self.register_buffer("factor", torch.ones((), dtype=torch.float64))
+
+    def forward(self, raw: Tensor) -> Logistic:
+        place, scale = self.parameters_of(raw)
+        return Logistic(place, scale * self.factor.to(scale))
+
+    @torch.no_grad()
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        place, scale = self.parameters_of(raw)
+        factors = self.factor * torch.logspace(-1, 1, 41, dtype=torch.float64)  # 1 among them
+        found = [Logistic(place, scale * one).log_prob(target).double().mean() for one in factors]
+        self.factor.copy_(factors[int(torch.stack(found).argmax())])
+
+
+class WrappedNormal(Distribution):
+    """Σ_k N(φ + 2πk; μ, σ²) for each angle (Mardia & Jupp 2000, §3.5.7), σ ≤ 2."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return circular
+
+    turns = 2 * math.pi * torch.arange(-3, 4, dtype=torch.float64)
+
+    def __init__(self, place: Tensor, scale: Tensor) -> None:
+        self.place, self.width = place, scale
+        super().__init__(place.shape[:-1], place.shape[-1:], validate_args=False)
+
+    @property
+    def mode(self) -> Tensor:
+        return self.place
+
+    def each(self, value: Tensor) -> Tensor:
+        standard = (wrap(value - self.place).unsqueeze(-1) + self.turns.to(value)) / self.width.unsqueeze(-1)
+        return torch.logsumexp(-standard.square() / 2, -1) - self.width.log() - math.log(2 * math.pi) / 2
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        return self.each(value).sum(-1)
+
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        shape = torch.Size(sample_shape) + self.place.shape
+        return wrap(self.place + self.width * torch.randn(shape, dtype=self.place.dtype))
+
+    def entropy(self) -> Tensor:
+        # of a narrow one the normal's; otherwise by the trapezium rule, exact where it resolves the density
+        angle = torch.linspace(-math.pi, math.pi, 801, dtype=torch.float64)[:-1].to(self.place)
+        angle = angle.reshape(-1, *(1,) * self.place.dim())
+        centred = WrappedNormal(torch.zeros_like(self.place), self.width.clamp(min=0.05))
+        log_prob = centred.each(angle)
+        wide = -(log_prob.exp() * log_prob).sum(0) * 2 * math.pi / 800
+        normal = self.width.log() + (1 + math.log(2 * math.pi)) / 2
+        return torch.where(self.width < 0.1, normal, wide).sum(-1)
+
+
+estimate.register(WrappedNormal, exactly)
+
+
+@marginal.register
+def _(density: WrappedNormal, index: int) -> WrappedNormal:
+    here = slice(index, index + 1)
+    return WrappedNormal(density.place[..., here], density.width[..., here])
+
+
+@median.register
+def _(density: WrappedNormal, samples: int) -> Tensor:
+    return density.place
+
+
+@pick.register
+def _(density: WrappedNormal, index: Tensor) -> WrappedNormal:
+    return WrappedNormal(take(density.place, index), take(density.width, index))
+
+
+@arc.register
+def _(density: WrappedNormal, start: Tensor, end: Tensor) -> Tensor:
+    first = wrap(start.double() - density.place.double())
+
+    def below(value: Tensor) -> Tensor:
+        turned = value + density.turns
+        return torch.special.ndtr(turned / density.width.double()).sum(-1)
+
+    return (below(first + turn(start, end)) - below(first)).clamp(0, 1)
+
+
+class WrappedNormalHead(DensityHead):
+    """A direction and a width for each angle."""
+
+    bibtex = ""
+    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+
+    def __init__(self, target: Target) -> None:
+        super().__init__()
+        target.require("angle", by="WrappedNormalHead")
+        self.angles = len(target.names)
+        self.size = 3 * self.angles
+
+    def forward(self, raw: Tensor) -> WrappedNormal:
+        cos, sin, width = require_finite(raw, self.size).chunk(3, -1)
+        # squares in the gradient of atan2 neither over- nor underflow
+        place = torch.atan2(sin.clamp(-1e18, 1e18), cos.clamp(-1e18, 1e18) + 1e-12)
+        return WrappedNormal(place, 1e-3 + 1.9 * torch.sigmoid(width))
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return -self(raw).log_prob(target)
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        pass
+
+
+HEADS: Mapping[str, tuple[type[DensityHead], tuple[Target, ...]]] = {
+    "Student's t": (StudentTHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
+    "Cauchy": (CauchyHead, (Target("real", ("height",)),)),
+    "Student's t, freedom predicted": (LearnedTHead, (Target("real", ("height",)),)),
+    "Laplace": (LaplaceHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
+    "logistic": (LogisticHead, (Target("real", ("height",)), Target("real", ("x", "y")))),
+    "wrapped normal": (
+        WrappedNormalHead,
+        (Target("angle", ("azimuth",)), Target("angle", ("azimuth", "tilt"))),
+    ),
+}
+
+
+def right_findings(name: str, target: Target) -> Iterator[Finding]:
+    """Every finding of one of them."""
+    kind = HEADS[name][0]
+    subject = HeadSubject(HeadRow(name, target), lambda: kind(target), of=kind)
+    yield from examine_head(subject)
+    yield from examine_densities(subject)
