@@ -15,7 +15,14 @@ from framework.geometry.meshes import stream
 from framework.storage.generated import read_mark
 from plugins.data.labelled_clouds import folders
 from plugins.data.labelled_clouds.archive import read_archive
-from plugins.data.labelled_clouds.labelled_clouds import Found, LabelledClouds, Unreadable, hold_out, loaded
+from plugins.data.labelled_clouds.labelled_clouds import (
+    Found,
+    LabelledClouds,
+    Unreadable,
+    hold_out,
+    loaded,
+    unread,
+)
 from plugins.data.labelled_clouds.reading import Packed, Reading, rounded, subsampled
 from plugins.data.labelled_clouds.shapes.generator import VERSION, Models, generated
 from plugins.data.labelled_clouds.shares import folds
@@ -192,6 +199,7 @@ class PointCloudFolder(LabelledClouds):
             splits=splits,
             skipped=len(listed.files) - len(kept.files),
             validated_on="validation" if self.shares[0] or "validation" in splits else "train",
+            remarks=unread(kept, self.reading),
         )
 
     def _drawn(self, kept: folders.Listed) -> np.ndarray:

@@ -15,7 +15,8 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture, images
-from framework.errors import DataError
+from framework.errors import DataError, shown
+from framework.geometry import meshes
 from framework.geometry.meshes import READERS
 from framework.storage.names import as_bytes, spelled
 from framework.target import Target
@@ -41,6 +42,7 @@ class Found(NamedTuple):
         synthetic: whether they were generated.
         validated_on: the split whose clouds are those of validation.
         rotations: how often a training cloud comes, turned about the up axis.
+        remarks: what of the user's files is not read.
     """
 
     where: str
@@ -55,6 +57,7 @@ class Found(NamedTuple):
     synthetic: bool = False
     validated_on: str = "validation"
     rotations: int = 1
+    remarks: tuple[str, ...] = ()
 
 
 class LabelledClouds(Data):
@@ -77,7 +80,7 @@ class LabelledClouds(Data):
         found = self.found()
         self.target = Target("class", tuple(map(spelled, found.classes)))
         self.input_shape = (found.packed.largest(), len(self.columns))
-        self.synthetic, self.skipped = found.synthetic, found.skipped
+        self.synthetic, self.skipped, self.remarks = found.synthetic, found.skipped, found.remarks
         clouds = apart(found)
         train = clouds["train"]
         if found.rotations > 1:
@@ -122,6 +125,23 @@ def loaded(
     if found.faults and unreadable == "error":
         raise DataError(images.fault_message(found.faults, len(listed.files), remedy))
     return listed.only(found.good), found.packed
+
+
+def unread(listed: Listed, how: Reading) -> tuple[str, ...]:
+    """What is not read of some files: those of other kinds, and the columns of the first that can be read."""
+    said = []
+    if listed.ignored:
+        said.append(f"left out: {listed.ignored} files of other kinds")
+    if listed.files:
+        mesh = meshes.read(listed.files[0])
+        others = [name for name in mesh.columns if name not in how.columns]
+        if others:
+            said.append(
+                f"left out: the columns {shown(', '.join(others))} of {listed.files[0].name}; data.columns reads them"
+            )
+        if len(mesh.faces):
+            said.append(f"the faces of {listed.files[0].name} are read as points drawn from them")
+    return tuple(said)
 
 
 def hold_out(

@@ -59,6 +59,7 @@ def test_every_format_is_read_and_clouds_keep_their_sizes(prepared, tmp_path):
     assert found.columns == ("x", "y", "z")
     assert not found.varies
     assert found.fingerprint()["ignored"] == "1"
+    assert found.remarks[0] == "left out: 1 files of other kinds"
     sizes = []
     for split in found.splits():
         batch = split.__getitems__(range(len(split)))
@@ -241,3 +242,14 @@ def test_the_real_shapes(prepared, tmp_path, name):
     extent = (low[1] - low[0]).amax(1)
     assert ((low - high).abs().amax((0, 2)) < 0.2 * extent).double().mean() > 0.9
     assert math.isfinite(float(extent.sum()))
+
+
+def test_columns_that_are_not_read_are_said(prepared, tmp_path):
+    for number, name in enumerate(("low", "high")):
+        (tmp_path / name).mkdir()
+        for sample in range(8):
+            rows = "\n".join(f"{number} {row} {sample} 0.5 7" for row in range(5))
+            (tmp_path / name / f"{sample}.xyz").write_text(f"x y z red heat\n{rows}\n")
+    wanted = "left out: the columns red, heat of 0.xyz; data.columns reads them"
+    assert prepared(root=tmp_path, validation=0.2, test=0.2).remarks == (wanted,)
+    assert not prepared(root=tmp_path, validation=0.2, test=0.2, columns=["red", "heat"]).remarks
