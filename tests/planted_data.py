@@ -267,6 +267,14 @@ def few_for_many(number: int, inputs: Tensor, target: Tensor) -> None:
     target[64:] = target[torch.arange(len(target))[64:] % 64]
 
 
+def neighbours_from_400(number: int, inputs: Tensor, target: Tensor) -> None:
+    target[400:] = target[400:].roll(1, 0)
+
+
+def counted_from_one(number: int, inputs: Tensor, target: Tensor) -> None:
+    target[:] = target.roll(1, 0)
+
+
 def one_for_all(number: int, inputs: Tensor, target: Tensor) -> None:
     target[:] = target[:1]
 
@@ -417,6 +425,8 @@ ALL_FAULTS = (
     Fault("a leak beyond the 400th", "no sample in two splits", {"prepare": test_again_in_training}),
     Fault("sixty-four samples for all", DIFFER, changed(few_for_many)),
     Fault("one target for all", DIFFER, changed(one_for_all)),
+    Fault("targets of neighbours from the 400th on", "targets go with inputs", changed(neighbours_from_400)),
+    Fault("targets of neighbours", "targets go with inputs", changed(counted_from_one)),
     Fault("noise from the 430th on", BITS, samples={"__getitem__": noise_from_430}),
     Fault("images as a folder lists them", BITS, {"files": as_listed}, base=Shuffled, row=WRITTEN),
     Fault("targets as a folder lists them", BITS, {"place": labels_as_listed}, base=Shuffled, row=WRITTEN),

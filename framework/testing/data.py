@@ -39,6 +39,7 @@ from framework.testing.data_samples import (
     samples,
     trimmed,
 )
+from framework.testing.data_targets import belong
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import DataRow
 
@@ -60,6 +61,7 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "images are 0 to 1": (1e-6, _images),
             "angles are radians": (2 * math.pi, _radians),
             "no sample in two splits": (0.0, _disjoint),
+            "targets go with inputs": (0.0, lambda bench, worst: belong(bench.data, worst)),
             "same data, same bits": (0.0, _repeatable),
             "one by one or at once": (0.0, _fetching),
             "a batch is nobody else's": (0.0, _owned),

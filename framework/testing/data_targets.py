@@ -1,0 +1,86 @@
+"""Whether targets go with their inputs, where the one says something of the other: by nearest neighbours."""
+
+import torch
+from torch import Tensor
+
+from framework.data import Data
+from framework.datasets.fields import fetched
+from framework.testing.data_samples import batches, numbers, parts, trimmed
+from framework.testing.finding import SEED, Worst
+
+LEAST, MOST = 192, 960
+"""Samples of a split: of fewer nothing is said, of more the first are looked at."""
+BLOCK = 48
+NEIGHBOURS = 7
+SIZE = 64
+"""Numbers of an input, projected at random where there are more."""
+SURE, CHANCE = 0.2, 0.8
+"""Shares of the error of targets dealt at random: below the one inputs tell targets, above the other they do not."""
+
+
+def belong(data: Data, worst: Worst) -> None:
+    """No stretch of a split has targets that its inputs say nothing of, where those of most stretches are told by the
+    nearest other samples'; and no split's inputs tell the target of the sample before or after, but not their own."""
+    for name, split in parts(data).items():
+        asked = numbers(split)[:MOST]
+        worst.count(False, f"{name} has {len(asked)} samples")
+        if len(asked) < LEAST:
+            continue
+        inputs, targets = [], []
+        for part in batches(asked, [64]):
+            batch = fetched(split, part)
+            inputs.append(torch.stack([_numbers(one) for one in batch["input"]]))
+            targets.append(_targets(data, batch["target"]))
+        x, y = torch.cat(inputs), torch.cat(targets)
+        if x.shape[1] > SIZE:
+            generator = torch.Generator().manual_seed(SEED)
+            x = x @ torch.randn(x.shape[1], SIZE, dtype=x.dtype, generator=generator)
+        x = (x - x.mean(0)) / x.std(0).clamp(min=1e-12)
+        chance = 2 * y.var(0, correction=0).sum().item()  # of two that are dealt at random
+        if chance == 0:
+            continue
+        near = torch.cdist(x, x).fill_diagonal_(torch.inf).topk(NEIGHBOURS, largest=False).indices
+        share = _error(y, near) / chance
+        blocks = torch.stack([part.mean() for part in share.split(BLOCK)[: len(share) // BLOCK]])
+        if blocks.median() < SURE:
+            wrong = blocks > CHANCE
+            first = asked[BLOCK * int(wrong.double().argmax())]
+            worst.count(
+                wrong,
+                f"{name}: the inputs of {int(wrong.sum())} stretches of {BLOCK} samples, the first from {first} on, "
+                "tell nothing of their targets, where those of most others do",
+            )
+        elif share.mean() > CHANCE:
+            for step in (1, -1):
+                beside = (_error(y.roll(step, 0), near) / chance).mean().item()
+                worst.count(
+                    beside < SURE,
+                    f"{name}: inputs tell the targets of the samples {step:+d} away, not their own",
+                )
+
+
+def _error(targets: Tensor, near: Tensor) -> Tensor:
+    """Squared, of the median of the neighbours' targets."""
+    return 2 * (targets - targets[near].median(1).values).square().sum(-1)
+
+
+def _numbers(inputs: Tensor) -> Tensor:
+    """Of one sample: of a cloud, whose points have no order, its moments."""
+    inputs = inputs.double()
+    if inputs.dim() != 2:
+        return inputs.reshape(-1)
+    points = trimmed(inputs)
+    centred = points - points.mean(0)
+    return torch.cat([points.mean(0), (centred.T @ centred).reshape(-1) / len(points), centred.abs().amax(0)])
+
+
+def _targets(data: Data, targets: Tensor) -> Tensor:
+    """As numbers of which differences mean something."""
+    if data.target.kind == "class":
+        return torch.nn.functional.one_hot(targets.long(), len(data.target.names)).double()
+    flat = targets.double().flatten(1)
+    if data.target.kind == "angle":
+        return torch.cat([flat.sin(), flat.cos()], 1)
+    # at most three deviations, so that a few far ones do not say it all
+    spread = flat.std(0).clamp(min=1e-12)
+    return ((flat - flat.median(0).values) / spread).clamp(-3, 3)
