@@ -5,6 +5,7 @@ makes other numbers of it silently.
 """
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from framework.datasets.csv_columns import (
 )
 from framework.errors import DataError
 from framework.geometry import meshes
+from framework.storage import text
 from plugins.data.bodies import motion
 from plugins.data.cest.volumes import read_volume
 from plugins.data.head_pose import towncentre_labels
@@ -364,3 +366,21 @@ def test_words_with_figures_are_left_out_and_not_taken_for_numbers(tmp_path: Pat
     chosen = numeric_columns(read_columns(file, Writing()), (), "data.columns")
     assert chosen.names == ("b",)
     assert chosen.left_out["a"] in ("words", "empty")
+
+
+LONG = (
+    "1,2 " + " " * 300_000 + "x 1,3", "1" * 300_000, "1.#" * 100_000, "1//2" * 100_000, '"' * 300_001, "1,23" * 100_000,
+    "1\N{NO-BREAK SPACE}123" * 50_000, "v 1 2 3 \\\n" * 50_000,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(LONG)))
+def test_long_texts_take_linear_time(tmp_path: Path, number: int) -> None:
+    """A pattern of quadratic time would take minutes."""
+    start = time.process_time()
+    for name, read in (("one.xyz", vertex), ("one.obj", vertex), ("one.off", vertex), ("one.csv", cell)):
+        (tmp_path / name).write_text(f"a;b\n{LONG[number]}", encoding="utf-8")
+        with pytest.raises(DataError):
+            read(tmp_path / name)
+    text.mended(LONG[number])
+    assert time.process_time() - start < 10

@@ -41,6 +41,8 @@ INDEX = re.compile(
 )
 """What pandas, R and databases call a column that numbers the rows."""
 
+MOST_LOOKED_AT = 2000
+"""Cells of a column of words, evenly spaced, of which each is asked whether it would be a number after mending."""
 MOST_TOLD = 12
 """Columns that a sentence lists."""
 Separator = Literal["comma", "semicolon", "tab", "bar", "space", ",", ";", "\t", "|", " "]
@@ -405,6 +407,7 @@ def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
     ]
     if not filled:
         return "empty"
+    filled = filled[:: -(-len(filled) // MOST_LOOKED_AT)]
     plain = sum(number(cell, how) is not None for cell, _ in filled)
     found = [(cell, line, _mended(cell, how)) for cell, line in filled if number(cell, how) is None]
     units = Counter(mend.unit for _, _, mend in found if mend is not None and mend.unit)
@@ -417,7 +420,7 @@ def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
             f"{columns.file} line {line}, column {quoted(name)}: {quoted(cell)} is a number {mend.what}. "
             f"{remedy(mend, columns.writing)} Or say with {asked} which columns to read, without this one."
         )
-    return f"words, {plain} of {len(filled)} cells are numbers" if plain else "words"
+    return f"words; {plain / len(filled):.0%} of the cells are numbers" if plain else "words"
 
 
 def _mended(cell: str, writing: Writing) -> text.Mended | None:
@@ -446,8 +449,9 @@ def remedy(mend: text.Mended, writing: Writing | None) -> str:
 
 def is_boolean(columns: Columns, name: str) -> bool:
     """Whether a column says TRUE or FALSE, in any letters, wherever it says something."""
-    said = {cell.lower() for cell in columns.cells[name]} - columns.how.missing
-    return bool(said) and said <= BOOLEANS.keys()
+    cells, missing = columns.cells[name], columns.how.missing
+    first = next((cell for cell in cells if cell.lower() not in missing), "")
+    return first.lower() in BOOLEANS and {cell.lower() for cell in cells} - missing <= BOOLEANS.keys()
 
 
 def mostly_numbers(columns: Columns, name: str) -> bool:
@@ -456,13 +460,18 @@ def mostly_numbers(columns: Columns, name: str) -> bool:
     if _all_finite(columns.cells[name], how) is not None:
         return True
     filled = [cell for cell in columns.cells[name] if cell.lower() not in how.missing]
-    return 2 * sum(number(cell, how) is not None for cell in filled) > len(filled)
+    return 2 * sum(_said(cell, how) is not None for cell in filled) > len(filled)
 
 
 def number(cell: str, writing: Writing = PLAIN) -> float | None:
     """What a cell says in figures, perhaps infinite; NaN where it says that there is none; None where it is a word."""
     if cell.lower() in writing.missing:
         return math.nan
+    return _said(cell, writing)
+
+
+def _said(cell: str, writing: Writing) -> float | None:
+    """The number of a cell that is not missing."""
     found = text.value(cell if writing.plain else writing.standard(cell))
     return None if found is not None and math.isnan(found) else found
 

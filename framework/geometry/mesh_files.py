@@ -363,7 +363,7 @@ def _as_comment(found: re.Match[bytes]) -> bytes:
 
 
 DECIMAL_COMMA = re.compile(rb"\d,\d")
-OTHER_SEPARATOR = re.compile(rb"[\d.][ \t]*[ \t;][ \t]*[-+.\d]")
+OTHER_SEPARATOR = re.compile(rb"[\d.](?:[ \t]++;?+|;)[ \t]*+[-+.\d]")  # possessive: in linear time
 QUOTED_COMMA = re.compile(rb"\"[-+]?\d*,\d")
 NO_NUMBER = re.compile(rb"[,;][ \t]*[,;]")
 

@@ -22,6 +22,8 @@ WIDE = (
     (codecs.BOM_UTF16_LE, "UTF-16"),
     (codecs.BOM_UTF16_BE, "UTF-16"),
 )
+LONGEST = 64
+"""Letters of what may be a number, written otherwise; patterns take more than linear time."""
 LOOKED_AT = 64
 """Bytes at the beginning by which UTF-16 without a mark is known: every second one is 0."""
 MINUS = str.maketrans(
@@ -31,6 +33,7 @@ MINUS = str.maketrans(
 NOT_FINITE = re.compile(r"[+-]?1\.#([A-Za-z]+)\d*")
 """How Microsoft's C library writes NaN and infinity: 1.#INF, -1.#IND, 1.#QNAN, cut after some letters."""
 FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)|([+-]?\d+)[dD]([+-]\d+)")
+FIGURE = re.compile(r"\d")
 FIGURES = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 BLANKS = " \N{NO-BREAK SPACE}\N{THIN SPACE}\N{NARROW NO-BREAK SPACE}"
 INVISIBLE = "\ufeff\u200b\u200c\u200d\u200e\u200f\u2060"
@@ -124,7 +127,8 @@ def value(word: str) -> float | None:
     try:
         return float(word)
     except ValueError:
-        pass
+        if not FIGURE.search(word):
+            return None
     word = trimmed(word).translate(MINUS)
     found = NOT_FINITE.fullmatch(word)
     if found:
@@ -189,7 +193,7 @@ UNIT = re.compile(
 def mended(word: str) -> Mended | None:
     """Return how a word that is no number could become one: decimal commas, thousands separators, units and others."""
     word = trimmed(word).translate(MINUS)
-    if not any(letter.isdigit() for letter in word):
+    if len(word) > LONGEST or not any(letter.isdigit() for letter in word):
         return None
     sign, figures = (word[0], word[1:]) if word[:1] in "+-" else ("", word)
     found = _separated(sign, figures)
