@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,7 +18,7 @@ from framework.renderer import Wrap
 from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
 from framework.storage.reading import guarded
 from plugins.renderer.rasterizer.gltf_document import WIDTHS, Document, opened, whole
-from plugins.renderer.rasterizer.parts import Part, Subject, subject
+from plugins.renderer.rasterizer.parts import Part, Subject, drawn_without, subject
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
@@ -53,6 +54,15 @@ def read(file: Path) -> Subject:
                 f"{file}: it needs {shown(', '.join(missing))}, which is not understood; save it without, e.g. with "
                 "neither compressed geometry nor compressed textures."
             )
+        unknown = [
+            one for one in document.content.get("extensionsUsed", ()) if not one.startswith(UNDERSTOOD)
+        ]
+        if unknown:
+            document.notes.append(
+                f"it uses {shown(', '.join(unknown))}, which is not understood: what that adds is left out."
+            )
+        if len(document.content.get("scenes", ())) > 1:
+            document.notes.append("its other scenes are left out.")
         try:
             above = _above(document)
             if _count(document, above) > MOST_PARTS:
@@ -185,6 +195,12 @@ def _skinned(
 
 def _part(document: Document, primitive: dict[str, Any]) -> Part:
     attributes = primitive["attributes"]
+    described = document.item("accessors", attributes["POSITION"])
+    if "extensions" in primitive and not {"bufferView", "sparse"} & described.keys():
+        raise DataError(
+            f"its vertices are stored by {shown(', '.join(primitive['extensions']))} alone, which is not understood; "
+            "wanted them without compression. Save it so."
+        )
     vertices = document.numbers(attributes["POSITION"], 3).astype(np.float64)
     count = len(vertices)
     order = np.arange(count)
@@ -228,6 +244,8 @@ def _material(
     if "material" not in primitive:
         return None, None
     material = document.item("materials", primitive["material"])
+    if material.get("alphaMode", "OPAQUE") != "OPAQUE":
+        document.notes.append("its transparency is left out.")
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is not None:
         factor, texture = glossy.get("diffuseFactor"), glossy.get("diffuseTexture")
@@ -257,11 +275,14 @@ def _textured(document: Document, part: Part, attributes: dict[str, Any], descri
         uv = (uv * np.array(moved.get("scale", (1, 1)), np.float64)) @ turned.T
         uv = uv + np.array(moved.get("offset", (0, 0)), np.float64)
     texture = document.item("textures", described["index"])
+    image = _image(document, texture)
+    if image is None:
+        return part
     sampler = document.item("samplers", texture["sampler"]) if "sampler" in texture else {}
     wraps = WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]
     return replace(
         part,
-        image=_image(document, texture),
+        image=image,
         uv=np.stack([uv[:, 0], 1 - uv[:, 1]], 1),  # glTF's v runs downwards
         wraps=wraps,
         smooth=sampler.get("magFilter") != NEAREST,
@@ -270,12 +291,23 @@ def _textured(document: Document, part: Part, attributes: dict[str, Any], descri
 
 def _image(document: Document, texture: dict[str, Any]):
     number = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
+    if number is None:
+        document.notes.append("a texture is stored by an extension that is not understood: drawn without.")
+        return None
     image = document.item("images", number)
     known = document.pictures.known(number)
     if known is not None:
         return known
-    if "uri" in image:
-        content, name = document.referred(image["uri"]), shown(image["uri"], 60)
+    uri = image.get("uri")
+    if uri is not None and not uri.startswith("data:"):
+        file = drawn_without(
+            document.folder, unquote(uri, errors="surrogateescape"), "texture is", document.notes
+        )
+        if file is None:
+            return None
+        content, name = document.of_file(file), shown(uri, 60)
+    elif uri is not None:
+        content, name = document.referred(uri), shown(uri, 60)
     else:
         content, name = bytes(document.view(image["bufferView"])[0]), f"{number}"
     return document.pictures.decode(number, content, name)

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from framework.errors import quoted
+from framework.errors import quoted, shown
 from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
 from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer.parts import Pictures, beside
@@ -54,7 +54,13 @@ class Document:
             elif number == 0 and self.binary is not None:
                 self.buffers[number] = self.binary
             else:
-                raise ValueError(f"its buffer {number} is nowhere")
+                extensions = ", ".join(described.get("extensions", {}))
+                why = (
+                    f", but stored by {shown(extensions)}, which is not understood; save it without"
+                    if extensions
+                    else ""
+                )
+                raise ValueError(f"its buffer {number} is nowhere{why}")
         return self.buffers[number]
 
     def referred(self, address: str) -> bytes:
@@ -64,7 +70,10 @@ class Document:
             if not head.endswith(";base64"):
                 raise ValueError(f"it holds data as {quoted(head[-20:])}; wanted base64")
             return base64.b64decode(body, validate=True)
-        file = beside(self.folder, unquote(address))
+        return self.of_file(beside(self.folder, unquote(address, errors="surrogateescape")))
+
+    def of_file(self, file: Path) -> bytes:
+        """What a file beside this one holds."""
         with guarded(file, "a part of a glTF file"):
             found = read_bytes(file)
         self.size += len(found)

@@ -1,18 +1,19 @@
 """Reads what Wavefront OBJ files say of colours: places in textures, and the materials of an MTL file beside them."""
 
 from dataclasses import dataclass, field
+from os import fsdecode
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from framework.errors import DataError, quoted, shown
+from framework.errors import DataError, quoted
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import continued, placed, text_lines
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_MATERIALS
 from framework.storage.reading import guarded, read_bytes
-from plugins.renderer.rasterizer.parts import Part, Pictures, beside
+from plugins.renderer.rasterizer.parts import Part, Pictures, drawn_without
 
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
 """Options of a texture that do not change where it lies or what it repeats, and how many words follow each."""
@@ -24,12 +25,14 @@ NAMES = (b"usemtl", b"mtllib", b"newmtl", b"map_Kd")
 class Material:
     """Attributes:
     color: linear; None where none is said. What is written is taken for light, as Blender writes it.
-    texture: a file beside the MTL file.
+    texture: what the MTL file says of a file beside it.
+    library: the MTL file.
     wrap: beyond the texture's edges.
     """
 
     color: Float[np.ndarray, "3"] | None = None
-    texture: Path | None = None
+    texture: str = ""
+    library: Path = Path()
     wrap: Wrap = "repeat"
 
 
@@ -54,17 +57,15 @@ def parts(file: Path, content: bytes, mesh: Part, pictures: Pictures, notes: lis
     """The mesh of an OBJ file, whose content was read, cut by its materials.
 
     Raises:
-        DataError: a file that it names lies elsewhere, or is damaged. One that is missing is noted alone.
+        DataError: a file that it names is damaged. One that is missing, or lies elsewhere, is noted alone.
         ValueError: a face names a place that is not there.
     """
     corners = _corners(content)
     known: dict[str, Material] = {}
     for name in corners.libraries:
-        library = beside(file.parent, name)
-        if library.exists():
+        library = drawn_without(file.parent, name, "materials are", notes)
+        if library is not None:
             known |= _materials(library)
-        else:
-            notes.append(f"its materials {shown(name)} are not beside it: drawn without.")
     names = list(dict.fromkeys(corners.materials))
     if len(names) > MOST_MATERIALS:
         raise DataError(f"it has {len(names)} materials; wanted at most {MOST_MATERIALS}.")
@@ -93,21 +94,27 @@ def _part(
     if material.color is not None:
         colors = np.tile(material.color, (len(used), 1)) * (1 if colors is None else colors)
     places = corners.rows[rows]
-    if material.texture is None or not material.texture.is_file():
-        if material.texture is not None:
-            notes.append(f"its texture {shown(material.texture.name)} is not beside it: drawn without.")
+    texture = _texture_of(material, notes)
+    if texture is None:
         return Part(vertices, faces, colors)
     if (places < 0).any():
         notes.append("a part with a texture says no places in it, and is drawn without.")
         return Part(vertices, faces, colors)
-    image = pictures.known(material.texture)
+    image = pictures.known(texture)
     if image is None:
-        with guarded(material.texture, "a texture"):
-            content = read_bytes(material.texture)
-        image = pictures.decode(material.texture, content, str(material.texture))
+        with guarded(texture, "a texture"):
+            content = read_bytes(texture)
+        image = pictures.decode(texture, content, str(texture))
     own, places = np.unique(places, return_inverse=True)
     wraps = material.wrap, material.wrap
     return Part(vertices, faces, colors, image, corners.uv[own], places.reshape(-1, 3), wraps)
+
+
+def _texture_of(material: Material, notes: list[str]) -> Path | None:
+    if not material.texture:
+        return None
+    with guarded(material.library, "an MTL file"):
+        return drawn_without(material.library.parent, material.texture, "texture is", notes)
 
 
 def _corners(content: bytes) -> Corners:
@@ -125,9 +132,9 @@ def _corners(content: bytes) -> Corners:
             before.append(len(points))
             materials.append(material)
         elif key == b"usemtl":
-            material = said.decode("utf-8", "replace")
+            material = fsdecode(said)
         elif key == b"mtllib":
-            libraries.append(said.decode("utf-8", "replace"))
+            libraries.append(fsdecode(said))
     uv = mesh_files.rows(points, "place in a texture", 2, placed(content, names=NAMES, key=b"vt"))
     places = mesh_files.numbers(words, np.int64)
     sizes = np.array(counts, np.int64)
@@ -158,7 +165,7 @@ def _materials(library: Path) -> dict[str, Material]:
         for number, line in enumerate(text_lines(content, names=NAMES)):
             key, said = _statement(line)
             if key == b"newmtl":
-                current = found.setdefault(said.decode("utf-8", "replace"), Material())
+                current = found.setdefault(fsdecode(said), Material())
             elif key == b"Kd":
                 color = mesh_files.rows([said], "colour Kd", 3, placed(content, names=NAMES, first=number))[0]
                 if not np.isfinite(color).all():
@@ -167,11 +174,11 @@ def _materials(library: Path) -> dict[str, Material]:
                     )
                 current.color = color
             elif key == b"map_Kd":
-                _texture(current, said.decode("utf-8", "replace").split(" "), library.parent)
+                _texture(current, fsdecode(said).split(" "), library)
     return found
 
 
-def _texture(material: Material, words: list[str], folder: Path) -> None:
+def _texture(material: Material, words: list[str], library: Path) -> None:
     while words and words[0].startswith("-"):
         if words[0] == "-clamp" and len(words) > 1:
             material.wrap = "clamp" if words[1] == "on" else "repeat"
@@ -183,4 +190,4 @@ def _texture(material: Material, words: list[str], folder: Path) -> None:
                 f"its texture has the option {quoted(words[0])}, which is not understood; save it without"
             )
     if words:
-        material.texture = beside(folder, " ".join(words).strip())
+        material.texture, material.library = " ".join(words).strip(), library

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from os.path import normpath
 from pathlib import Path
 from typing import Literal
 
@@ -198,3 +199,31 @@ def beside(folder: Path, name: str) -> Path:
             f"it names {quoted(name)}; wanted a file in its own folder, since others are not read. Copy it there."
         )
     return folder / plain
+
+
+def drawn_without(folder: Path, name: str, what: str, notes: list[str]) -> Path | None:
+    """The file that another one in `folder` names; None where it is missing or lies elsewhere, which is noted.
+
+    Of a place elsewhere, as programs write the folders of their own machine, the file of the same name beside is taken.
+
+    Args:
+        what: the file holds: "texture is".
+
+    Raises:
+        DataError: a link leads elsewhere.
+    """
+    plain = name.replace("\\", "/")
+    if ":" in plain or plain.startswith("/") or normpath(plain).startswith(".."):
+        last = plain.rpartition("/")[2]
+        file = beside(folder, last) if last.strip(".") else None
+        if file is None or not file.exists():
+            notes.append(f"its {what} in another folder, {shown(name)}, which is not read: drawn without.")
+            return None
+        notes.append(f"its {what} in another folder, {shown(name)}; {shown(file.name)} beside it is read.")
+        return file
+    file = beside(folder, name)
+    if file.exists():  # what is no regular file is refused where it is read
+        return file
+    thing, _, verb = what.rpartition(" ")
+    notes.append(f"its {thing} {shown(name)} {verb} not beside it: drawn without.")
+    return None

@@ -1,19 +1,20 @@
 """Reads a user's scene from a file: surfaces, colours and textures."""
 
 import re
+from os import fsdecode
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from framework.errors import DataError, did_you_mean, shown
+from framework.errors import DataError, did_you_mean
 from framework.geometry import meshes
 from framework.geometry.light import linear
 from framework.geometry.mesh_files import COLOURS
 from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer import gltf, obj_materials
-from plugins.renderer.rasterizer.parts import Axis, Part, Pictures, Subject, beside, subject
+from plugins.renderer.rasterizer.parts import Axis, Part, Pictures, Subject, drawn_without, subject
 
 UPWARDS: dict[str, Axis] = {".glb": "y", ".gltf": "y", ".obj": "y", ".off": "z", ".ply": "y", ".stl": "z"}
 """What can be read, by the end of the file's name, and the axis that most such files have upwards."""
@@ -67,14 +68,13 @@ def _textured(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) -> Pa
     named = re.search(rb"[\r\n]comment TextureFile[ \t]+([^\r\n]+)", head)
     if named is None:
         return part
-    name = named[1].decode("utf-8", "replace").strip()
+    name = fsdecode(named[1].strip())
     places = next((pair for pair in PLACES if set(pair) <= set(mesh.columns)), None)
     if places is None:
         notes.append("its texture lies on faces and not on vertices: drawn without; save it as OBJ or GLB.")
         return part
-    texture = beside(file.parent, name)
-    if not texture.is_file():
-        notes.append(f"its texture {shown(name)} is not beside it: drawn without.")
+    texture = drawn_without(file.parent, name, "texture is", notes)
+    if texture is None:
         return part
     with guarded(texture, "a texture"):
         image = Pictures().decode(name, read_bytes(texture), str(texture))

@@ -394,17 +394,10 @@ def test_ply_colours_are_light_and_its_texture_is_found(tmp_path: Path, binary: 
     np.testing.assert_allclose(texel(scene, 1, 2), light(FOUR[0, 0]), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "name", ["../one.png", "/etc/hostname", "http://localhost/x.png", "sub/../../one.png", "link"]
-)
-def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> None:
-    folder = tmp_path / "inner"
-    (folder / "sub").mkdir(parents=True)
-    (tmp_path / "one.png").write_bytes(png(FOUR))
-    (folder / "link").symlink_to(tmp_path / "one.png")
+def naming(folder: Path, name: str) -> list[Path]:
+    """A scene of each format whose texture has this name."""
     content, arrays = part()
     content["images"] = [{"uri": name}]
-    made = [written(folder, content, arrays)]
     (folder / "one.obj").write_bytes(OBJ)
     (folder / "one.mtl").write_bytes(b"newmtl red\nmap_Kd " + name.encode())
     head = f"ply\nformat ascii 1.0\ncomment TextureFile {name}\nelement vertex 3\n"
@@ -413,12 +406,112 @@ def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> Non
         "property list uchar int vertex_indices\nend_header\n" + "0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
     )
     (folder / "one.ply").write_text(head)
-    for file in (*made, folder / "one.obj", folder / "one.ply"):
-        with pytest.raises(DataError, match=r"inner.*it names .*; wanted a file in its own folder"):
+    made = [written(folder, content, arrays, end) for end in ("one.glb", "one.gltf")]
+    return [*made, folder / "one.obj", folder / "one.ply"]
+
+
+def test_names_that_are_not_utf8_lead_to_their_files(tmp_path: Path) -> None:
+    (tmp_path / os.fsdecode(b"caf\xe9.png")).write_bytes(png(FOUR))
+    for file in naming(tmp_path, "caf%E9.png"):
+        if file.suffix in (".obj", ".ply"):
+            named = (tmp_path / "one.mtl") if file.suffix == ".obj" else file
+            named.write_bytes(named.read_bytes().replace(b"caf%E9", b"caf\xe9"))
+        found = read(file)
+        assert found.scene.texture is not None and not found.notes
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../one.png", "/etc/hostname", "http://localhost/x.png", "sub/../../one.png", "..", "C:\\"],
+)
+def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "inner"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "one.png").write_bytes(png(FOUR))
+    (folder / "link").symlink_to(tmp_path / "one.png")
+    for file in naming(folder, name):
+        found = read(file)
+        assert found.scene.texture is None
+        assert found.notes == (
+            f"its texture is in another folder, {name}, which is not read: drawn without.",
+        )
+    for file in naming(folder, "link"):
+        with pytest.raises(DataError, match=r"inner.*it names 'link'; wanted a file in its own folder"):
             read(file)
-    (folder / "sub" / "one.png").write_bytes(png(FOUR))
-    content["images"] = [{"uri": "sub/one.png"}]
-    assert read(written(folder, content, arrays)).scene.texture is not None
+    buffers, arrays = part()
+    file = written(folder, buffers, arrays, "one.gltf", lambda whole: whole["buffers"][0].update(uri=name))
+    with pytest.raises(DataError, match=r"inner.*it names .*; wanted a file in its own folder"):
+        read(file)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "C:\\Users\\me\\t.png",
+            "C:/t.png",
+            "/home/me/t.png",
+            "../t.png",
+            "..\\maps\\t.png",
+            "file:///D:/t.png",
+        )
+    ],
+)
+def test_of_a_place_elsewhere_the_file_beside_is_taken(tmp_path: Path, name: str) -> None:
+    (tmp_path / "t.png").write_bytes(png(FOUR))
+    (tmp_path / "one.mtl").write_bytes(b"newmtl red\nmap_Kd t.png")
+    for file in naming(tmp_path, name):
+        found = read(file)
+        assert found.scene.texture is not None
+        assert found.notes == (f"its texture is in another folder, {name}; t.png beside it is read.",)
+    (tmp_path / "t.png").rename(tmp_path / "lib.mtl")
+    library = f"mtllib {name.replace('t.png', 'lib.mtl')}\n".encode()
+    (tmp_path / "one.obj").write_bytes(library + OBJ.partition(b"\n")[2])
+    (tmp_path / "lib.mtl").write_bytes(b"newmtl red\nKd 1 0 0\n")
+    found = read(tmp_path / "one.obj")
+    assert found.notes == (
+        f"its materials are in another folder, {name.replace('t.png', 'lib.mtl')}; lib.mtl beside it is read.",
+    )
+
+
+def test_a_missing_texture_is_noted_alike_by_every_format(tmp_path: Path) -> None:
+    for file in naming(tmp_path, "sub/gone.png"):
+        found = read(file)
+        assert found.scene.texture is None
+        assert found.notes == ("its texture sub/gone.png is not beside it: drawn without.",)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "gone.png").write_bytes(png(FOUR))
+    for file in naming(tmp_path, "sub/gone.png"):
+        found = read(file)
+        assert found.scene.texture is not None and not found.notes
+
+
+LEFT_OUT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "instances": (
+        lambda whole: whole.update(extensionsUsed=["EXT_mesh_gpu_instancing", "KHR_materials_ior"]),
+        "it uses EXT_mesh_gpu_instancing, which is not understood: what that adds is left out.",
+    ),
+    "a texture of an extension": (
+        lambda whole: whole.update(textures=[{"extensions": {"KHR_texture_basisu": {"source": 0}}}]),
+        "a texture is stored by an extension that is not understood: drawn without.",
+    ),
+    "scenes": (
+        lambda whole: whole.update(scenes=[{"nodes": [0]}, {"nodes": []}]),
+        "its other scenes are left out.",
+    ),
+    "alpha": (
+        lambda whole: whole["materials"][0].update(alphaMode="BLEND"),
+        "its transparency is left out.",
+    ),
+    "blend shapes": (lambda whole: whole["meshes"][0].update(weights=[1]), "its blend shapes are left out."),
+}
+
+
+@pytest.mark.parametrize("what", LEFT_OUT)
+def test_what_a_scene_leaves_out_is_said(tmp_path: Path, what: str) -> None:
+    change, note = LEFT_OUT[what]
+    assert not read(written(tmp_path, *part())).notes
+    assert read(written(tmp_path, *part(), change=change)).notes == (note,)
 
 
 def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -448,6 +541,20 @@ def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.Monk
         (lambda whole: whole["accessors"][0].pop("count"), "'count' is missing"),
         (lambda whole: whole["bufferViews"][0].update(byteLength=10**9), "it is cut short"),
         (lambda whole: whole["textures"][0].update(source=-1), "it names number -1 of its images"),
+        (
+            lambda whole: (
+                whole["accessors"][0].pop("bufferView"),
+                whole["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}),
+            ),
+            "its vertices are stored by KHR_draco_mesh_compression alone",
+        ),
+        (
+            lambda whole: (
+                whole["buffers"].append({"byteLength": 48, "extensions": {"EXT_meshopt_compression": {}}}),
+                whole["bufferViews"][0].update(buffer=1),
+            ),
+            "its buffer 1 is nowhere, but stored by EXT_meshopt_compression",
+        ),
     ],
 )
 def test_a_bad_gltf_gets_its_sentence(
