@@ -209,10 +209,6 @@ def in_radians(metric: Kept, seen: Tensor) -> Tensor:
     return Kept.spread(metric, seen).deg2rad()
 
 
-def of_one_is_0(metric: Kept, seen: Tensor) -> Tensor:
-    return seen.std(correction=0) / len(seen) ** 0.5 if len(seen) else nothing_of(seen)
-
-
 def squares_error(metric: Kept) -> dict[str, Tensor]:
     seen = metric.all()
     return {"root": seen.mean().sqrt(), "root_sem": metric.spread(seen)}
@@ -320,7 +316,6 @@ ALL_FAULTS = (
     Fault("± is half of an interval", PLACE, Kept, {"spread": half_interval}, SEM),
     Fault("± is divided by n, not by its root", HEIGHT, Kept, {"spread": divided_by_count}, SEM),
     Fault("± of degrees in radians", ONE, Turned, {"spread": in_radians}, SEM),
-    Fault("± of one sample is 0", HEIGHT, Kept, {"spread": of_one_is_0}, SEM),
     Fault("± of a root is that of the square", PLACE, Rooted, {"compute": squares_error}, SEM),
     Fault("± counts every angle as a sample", THREE, Turned, {"each": every_number}, SEM),
     Fault("angles are not wrapped", ONE, Turned, {"each": no_wrap}, TURNS),

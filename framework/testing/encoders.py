@@ -118,7 +118,7 @@ def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
 
 def _every_part(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Another channel, or another quarter of the image, gives other features, with weights as after some training."""
-    encoder, batch = make(), inputs(2)
+    encoder, batch = make(), inputs(4)
     moved_a_little(encoder)
     channels, height, width = batch.shape[1:]
     whole = slice(None)
