@@ -266,6 +266,10 @@ def read_columns(
         names = next(reader, [])
         if re.fullmatch(r"sep=.?", "".join(names).strip()) and len(names) < 3:
             names = next(reader, [])
+        if len(names) > MOST_COLUMNS:
+            raise DataError(
+                f"{file} has {len(names)} columns; wanted at most {MOST_COLUMNS}. Leave some out."
+            )
         header = [text.column_name(cell) for cell in names]
         _check_header(file, header)
         columns: list[list[str]] = [[] for _ in header]  # a list for each row would take most of the memory
@@ -549,8 +553,6 @@ def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndar
 
 
 def _check_header(file: Path, header: Sequence[str]) -> None:
-    if len(header) > MOST_COLUMNS:
-        raise DataError(f"{file} has {len(header)} columns; wanted at most {MOST_COLUMNS}. Leave some out.")
     if not any(header):
         raise DataError(f"{file} is empty or begins with a blank line; wanted names of columns. Write them.")
     if all(name and text.value(name) is not None for name in header):
