@@ -20,14 +20,13 @@ from framework.datasets.png import png
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
-from framework.errors import DataError
 from framework.evaluation.promises import ends, promised, require_interval, require_promised
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
 from framework.prediction import Prediction, answers
 from framework.runs.run import opened
 from framework.runs.session import for_trained
-from framework.runs.user_files import UNREADABLE, to_read
+from framework.runs.user_files import UNREADABLE, files_in, say_left_out, to_read
 from framework.storage.names import spelled
 from framework.target import Target
 from framework.training.batches import told
@@ -46,8 +45,9 @@ class PredictOptions(Options):
 def run(config: Config) -> None:
     """Write predictions.csv into the run folder."""
     options = config.options(PredictOptions)
-    files = _files(Path(options.files).expanduser()) if options.files else []
+    files, folders = files_in(Path(options.files).expanduser()) if options.files else ([], [])
     session = for_trained(config, prepare=not files)
+    say_left_out(session.console, "folders", "not looked into", folders)
     if options.interval:
         require_interval(session.target, options.interval, by="mode.interval")
     bad: list[Path] = []
@@ -79,17 +79,6 @@ def run(config: Config) -> None:
             for written in _maps(session.data, files, mapped, run.folder / "maps"):
                 run.tracker.log_artifact(written, "maps")
             session.console.print(f"maps in {run.folder / 'maps'}", soft_wrap=True)
-
-
-def _files(path: Path) -> list[Path]:
-    if not path.exists():
-        raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
-    found = [path] if path.is_file() else sorted(item for item in path.iterdir() if item.is_file())
-    if not found:
-        raise DataError(
-            f"mode.files={path} is an empty folder. Give a folder that holds the files to predict for."
-        )
-    return found
 
 
 @torch.no_grad()

@@ -15,6 +15,33 @@ UNREADABLE = "unreadable.txt"
 """The files that were left out, a line each."""
 
 
+def files_in(path: Path) -> tuple[list[Path], list[Path]]:
+    """Return the files to read, `path` itself or those in it, and the folders in it, which are not looked into.
+
+    Hidden ones are neither.
+
+    Raises:
+        DataError: there is no file.
+    """
+    if not path.exists():
+        raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
+    if path.is_file():
+        return [path], []
+    items = sorted(item for item in path.iterdir() if not item.name.startswith("."))
+    files = [item for item in items if item.is_file()]
+    folders = [item for item in items if item.is_dir()]
+    if not files:
+        held = (
+            f"holds folders alone ({_listed(folders)}), which are not looked into"
+            if folders
+            else "holds no file"
+        )
+        raise DataError(
+            f"mode.files={path} {held}. Give a folder that itself holds the files to predict for."
+        )
+    return files, folders
+
+
 def readable(data: Data, file: Path) -> bool:
     """Whether every sample of a file can be read."""
     try:
@@ -36,7 +63,7 @@ def to_read(
     later; where the data's `config` says to skip it, it is left out.
     """
     beside = {file for file in files if data.companions and file.name.lower().endswith(data.companions)}
-    _tell(console, "belong to others and are read with them", sorted(beside))
+    say_left_out(console, "files", "belong to others and are read with them", sorted(beside))
     files = [file for file in files if file not in beside]
     kinds: dict[str, list[Path]] = {}
     for file in files:
@@ -50,19 +77,29 @@ def to_read(
     kept = [
         file for file in files if not file.name.startswith(".") and (not read or file.suffix.lower() in read)
     ]
-    _tell(console, "ignored, being of another kind", [file for file in files if file not in set(kept)])
+    say_left_out(
+        console, "files", "ignored, being of another kind", [file for file in files if file not in set(kept)]
+    )
+    if not kept:
+        raise DataError(
+            f"None of {len(files) + len(beside)} files is one to predict for. Give files that the data set reads."
+        )
     if config.get("unreadable") != "skip" and not config.get("skip_unreadable"):
         return kept, []
     bad = [
         file for file in tracked(kept, "looking for damage", len(kept), "files") if not readable(data, file)
     ]
-    _tell(console, "left out, since they cannot be read", bad)
+    say_left_out(console, "files", "left out, since they cannot be read", bad)
     if len(bad) == len(kept):
         raise DataError(f"None of {len(kept)} files can be read. Give files that the data set reads.")
     return [file for file in kept if file not in set(bad)], bad
 
 
-def _tell(console: Console, what: str, files: Sequence[Path]) -> None:
-    if files:
-        named = ", ".join(spelled(file.name) for file in files[:10]) + (", …" if len(files) > 10 else "")
-        console.print(f"{len(files)} files {what}: {named}", soft_wrap=True, highlight=False)
+def say_left_out(console: Console, kind: str, why: str, paths: Sequence[Path]) -> None:
+    """Tell the user of files or folders that are not read, where there are any."""
+    if paths:
+        console.print(f"{len(paths)} {kind} {why}: {_listed(paths)}", soft_wrap=True, highlight=False)
+
+
+def _listed(paths: Sequence[Path]) -> str:
+    return ", ".join(spelled(path.name) for path in paths[:10]) + (", …" if len(paths) > 10 else "")
