@@ -128,10 +128,9 @@ class TableTennis(Data):
         self.target = Target("real", self.grid.names, tuple(train.mean(0).tolist()), tuple(scale.tolist()))
         self.synthetic = read_mark(root) is not None if root.is_dir() else False
         self.skipped = left_out
-        first = listed(root)[0]
-        others = other_columns(first, self.writing)
+        others = shown(", ".join(self._others))
         said = (
-            (others, f"left out: the columns {shown(', '.join(others))} of {first.name}"),
+            (others, f"left out: the columns {others}"),
             (self.repeated, f"left out: {self.repeated} repeated flights"),
             (
                 self.short,
@@ -143,13 +142,16 @@ class TableTennis(Data):
 
     def _found(self, root: Path) -> tuple[list[Flight], int]:
         flights, left_out = [], 0
+        others: list[str] | None = None
         for file in listed(root):
             try:
                 flights += self._flights_of(file)
+                others = other_columns(file, self.writing) if others is None else others  # of the first alone
             except DataError:
                 if self.unreadable == "error":
                     raise
                 left_out += 1
+        self._others = others or []
         return flights, left_out
 
     def _flights_of(self, file: Path) -> list[Flight]:
