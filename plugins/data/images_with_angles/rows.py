@@ -14,7 +14,8 @@ def write(folder: Path, split: bool = False) -> Mapping[str, str]:
     for number in range(40):
         file = noise_image(folder / f"{number:03d}.png", number)
         part = ("train", "validation", "test")[number % 3]
-        lines.append(f"{file.name},{10 * number},{-number}" + f",{part}" * split)
+        pan = 10 * number if number >= 30 else number / 8  # which may be degrees or radians
+        lines.append(f"{file.name},{pan},{-number / 4}" + f",{part}" * split)
     (folder / "angles.csv").write_text("\n".join(lines), encoding="utf-8")
     return {"root": str(folder)}
 
