@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import integrate, special, stats
-from torch.distributions import Categorical, Independent, MultivariateNormal, Normal
+from torch.distributions import Categorical, Distribution, Independent, MultivariateNormal, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
@@ -246,6 +246,100 @@ def test_any_density_of_one_angle_is_normalised_on_a_grid(temperature):
     cumulative = integrate.cumulative_trapezoid((1 + np.cos(axis)) ** power / total, axis, initial=0)
     for row in range(3):
         assert stats.kstest(drawn[:, row], lambda x: np.interp(x, axis, cumulative)).pvalue > 1e-3
+
+
+class OneAngle(Distribution):
+    """A stranger's density of one angle, of which nothing is registered: Σ_k w_k of von Mises or cusped components."""
+
+    arg_constraints = {}  # noqa: RUF012 - as torch has it
+    support = circular
+
+    def __init__(self, place, concentration, weights, cusp, dtype):
+        self.place, self.concentration = torch.tensor(place).double(), torch.tensor(concentration).double()
+        self.log_weights = torch.tensor(weights).double().log_softmax(-1)
+        self.cusp, self.dtype = cusp, dtype
+        super().__init__(torch.Size((2,)), torch.Size((1,)), validate_args=False)
+
+    def log_prob(self, value):
+        apart = wrap(value.double() - self.place)  # (*sample, 2, K)
+        if self.cusp:  # exp(-κ d) on the circle
+            scale = torch.log(self.concentration / 2) - torch.log1p(-(-math.pi * self.concentration).exp())
+            parts = scale - self.concentration * apart.abs()
+        else:
+            norm = torch.special.i0e(self.concentration).log() + math.log(2 * math.pi)
+            parts = -2 * self.concentration * (apart / 2).sin().square() - norm
+        return torch.logsumexp(self.log_weights + parts, -1).to(self.dtype)
+
+    @property
+    def mode(self):
+        height = self.concentration.log() * (1.0 if self.cusp else 0.5)
+        highest = (self.log_weights + height).argmax()
+        return self.place[highest].expand(2, 1).to(self.dtype)
+
+    def sample(self, sample_shape=()):
+        return self.mode.expand(*sample_shape, 2, 1).clone()
+
+
+def quadrature(density, temperature):
+    """The distribution function of p^(1/T) and its entropy, float64 NumPy, on nodes about each peak."""
+    steps = np.concatenate([[0.0], np.logspace(-11, math.log10(math.pi), 60_001)])
+    steps = np.concatenate([-steps[:0:-1], steps])
+    nodes = [wrap(torch.tensor(float(place) + steps)) for place in density.place]
+    nodes = torch.cat([*nodes, torch.tensor([-math.pi, math.pi]).double()]).unique()
+    exact = OneAngle([0.0], [1.0], [0.0], density.cusp, torch.float64)
+    exact.__dict__.update(density.__dict__ | {"dtype": torch.float64})
+    log_power = exact.log_prob(nodes.reshape(-1, 1, 1).expand(-1, 2, 1))[:, 0].numpy() / temperature
+    nodes, top = nodes.numpy(), log_power.max()
+    height = np.exp(log_power - top)
+    total = integrate.trapezoid(height, nodes)
+    surprise = np.where(height > 0, height * (log_power - top), 0.0)
+    entropy = math.log(total) - integrate.trapezoid(surprise, nodes) / total
+    return nodes, integrate.cumulative_trapezoid(height / total, nodes, initial=0), entropy
+
+
+POWERS = {
+    **{f"concentration {kappa:g}": ([0.3], [kappa], [0.0], False) for kappa in (1e-3, 1.0, 30.0, 3e2, 1e3)},
+    **{f"concentration {kappa:g}": ([-3.1], [kappa], [0.0], False) for kappa in (9e3, 8e4, 1e6, 1e8, 1e12)},
+    "a low and a high peak": ([0.3, 2.5], [1e4, 1e4], [0.0, -4.0], False),
+    "sharp beside broad": ([-2.0, 1.0], [9e4, 2.0], [0.0, 1.0], False),
+    "sharp between the grid's angles": ([0.3, 2.0014], [1e4, 1e6], [2.5, 0.0], False),
+    "five": ([-3.0, -1.5, 0.0, 1.0, 2.2], [1e3, 1e4, 10.0, 1e5, 50.0], [0.0] * 5, False),
+    "a cusp": ([0.3], [5.0], [0.0], True),
+    "cusps": ([0.3, -2.0], [5.0, 40.0], [0.0, 0.0], True),
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", POWERS)
+@pytest.mark.parametrize("temperature", [0.4, 3.0])
+def test_draws_of_a_power_are_those_of_its_density(kind, dtype, temperature, monkeypatch):
+    """At equally spaced shares the draws are quantiles; their spread and entropy are those of quadrature."""
+    density = OneAngle(*POWERS[kind], dtype)
+    if dtype == torch.float32 and density.concentration.max() > 1e6:
+        pytest.skip("float32 shows no angle to a tenth of its standard deviation")
+    power = CircularPower(density, hot(temperature))
+    count = 20_000
+    shares = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    monkeypatch.setattr(torch, "rand", lambda *shape, **_: shares.unsqueeze(-1).expand(shape))
+    drawn = power.sample((count,))[..., 0]
+    assert drawn.dtype == dtype
+    nodes, cdf, entropy = quadrature(density, temperature)
+    found = np.sort(drawn[:, 1].double().numpy())
+    # the draws begin at the mode: in order of the angle they are turned by one constant
+    gap = (np.interp(found, nodes, cdf) - shares.numpy() + 0.5) % 1
+    assert np.ptp(gap) < (1e-3 if len(density.place) > 1 or dtype == torch.float32 else 1e-5)
+    wanted = np.interp(shares.numpy(), cdf, nodes)
+    for place in density.place.tolist():
+        near = [wrap(torch.as_tensor(each).double() - place).numpy() for each in (found, wanted)]
+        near = [each[np.abs(each) < 0.3] for each in near]
+        if len(near[1]) > 400:
+            assert len(near[0]) == pytest.approx(len(near[1]), abs=10)
+            assert near[0].var() == pytest.approx(
+                near[1].var(), rel=2e-3 if len(density.place) == 1 else 0.02
+            )
+    torch.testing.assert_close(power.entropy()[0].item(), entropy, rtol=0, atol=3e-4)
+    at = -power.log_prob(drawn.unsqueeze(-1))[:, 1].double().mean().item()
+    assert at == pytest.approx(entropy, abs=2e-3)
 
 
 class Narrow(Cardioid):
