@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
 WINDOW, SIGMA = 11, 1.5
 """Side and standard deviation of SSIM's Gaussian window, pixels (Wang et al. 2004, §III.C)."""
@@ -86,10 +86,18 @@ def ms_ssim(predicted: Image, true: Image, scales: int) -> Float[Tensor, ""]:
     factors: list[Tensor] = []
     for scale in range(scales):
         if scale:
-            one, other = avg_pool2d(one, 2), avg_pool2d(other, 2)
+            one, other = halved(one), halved(other)
         found = similarity(one, other)
         factors.append((found.whole if scale == scales - 1 else found.contrast).mean((-2, -1)).clamp(min=0))
     return (torch.stack(factors) ** weights[:, None]).prod(0).mean()
+
+
+def halved(planes: Float[Tensor, "number height width"]) -> Tensor:
+    """Means of 2 × 2 pixels. The last of an odd number of rows or columns is mirrored, as by the authors' code
+    (Wang, Simoncelli & Bovik 2003; `imfilter(..., 'symmetric')` with a window of 2 × 2, of which every second stays,
+    the first included: the window of an even size lies about its pixel and the next)."""
+    odd = planes.shape[-1] % 2, planes.shape[-2] % 2
+    return avg_pool2d(pad(planes, (0, odd[0], 0, odd[1]), mode="replicate"), 2)
 
 
 def least_side(scales: int) -> int:
