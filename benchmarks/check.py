@@ -1,8 +1,9 @@
 """What the contract of density heads is worth: python benchmarks/check.py [seeds, 50 by default] [more]
 
-Finds the planted faults of tests/planted_faults.py, and counts false alarms: every row of every head that is shipped,
-over seeds of everything that is drawn. Writes check.md beside this file. With `more` it goes on where that file ends,
-which is fair as long as the code is the same.
+Finds the planted faults of tests/planted_faults.py and tests/planted_questions.py, and counts false alarms: every row
+of every head that is shipped, and the right heads of tests/right_heads.py, over seeds of everything that is drawn.
+Writes check.md beside this file. With `more` it goes on where that file ends, which is fair as long as the code is the
+same.
 """
 
 import re
@@ -18,6 +19,8 @@ from framework.configuration.registry import installed
 from framework.testing import finding
 from framework.testing.contract import contract
 from tests.planted_faults import ALL_FAULTS
+from tests.planted_questions import FURTHER_FAULTS
+from tests.right_heads import HEADS, right_findings
 
 PAGE = Path(__file__).with_suffix(".md")
 
@@ -25,7 +28,7 @@ PAGE = Path(__file__).with_suffix(".md")
 def faults() -> list[str]:
     """A line of the table for each planted fault."""
     lines = []
-    for fault in ALL_FAULTS:
+    for fault in (*ALL_FAULTS, *FURTHER_FAULTS):
         failed = list(dict.fromkeys(one.name for one in fault.findings() if not one.holds))
         lines.append(
             f"| {fault.name} | {len(fault.target.names)} {fault.target.kind} | {', '.join(failed) or '**missed**'} |"
@@ -35,7 +38,7 @@ def faults() -> list[str]:
 
 
 def alarms(seed: int) -> list[str]:
-    """What fails of the shipped rows with this seed."""
+    """What fails of the shipped rows and of the right heads of others with this seed."""
     before = finding.SEED
     for module in list(sys.modules.values()):  # whoever imported it has a copy
         if getattr(module, "SEED", None) == before and module.__name__.startswith(
@@ -47,11 +50,16 @@ def alarms(seed: int) -> list[str]:
         whole = contract("density_head", name)
         for row in whole.rows:
             failed += [f"{name}, {row.name}: {one}" for one in whole.findings(row) if not one.holds]
+    for name, (_, targets) in HEADS.items():
+        for target in targets:
+            what = f"{name} of somebody else, {target.told}"
+            failed += [f"{what}: {one}" for one in right_findings(name, target) if not one.holds]
     return failed
 
 
 def write(lines: list[str], seeds: int, failed: dict[str, list[int]], minutes: float) -> None:
     rows = sum(len(contract("density_head", name).rows) for name in installed("density_head"))
+    others = sum(len(targets) for _, targets in HEADS.values())
     told = [f"- seeds {', '.join(map(str, at))}: {what}" for what, at in failed.items()]
     found = sum("**missed**" not in line for line in lines)
     text = f"""# What `mode=check` finds in density heads
@@ -65,7 +73,8 @@ thing; the third column names every property that fails.
 | --- | --- | --- |
 {chr(10).join(lines)}
 
-**False alarms: {sum(map(len, failed.values()))} findings** of {rows} rows of shipped heads × {seeds} seeds.
+**False alarms: {sum(map(len, failed.values()))} findings** of {rows} rows of shipped heads × {seeds} seeds,
+and of {others} rows of right heads that are not shipped (tests/right_heads.py).
 
 {chr(10).join(told)}
 """

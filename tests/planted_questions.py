@@ -128,6 +128,27 @@ class FirstHalf(LogisticHead):
         super().calibrate(raw[: len(raw) // 2], target[: len(raw) // 2])
 
 
+class NextRows(LogisticHead):
+    """calibrate takes each row's target for the next one's."""
+
+    def calibrate(self, raw: Tensor, target: Tensor) -> None:
+        super().calibrate(raw, target.roll(1, 0))
+
+
+class Clipped(StudentTHead):
+    """A loss of at most 20 nats."""
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return (-self(raw).log_prob(target)).clamp(max=20)
+
+
+class PerNumber(LogisticHead):
+    """A loss that is the mean over numbers, as that of images may be."""
+
+    def loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        return super().loss(raw, target) / target.shape[-1]
+
+
 class Unread(LogisticHead):
     """Asks for a number more than it reads."""
 
@@ -250,6 +271,9 @@ FURTHER_FAULTS = (
     Fault("calibrated in the target's unit twice", HEIGHT, {}, "target's unit", head=CalibratedTwice),
     # rows, values, raw numbers
     Fault("calibrate reads the first half", HEIGHT, {}, "calibrate reads every row alike", head=FirstHalf),
+    Fault("calibrate takes targets of the next row", HEIGHT, {}, "calibrate does not harm", head=NextRows),
+    Fault("a loss of at most 20 nats", HEIGHT, {}, "loss is in nats", head=Clipped),
+    Fault("a loss of one number, of two", PLACE, {}, "loss is in nats", head=PerNumber),
     Fault("a raw number is not read", HEIGHT, {}, "every raw number counts", head=Unread),
     Fault("two numbers share the first's scale", PLACE, {}, "every raw number counts", head=OneScaleForAll),
     Fault("log_prob of the first of several values", HEIGHT,

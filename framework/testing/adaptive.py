@@ -199,6 +199,11 @@ def boxes(density: Distribution) -> Boxes:
     length = way.ends[1] - way.ends[0]
     low = way.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
     high = way.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
+    if numbers == 1:
+        # a kink at a peak near a border is beyond the outermost node of either rule: a border is put there
+        edges = torch.cat([low.expand(-1, *humps.shape[1:]), high[-1:].expand(-1, *humps.shape[1:]), humps])
+        edges = edges.sort(0).values
+        low, high = edges[:-1], edges[1:]
     parts = _summed(way, low, high, place, height, humps)
     # float32 does not agree with itself to more digits
     tolerance = TOLERANCE[numbers] if density.log_prob(density.mode).dtype == torch.float64 else 1e-4
@@ -316,7 +321,7 @@ def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
     value, log_prob, weight = _nodes(way, low, high, RULES[low.shape[-1]][0])
     border = mass[:0]
     if low.shape[-1] == 1:
-        order = low[..., 0].argsort(0)
+        order = (low + high)[..., 0].argsort(0)  # empty ones before those that begin there
         mass = mass.gather(0, order)
         ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
         border = way.to(ends.unsqueeze(-1))[0][..., 0]

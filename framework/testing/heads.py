@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead, Fitted
-from framework.distributions.circular import Circular
+from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import images, median
 from framework.geometry.light import light_of
@@ -135,6 +135,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("calibrate does not harm", 1e-5, _calibrated),
         ("calibrate reads every row alike", 1e-5, _calibrated_backwards),
         ("every raw number counts", 0.0, _all_read),
+        ("loss is in nats", 1e-5, _loss_in_nats),
         ("several values at once", 1e-5, _several_values),
         ("target's unit", TOLERANCE, units),
         ("loss gradient", 1e-6, gradient),
@@ -374,17 +375,33 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _calibrated(subject: HeadSubject, worst: Worst) -> None:
-    """calibrate leaves the mean log_prob of what it was given as good as before, or better; relative above 1 nat."""
-    head, raw, value = subject.make(), subject.raws(64), subject.values(64)
+    """calibrate leaves the mean log_prob of what it was given as good as before, or better; relative above 1 nat.
+
+    Of targets that have nothing to do with the raw numbers, and of draws from the head's own densities, as far from
+    their modes as they are drawn, and three times nearer and farther: there a hundredth is allowed.
+    """
     if subject.draws():
         worst.count(False, "draws in log_prob")
         return
-    with torch.no_grad():
-        before = head(raw).log_prob(value).double().mean()
-        head.calibrate(raw, value)
-        after = head(raw).log_prob(value).double().mean()
-    loss = (before - after).clamp(min=0) / before.abs().clamp(min=1) if after.isfinite() else after
-    worst.see(loss, f"{before.item():.6g} before, {after.item():.6g} after")
+    sets = {"any targets": None, "its draws": 1.0, "near ones": 1 / 3, "far ones": 3.0}
+    for what, spread in sets.items():
+        head, raw, value = subject.make(), subject.raws(64), subject.values(64)
+        if spread is not None and (head.direct or isinstance(head, Fitted)):  # random numbers are no features
+            break
+        with torch.no_grad():
+            if spread is not None:
+                density = seeded(head, raw)
+                value, mode = density.sample(), density.mode
+                if value.is_floating_point() and subject.row.target.kind != "image":
+                    angles = isinstance(density.support, Circular)
+                    value = mode + spread * (wrap(value - mode) if angles else value - mode)
+            before = head(raw).log_prob(value).double().mean()
+            head.calibrate(raw, value)
+            after = head(raw).log_prob(value).double().mean()
+        loss = (before - after).clamp(min=0) / before.abs().clamp(min=1) if after.isfinite() else after
+        # fitted to intervals, say, it need not be the likeliest
+        loss = loss if spread is None else 1e-3 * loss
+        worst.see(loss, f"{what}: {before.item():.6g} before, {after.item():.6g} after")
 
 
 def _calibrated_backwards(subject: HeadSubject, worst: Worst) -> None:
@@ -408,7 +425,7 @@ def _calibrated_backwards(subject: HeadSubject, worst: Worst) -> None:
 def _all_read(subject: HeadSubject, worst: Worst) -> None:
     """Each raw number changes the loss of some target at some size: none is read and then left out."""
     head, columns = subject.make().double().train(), range(subject.size)
-    if head.direct:
+    if head.direct or isinstance(head, Fitted):
         worst.count(False, "it reads features, which are not made for it")
         return
     unread = set(columns)
@@ -428,6 +445,40 @@ def _all_read(subject: HeadSubject, worst: Worst) -> None:
             unread = set()
             break
     worst.count(bool(unread), f"raw numbers that change no loss: {sorted(unread)[:8]}")
+
+
+def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
+    """A loss that is a multiple of -log_prob and a constant at a head's own draws is so with a factor of 1, and also
+    at values that are hardly drawn; relative to log_prob."""
+    if subject.draws():
+        worst.count(False, "draws in log_prob, of which the loss may be a bound")
+        return
+    head, raw = subject.make().double(), subject.raws(6).double()
+    with torch.no_grad():
+        density = head.eval()(raw)
+        seed(SEED)
+        drawn = density.sample(torch.Size((24,)))
+        seed(SEED)
+        others = as_type(subject.values(8, 6), drawn.dtype)
+        if subject.row.target.kind != "class":
+            others[:4], others[4:] = 10 * others[:4], 1e4 * others[4:]
+        value = torch.cat([drawn, others])
+        log_prob = density.log_prob(value).double()
+        loss = torch.stack([head.train().loss(raw, one) for one in value]).double()
+    near, far = log_prob[:24], log_prob[24:]
+    offset = near - near.mean(0)
+    factor = -(offset * loss[:24]).sum(0) / offset.square().sum(0).clamp(min=1e-300)
+    constant = (loss + factor * log_prob)[:24].mean(0)
+    rest = (loss + factor * log_prob - constant).abs()
+    size = 1 + log_prob.abs()
+    fits = ((rest / size)[:24].amax(0) < 1e-9) & (offset.abs().amax(0) > 1e-3)
+    worst.count(False, "another loss than log_prob")
+    # of an image it may be that of one number
+    share = density.event_shape.numel() if subject.row.target.kind == "image" else 1
+    gap = torch.where(fits, torch.minimum((factor - 1).abs(), (share * factor - 1).abs()), 0.0)
+    worst.see(gap, lambda at: f"{factor[at].item():.4g} times -log_prob, row {at[0]}")
+    gap = torch.where(fits & far.isfinite(), (rest / size)[24:], 0.0)
+    worst.see(gap, lambda at: f"loss is {loss[24:][at].item():.6g} where log_prob is {far[at].item():.6g}")
 
 
 def _several_values(subject: HeadSubject, worst: Worst) -> None:
