@@ -274,6 +274,54 @@ def test_volumes_of_several_numbers():
     assert (nine.scores(far).diff() > 0).all()
 
 
+@pytest.mark.parametrize("drop", [0.5, 3.0, 20.0, 200.0])
+@pytest.mark.parametrize("count", [2, 3, 7])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sets_of_a_normal_density_are_ellipsoids(count, drop, dtype):
+    """However far beyond all draws their rim lies: volumes of the ball by its recursion, times |Σ|^½."""
+    root = torch.eye(count).tril() + 0.3 * torch.ones(count, count).tril(-1)
+    root = (root * (1 + torch.arange(count)).reshape(-1, 1)).to(dtype).expand(3, count, count)
+    density = MultivariateNormal(torch.ones(3, count, dtype=dtype), scale_tril=root, validate_args=False)
+    found = PredictionSet(density, drop - density.log_prob(density.mode)[0].double(), "density")
+    ball = {0: 1.0, 1: 2.0}
+    for n in range(2, count + 1):
+        ball[n] = 2 * math.pi / n * ball[n - 2]
+    volume = ball[count] * (2 * drop) ** (count / 2) * math.factorial(count)
+    np.testing.assert_allclose(found.size().numpy(), volume, rtol=1e-5 if dtype == torch.float32 else 1e-10)
+    assert not found.size_error().any()
+
+
+@pytest.mark.parametrize("drop", [1.0, 6.0, 30.0])
+@pytest.mark.parametrize("kind", ["reals", "angles"])
+def test_other_volumes_have_an_error_that_covers_the_quadratures(kind, drop):
+    """Of mixtures and of two angles, up to sets far beyond all draws; 40 estimates, half of them within an error."""
+    torch.manual_seed(7)
+    if kind == "reals":
+        place = torch.tensor([[[0.0, 0.0], [3.0, 1.0]]]).double()
+        density = Mixture(torch.zeros(1, 2), normals_apart(place))
+        axes = [torch.linspace(-15, 15, 1201).double()] * 2
+    else:
+        kind_of = type(build_head("von_mises")(torch.zeros(1, 3)))
+        density = kind_of(torch.zeros(1, 2).double(), torch.tensor([[5.0, 9.0]]).double())
+        axes = [torch.linspace(-math.pi, math.pi, 1201).double()[:-1]] * 2
+    threshold = drop - density.log_prob(density.mode)[0].double()
+    grid = torch.cartesian_prod(*axes).unsqueeze(1)
+    cell = math.prod(float(axis[1] - axis[0]) for axis in axes)
+    wanted = cell * float((-density.log_prob(grid) <= threshold).double().sum())
+    sets = [PredictionSet(density, threshold, "density") for _ in range(40)]
+    size, error = (
+        torch.cat(each) for each in zip(*((one.size(), one.size_error()) for one in sets), strict=True)
+    )
+    gap = (size - wanted).abs()
+    assert (gap <= 4.5 * error + 0.01 * wanted).all() and error.max() < 0.15 * wanted
+    if drop < 30 or kind == "reals":  # all of the torus leaves no chance
+        assert float((gap < error + 0.003 * wanted).double().mean()) > 0.3
+
+
+def normals_apart(place):
+    return Independent(Normal(place, torch.ones_like(place), validate_args=False), 1, validate_args=False)
+
+
 def test_shares_among_draws_by_a_loop():
     density = MultivariateNormal(torch.zeros(1, 2).double(), torch.eye(2).double(), validate_args=False)
     sets = PredictionSet(density, EVERYTHING, "mass")
