@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Normals,
     Slope,
@@ -41,6 +42,7 @@ class Gaussian(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = True
+    __repr__ = one_line
 
     def __init__(
         self,
@@ -112,7 +114,7 @@ class Gaussian(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         residual = value - self.location
         if self.coefficients is not None:
-            residual = residual - (self.coefficients @ residual.unsqueeze(-1)).squeeze(-1)
+            residual = residual - _times(self.coefficients, residual)
         standard = residual / self.scale
         return -(standard.square() / 2 + self.scale.log() + math.log(2 * math.pi) / 2).sum(-1)
 
@@ -120,11 +122,16 @@ class Gaussian(Distribution):
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         noise = torch.randn(shape, dtype=self.scale.dtype, device=self.scale.device) * self.scale
         if self.coefficients is not None:
-            noise = (self._mixing @ noise.unsqueeze(-1)).squeeze(-1)
+            noise = _times(self._mixing, noise)
         return self.location + noise
 
     def entropy(self) -> Tensor:
         return (self.scale.log() + (1 + math.log(2 * math.pi)) / 2).sum(-1)
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """The product, in the numbers' own type: `@` is computed in bfloat16 under mixed precision."""
+    return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
 estimate.register(Gaussian, exactly)
@@ -154,8 +161,9 @@ def _(density: Gaussian, value: Tensor) -> Slope:
     # Σ⁻¹ = Aᵀ A, A = (I - φ)/σ; a diagonal that exceeds it has the sums of its rows' sizes (Gershgorin)
     identity = torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
     root = (identity - density.coefficients) / density.scale.unsqueeze(-1)
-    pull = -(root.mT @ (root @ residual.unsqueeze(-1))).squeeze(-1)
-    return Slope(density.log_prob(value), pull, (root.mT @ root).abs().sum(-1).expand(residual.shape))
+    pull = -_times(root.mT, _times(root, residual))
+    precision = (root.unsqueeze(-1) * root.unsqueeze(-2)).sum(-3)
+    return Slope(density.log_prob(value), pull, precision.abs().sum(-1).expand(residual.shape))
 
 
 @about.register

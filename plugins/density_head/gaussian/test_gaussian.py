@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.protocol import marginal, pick
+from framework.distributions.protocol import marginal, pick, slope
 from framework.errors import ConfigError
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
@@ -156,3 +156,22 @@ def test_a_covariance_is_a_number_or_refused(numbers):
                 for ask in (lambda d: d.stddev, lambda d: d.rsample(), lambda d: marginal(d, numbers - 1)):
                     with pytest.raises(ValueError, match="covariance=diagonal"):
                         ask(density)
+
+
+def test_mixed_precision_does_not_round_the_covariance():
+    """Densities, draws and slopes under autocast are those of float32."""
+    torch.manual_seed(0)
+    made = head({"covariance": "full"})
+    raw = torch.randn(50, made.size)
+    value = 5 * torch.randn(50, 3)
+
+    def answers():
+        torch.manual_seed(1)
+        density = made(raw)
+        return [density.log_prob(value), density.sample(), *slope(density, value)]
+
+    wanted = answers()
+    with torch.autocast("cpu", torch.bfloat16):
+        found = answers()
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
