@@ -8,7 +8,7 @@ from typing import Any
 
 from framework.configuration.registry import load
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError
+from framework.errors import ConfigError, UserError
 from framework.target import Target
 from framework.testing.finding import Finding
 from framework.testing.rows import (
@@ -162,11 +162,20 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
 
 
 def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
-    """Build the plugin for a target, which it may refuse."""
+    """Build the plugin for a target, which it may refuse; a wrapper also when it sees densities of the kind."""
     if group == "uncertainty":
-        from framework.testing.wrappers import Plain
+        import torch
 
-        build(group, resolved, model=lambda: Plain(target), target=target)
+        from framework.testing.heads import values
+        from framework.testing.wrappers import Plain, inputs
+
+        wrapper = build(group, resolved, model=lambda: Plain(target), target=target)
+        batch = {"input": inputs(8), "target": values(target, (8,)), "index": torch.arange(8)}
+        try:  # some learn only from its densities what they cannot do, such as a power without a normaliser
+            wrapper.eval().calibrate([batch])
+            wrapper(batch["input"])
+        except UserError as error:
+            raise ConfigError(str(error)) from error
     elif group == "objective":
         build(group, resolved)
     else:
@@ -219,13 +228,15 @@ def _examine_wrapper(name: str, row: WrapperRow) -> Iterator[Finding]:
     from framework.model import Predictor
     from framework.testing.wrappers import Plain, examine_wrapper
 
-    def around(config: Mapping[str, Any], model: Callable[[], Predictor]) -> Any:
+    def around(config: Mapping[str, Any], model: Callable[[], Predictor], target: Target) -> Any:
         resolved = resolve("uncertainty", {"name": name, **config})
-        return build("uncertainty", resolved, model=model, target=row.target)
+        return build("uncertainty", resolved, model=model, target=target)
 
     same = row.identity
-    identity = None if same is None else lambda model: around({**row.config, **same}, model)
-    yield from examine_wrapper(row, lambda: around(row.config, lambda: Plain(row.target)), identity)
+    identity = None if same is None else lambda model: around({**row.config, **same}, model, row.target)
+    yield from examine_wrapper(
+        row, lambda target: around(row.config, lambda: Plain(target), target), identity
+    )
 
 
 def _examine_objective(name: str, row: ObjectiveRow) -> Iterator[Finding]:

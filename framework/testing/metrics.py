@@ -110,7 +110,8 @@ def _(density: Cardioid, samples: int) -> Tensor:
 
 @pick.register
 def _(density: Cardioid, index: Tensor) -> Cardioid:
-    return Cardioid(take(density.location, index))
+    strength = take(density.strength.unsqueeze(-1), index)[..., 0]
+    return Cardioid(take(density.location, index), strength)
 
 
 def numbers_about(target: Target) -> int:
@@ -133,7 +134,7 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
     if target.kind == "real":
         # MultivariateNormal, since Independent refuses empty batches
         scale = torch.eye(place.shape[-1], dtype=place.dtype)
-        if breadth is not None:
+        if breadth is not None and breadth.numel():  # torch asks for no batch of 0 matrices
             scale = scale * breadth[..., None, None].to(place)
         return MultivariateNormal(place, scale_tril=scale, validate_args=False)
     return Categorical(

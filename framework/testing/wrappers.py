@@ -1,6 +1,11 @@
-"""The contract of an uncertainty wrapper: one function a property, each reporting the worst case it saw."""
+"""The contract of an uncertainty wrapper: one function a property, each reporting the worst case it saw.
 
+What must hold of its calibration is in framework.testing.calibration.
+"""
+
+import copy
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -10,28 +15,49 @@ from framework.data import Batch
 from framework.distributions.circular import Circular
 from framework.model import Predictor
 from framework.target import Target
-from framework.testing.densities import integral, samples_follow_log_prob
-from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing import densities as asked
+from framework.testing.finding import SEED, Finding, Worst, examined, seed
 from framework.testing.heads import values
 from framework.testing.metrics import density_about, numbers_about
 from framework.testing.rows import WrapperRow
 from framework.uncertainty import Uncertainty
 
 Make = Callable[[], Uncertainty]
+Build = Callable[[Target], Uncertainty]
+"""Builds the row's wrapper around `Plain`, for the row's target in any unit."""
 LENGTH = 6
+UNITS = ((200.0, 50.0), (-3.0, 1e-3))
+"""Locations and scales of reals, beside 0 and 1."""
 
 
 class Plain(Predictor):
-    """What is wrapped: one linear layer to the place of the simplest density of the target's kind."""
+    """What is wrapped: one linear layer to the place and the breadth of the simplest density of the target's kind.
+
+    What `calibrate` does to it does not depend on the samples: so whoever wraps it can be compared with whoever wraps
+    one that was calibrated before.
+
+    Attributes:
+        calibrated: 1 after `calibrate`, a buffer.
+    """
+
+    calibrated: Tensor
 
     def __init__(self, target: Target) -> None:
         super().__init__()
         self.target = target
         self.dropout = nn.Dropout(0.1)  # for wrappers that need one
-        self.layer = nn.Linear(LENGTH, numbers_about(target))
+        self.layer = nn.Linear(LENGTH, numbers_about(target) + 1)
+        self.register_buffer("calibrated", torch.zeros(()))
 
     def forward(self, inputs: Tensor) -> Distribution:
-        return density_about(self.target, self.layer(self.dropout(inputs)))
+        numbers = self.layer(self.dropout(inputs))
+        place, breadth = numbers[..., :-1], (1 + numbers[..., -1].sigmoid()) * (1 + self.calibrated / 2)
+        if self.target.scale:
+            location, scale = (
+                torch.tensor(part).to(place) for part in (self.target.location, self.target.scale)
+            )
+            place, breadth = location + scale * place, scale[0] * breadth
+        return density_about(self.target, place, breadth)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return -self(inputs).log_prob(target)
@@ -40,34 +66,54 @@ class Plain(Predictor):
         return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        pass
+        rows = sum(
+            len(batch["target"]) for batch in batches
+        )  # of batches that come only once, nothing is left
+        self.calibrated.fill_(float(rows > 0))
+
+
+def wrapped(wrapper: Uncertainty) -> list[Plain]:
+    """Whatever is inside; none, where a wrapper keeps the parameters in another form."""
+    return [module for module in wrapper.modules() if isinstance(module, Plain)]
 
 
 def examine_wrapper(
-    row: WrapperRow, build: Make, build_identity: Callable[[Callable[[], Predictor]], Uncertainty] | None
+    row: WrapperRow, build: Build, build_identity: Callable[[Callable[[], Predictor]], Uncertainty] | None
 ) -> Iterator[Finding]:
     """Every property of one wrapper around `Plain`, fresh for each.
 
     Args:
         build_identity: builds it around a given model such that it must be that model; None where it cannot be.
     """
+    from framework.testing.calibration import Calibration
 
     def make() -> Uncertainty:
-        torch.manual_seed(SEED)
-        return build().eval()
+        seed(SEED)
+        return build(row.target).eval()
 
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "densities": (0.0, lambda worst: _densities(make, row, worst)),
+        "number types": (0.0, lambda worst: _number_types(make, row, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, row, worst)),
+        "rows of a batch apart": (1e-5, lambda worst: _rows_apart(make, row, worst)),
+        "leaves no trace": (0.0, lambda worst: _traces(make, row, worst)),
+        "knobs turn": (0.0, lambda worst: _knobs(make, row, worst)),
         "loss and its gradient": (0.0, lambda worst: _loss(make, row, worst)),
-        "state-dict round trip": (0.0, lambda worst: _round_trip(make, build, row, worst)),
-        "calibration": (0.0, lambda worst: _calibration(make, row, worst)),
-        "integral": (1e-5, lambda worst: _of_density(make, row, integral, worst)),
-        "samples follow log_prob": (
-            5.0,
-            lambda worst: _of_density(make, row, samples_follow_log_prob, worst),
+        "loss trains all it wraps": (0.0, lambda worst: _trains(make, row, worst)),
+        "training densities": (1e-5, lambda worst: _training_densities(make, row, worst)),
+        "state-dict round trip": (
+            0.0,
+            lambda worst: _round_trip(make, lambda: build(row.target), row, worst),
         ),
+        "calibration": (0.0, lambda worst: _calibration(make, row, worst)),
     }
+    calibration = Calibration(row, build)
+    checks |= {name: (limit, check) for name, limit, check in calibration.checks()}
+    # of a mixture of densities it is the best of some candidates
+    limit = 1e-6 if row.target.kind == "class" else 0.2
+    checks["mode"] = (limit, lambda worst: _of_densities(calibration.many, asked.mode_is_highest, worst))
+    for name, limit, check in questions(row.target):
+        checks[name] = (limit, lambda worst, check=check: _of_densities(calibration.densities, check, worst))
     if build_identity is not None:
         checks["one member is the member"] = (0.0, lambda worst: _identity(build_identity, row, worst))
     for name, (limit, check) in checks.items():
@@ -75,8 +121,44 @@ def examine_wrapper(
             yield examined(name, row.limits.get(name, limit), check)
 
 
-def inputs(count: int) -> Tensor:
-    return torch.randn(count, LENGTH, generator=torch.Generator().manual_seed(SEED))
+def questions(target: Target) -> Iterator[tuple[str, float, asked.Check]]:
+    """What densities over the target are asked, of those in framework.testing.densities, with limits."""
+    numbers = 0 if target.kind == "class" else len(target.names)
+    yield "integral", 1e-5, asked.integral
+    yield "samples follow log_prob", 5.0, asked.samples_follow_log_prob if numbers != 2 else _drawn_on_a_grid
+    if numbers == 2:
+        yield "samples follow marginals", 5.0, asked.samples_follow_marginals
+    yield "entropy", 5.0, asked.entropy
+    if target.kind == "angle":
+        yield "2π-periodic", 1e-12, asked.periodic
+    if numbers == 1:
+        yield "median", 5.0, asked.median_is_best
+        yield "cdf", 1e-6, asked.masses
+    if target.kind == "real" and numbers <= 2:
+        yield "mean and variance", 1e-5, asked.moments
+
+
+def _drawn_on_a_grid(density: Distribution, worst: Worst) -> None:
+    """Of reals only where the grid resolves them: in the unit of the standardised target."""
+    broad = bool((density.mode.abs() < 10).all() and (density.entropy() > 0).all())
+    if isinstance(density.support, Circular) or broad:
+        asked.samples_follow_log_prob(density, worst)
+    else:
+        worst.count(False, "the grid is too coarse; draws of each number are compared with its marginal")
+
+
+def in_units(target: Target) -> list[Target]:
+    """The target, and of reals the same in other units."""
+    if target.kind != "real":
+        return [target]
+    many = len(target.names)
+    others = [replace(target, location=(at,) * many, scale=(scale,) * many) for at, scale in UNITS]
+    return [target, *others]
+
+
+def inputs(count: int, number: int = 0) -> Tensor:
+    """Seeded; another `number` gives others."""
+    return torch.randn(count, LENGTH, generator=torch.Generator().manual_seed(SEED + 100 * number))
 
 
 def batches(row: WrapperRow) -> list[Batch]:
@@ -105,17 +187,116 @@ def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
             if count:
                 worst.same(f"sample of {count}", tuple(density.sample().shape), (count, *event))
                 worst.same(f"entropy of {count}", tuple(density.entropy().shape), (count,))
+                worst.same(f"mode of {count}", tuple(density.mode.shape), (count, *event))
+
+
+def _number_types(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """float64 stays float64, before and after calibrate."""
+    for kind in (torch.float32, torch.float64):
+        wrapper = make().to(kind)
+        typed = [
+            {name: field.to(kind) if field.is_floating_point() else field for name, field in batch.items()}
+            for batch in batches(row)
+        ]
+        for what in ("as built", "calibrated"):
+            if what == "calibrated":
+                wrapper.calibrate(typed)
+            with torch.no_grad():
+                found = wrapper(typed[0]["input"]).log_prob(typed[0]["target"])
+            worst.same(f"log_prob of {kind}, {what}", found.dtype, kind)
 
 
 def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """Also after other inputs, and of two that were calibrated: a wrapper keeps nothing between calls."""
     target = values(row.target, (5,))
-    found = []
+
+    def everything(wrapper: Uncertainty) -> dict[str, Tensor]:
+        seed(SEED)
+        density = wrapper(inputs(5))
+        found = {"log_prob": density.log_prob(target), "mode": density.mode}
+        seed(SEED)
+        return {**found, "sample": density.sample(), "loss": wrapper.loss(inputs(5), target)}
+
     with torch.no_grad():
-        for _ in range(2):
-            wrapper = make()
-            torch.manual_seed(SEED)
-            found.append(wrapper(inputs(5)).log_prob(target))
-    worst.same_bits("log_prob of two wrappers of one seed", *found)
+        first, second = make(), make()
+        wanted = everything(first)
+        first(3 * inputs(7, 1)).sample()
+        first.loss(3 * inputs(5, 1), target)
+        for what, other in {"after other inputs": first, "of two wrappers": second}.items():
+            for name, found in everything(other).items():
+                worst.same_bits(f"{name} {what}", found, wanted[name])
+    for wrapper in (first, second):
+        seed(SEED)
+        wrapper.calibrate(batches(row))
+    with torch.no_grad():
+        wanted = everything(first)
+        for name, found in everything(second).items():
+            worst.same_bits(f"{name} of two calibrated", found, wanted[name])
+
+
+def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """What is said of row 2 does not change with the others, nor has its loss a gradient in them."""
+    wrapper, target, given = make(), values(row.target, (5,)), inputs(5)
+    other = torch.where(torch.arange(5).unsqueeze(-1) == 2, given, 1 - 3 * given)
+    for what in ("as built", "calibrated"):
+        if what == "calibrated":
+            wrapper.calibrate(batches(row))
+        found: list[dict[str, Tensor]] = []
+        with torch.no_grad():
+            for some in (given, other):
+                seed(SEED)
+                density = wrapper(some)
+                answers = {"log_prob": density.log_prob(target), "mode": density.mode}
+                seed(SEED)
+                answers["entropy"] = density.entropy()
+                seed(SEED)
+                answers["loss"] = wrapper.loss(some, target)
+                found.append({name: answer[2].double() for name, answer in answers.items()})
+        for name, alone in found[0].items():
+            # quadratures of a batch share their nodes, and entropies may be of draws
+            least = 10.0 if name == "entropy" else 1.0
+            error = (found[1][name] - alone).abs() / alone.abs().clamp(min=least)
+            worst.see(error, f"{name} of row 2 where the others change, {what}")
+    reached = inputs(5).requires_grad_()
+    seed(SEED)
+    wrapper.loss(reached, target)[2].backward()
+    if reached.grad is not None:
+        worst.see(reached.grad[[0, 1, 3, 4]].abs().max(), "gradient of row 2's loss in the others' inputs")
+
+
+def _traces(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """What an answer must not touch: modes, buffers, parameters; calibrate keeps the modes."""
+    target = values(row.target, (5,))
+    for training in (True, False):
+        wrapper = make().train(training)
+        modes = {name: module.training for name, module in wrapper.named_modules()}
+        state = copy.deepcopy(wrapper.state_dict())
+        with torch.no_grad():
+            density = wrapper(inputs(5))
+            _ = density.log_prob(target), density.sample(), density.entropy(), density.mode
+            wrapper.loss(inputs(5), target)
+            wrapper.training_densities(inputs(5)).sample()
+        for name, value in wrapper.state_dict().items():
+            worst.same_bits(f"{name} after an answer, training {training}", value, state[name])
+        for what in ("an answer", "calibrate"):
+            if what == "calibrate":
+                wrapper.calibrate(batches(row))
+            after = {name: module.training for name, module in wrapper.named_modules()}
+            changed = [name or "the wrapper" for name in modes if after.get(name) != modes[name]]
+            worst.count(bool(changed), f"modes changed by {what}: {', '.join(changed) or 'none'}")
+
+
+def _knobs(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """Attributes that may be set at any time, their declared values ascending; the smallest two work."""
+    wrapper = make()
+    worst.count(False, "none declared")
+    for name, dial in wrapper.knobs.items():
+        worst.same(f"order of {name}", list(dial), sorted(dial))
+        for setting in dial[:2]:
+            setattr(wrapper, name, setting)
+            with torch.no_grad():
+                found = wrapper(inputs(3)).log_prob(values(row.target, (3,)))
+            worst.finite(f"log_prob with {name} = {setting}", found)
 
 
 def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
@@ -130,18 +311,66 @@ def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
         worst.finite("gradient", gradient)
 
 
+def _trains(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """A small step down the loss makes every model inside better; in evaluation, without dropout."""
+    wrapper = make().double()
+    given, target = inputs(64).double(), values(row.target, (64,))
+    target = target.double() if target.is_floating_point() else target
+    models = wrapped(wrapper)
+
+    def lost() -> list[float]:
+        with torch.no_grad():
+            return [model.loss(given, target).mean().item() for model in models]
+
+    before = lost()
+    wrapper.loss(given, target).mean().backward()
+    with torch.no_grad():
+        for model in models:
+            slopes = [part.grad for part in model.parameters() if part.grad is not None]
+            length = torch.stack([slope.norm() for slope in slopes]).norm() if slopes else torch.zeros(())
+            for part in model.parameters():
+                if part.grad is not None:
+                    part -= 1e-4 * part.grad / length.clamp(min=1e-12)
+    worst.count(False, "keeps no model as it is")
+    for number, (first, then) in enumerate(zip(before, lost(), strict=True)):
+        worst.count(not then < first, f"loss of model {number}: {first:.9g}, after a step {then:.9g}")
+
+
+def _training_densities(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """Of one model or of every member, by gradient; a mixture lies between its members at every value."""
+    wrapper, target = make(), values(row.target, (5,))
+    density = wrapper.training_densities(inputs(5))
+    worst.count(
+        density.batch_shape[:1] != (5,) or len(density.batch_shape) > 2,
+        f"batch_shape {tuple(density.batch_shape)} of 5, wanted (5,) or (5, members)",
+    )
+    several = len(density.batch_shape) == 2
+    value = torch.stack([values(row.target, (5,)), wrapper(inputs(5)).mode, 0 * target])
+    parts = density.log_prob(value.unsqueeze(2) if several else value)
+    worst.count(not parts.requires_grad, "an objective gets no gradient")
+    parts.sum().backward()
+    for number, model in enumerate(wrapped(wrapper)):
+        reached = any(part.grad is not None and bool(part.grad.any()) for part in model.parameters())
+        worst.count(not reached, f"an objective does not reach model {number}")
+    if several:
+        with torch.no_grad():
+            whole, parts = wrapper(inputs(5)).log_prob(value), parts.detach()
+        outside = (whole - parts.amax(-1)).maximum(parts.amin(-1) - whole)
+        worst.see(outside, lambda at: f"a mixture of what is trained, value {at[0]}, row {at[1]}")
+
+
 def _round_trip(make: Make, build: Make, row: WrapperRow, worst: Worst) -> None:
     """What calibrate fitted is stored too."""
     wrapper = make()
     wrapper.calibrate(batches(row))
-    torch.manual_seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
+    seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
     other = build().eval()
     other.load_state_dict(wrapper.state_dict())
     target = values(row.target, (5,))
     with torch.no_grad():
-        torch.manual_seed(SEED)
+        seed(SEED)
         first = wrapper(inputs(5)).log_prob(target)
-        torch.manual_seed(SEED)
+        seed(SEED)
         worst.same_bits("log_prob of the stored state", other(inputs(5)).log_prob(target), first)
 
 
@@ -162,19 +391,20 @@ def _alike(row: WrapperRow) -> list[Batch]:
     return [{**batch, "target": torch.zeros_like(batch["target"])} for batch in batches(row)]
 
 
-def _of_density(
-    make: Make, row: WrapperRow, check: Callable[[Distribution, Worst], None], worst: Worst
+def _of_densities(
+    found: dict[str, Distribution], check: Callable[[Distribution, Worst], None], worst: Worst
 ) -> None:
-    wrapper = make().double()
-    with torch.no_grad():
-        check(wrapper(inputs(3).double()), worst)
+    for what, density in found.items():
+        worst.rows = [f"{what}, row {number}" for number in range(*density.batch_shape)]
+        with torch.no_grad():
+            check(density, worst)
 
 
 def _identity(
     build_identity: Callable[[Callable[[], Predictor]], Uncertainty], row: WrapperRow, worst: Worst
 ) -> None:
     """With the row's `identity` config the wrapper's density is the wrapped model's."""
-    torch.manual_seed(SEED)
+    seed(SEED)
     member = Plain(row.target).eval()
     wrapper = build_identity(lambda: member).eval()
     target, given = values(row.target, (64,)), 4 * inputs(64)  # places several turns apart
@@ -182,3 +412,4 @@ def _identity(
         whole, alone = wrapper(given), member(given)
         worst.same_bits("log_prob", whole.log_prob(target), alone.log_prob(target))
         worst.same_bits("mode", whole.mode, alone.mode)
+        worst.same_bits("loss", wrapper.loss(given, target), member.loss(given, target))

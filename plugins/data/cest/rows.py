@@ -64,7 +64,9 @@ ROWS = {
         HeadRow("fifteen", FIFTEEN, {"offsets": FEW, "steps": 3}, leave_out=NO_GRADIENT),
     ),
     "refined": (
-        WrapperRow("no step", TEN, {"steps": 0}, identity={"steps": 0}, leave_out=TEN_NUMBERS),
+        WrapperRow(
+            "no step", TEN, {"steps": 0, "offsets": FEW[3:9]}, identity={"steps": 0}, leave_out=TEN_NUMBERS
+        ),
         WrapperRow("a fit", TEN, {"steps": 10, "offsets": FEW[3:9]}, leave_out=TEN_NUMBERS),
     ),
 }
