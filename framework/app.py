@@ -8,6 +8,7 @@ from io import TextIOWrapper
 from pathlib import Path
 
 from framework.errors import ConfigError, UserError
+from framework.storage.closed_pipes import survive_closed_pipes
 from framework.storage.threads import wait_passively
 
 
@@ -20,6 +21,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a table must not fail for an ± that a terminal has not
             stream.reconfigure(errors="backslashreplace")
+    survive_closed_pipes()
     # Hydra prints its own errors and exits unless told to raise them.
     full_error = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"

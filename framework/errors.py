@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
 from itertools import islice
 
 
@@ -86,12 +86,37 @@ def quoted(damage: object) -> str:
     return shown(repr(damage))
 
 
-def nearest(word: str, known: Iterable[str], likeness: float = 0.5) -> str | None:
-    """The name like `word`, if there is one; 'lr' is like learning_rate."""
-    names = list(islice(known, 1000))
-    near = get_close_matches(shown(word), names, n=1, cutoff=likeness)
+LIKE = 0.65
+"""Least likeness of a name that is suggested: 'resnet' and 'unet' have 0.6, 'mpl' and 'mlp' 0.67."""
+LISTED_WHOLE, LISTED = 24, 8
+"""Most names that a message lists, and how many it lists of more."""
+
+
+def nearest(word: str, known: Iterable[str], likeness: float = LIKE) -> str | None:
+    """Return the name like `word`, if there is one.
+
+    'lr' is like learning_rate, and 'moons' like moons/everything.
+    """
+    word, names = shown(word), list(islice(known, 1000))
+    near = get_close_matches(word, names, n=1, cutoff=likeness)
     near = near or [name for name in names if "".join(piece[:1] for piece in name.split("_")) == word]
+    near = near or [name for name in names if name.startswith((f"{word.rstrip('/')}/", f"{word}_"))]
     return near[0] if near else None
+
+
+def listed(word: str, known: Iterable[str]) -> str:
+    """Return all names, or of many the nearest to `word` and how many more there are."""
+    names = list(known)
+    if len(names) <= LISTED_WHOLE:
+        return ", ".join(names)
+    matcher = SequenceMatcher(None, b=shown(word))
+
+    def likeness(name: str) -> float:
+        matcher.set_seq1(name[:200])
+        return matcher.ratio()
+
+    near = sorted(names[:1000], key=likeness, reverse=True)[:LISTED]
+    return f"{', '.join(near)} and {len(names) - LISTED} more"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

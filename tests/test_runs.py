@@ -475,7 +475,7 @@ def test_a_run_is_named_by_what_tells_it_from_its_neighbours() -> None:
     assert run_name(chosen, "train", overrides) == "mixture, category=car, max_steps=5, seed=3"
     assert run_name(Settings(), "test", []) == "test, seed=0"
     assert store_experiment({"experiment_name": "faces/mixture"}) == "faces"
-    assert store_experiment({"experiment_name": None, "logger": {"experiment": None}}) == "default"
+    assert store_experiment({"experiment_name": None, "logger": {"experiment": None}}) == "Default"
     assert store_experiment({"experiment_name": "a/b", "logger": {"experiment": "mine"}}) == "mine"
 
 

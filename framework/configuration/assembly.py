@@ -116,7 +116,7 @@ def build_predictor(
 
     Encoders with fixed features, as many as stand first, are outside what the wrappers of `uncertainty` wrap.
     """
-    torch.manual_seed(seed)
+    torch.default_generator.manual_seed(seed)  # of the CPU, where it is built; devices keep their own states
     parts = list(resolved["encoder"])
     fixed: list[Encoder] = []
     ready: list[Encoder] = []  # built already, for the first model

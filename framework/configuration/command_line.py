@@ -1,38 +1,105 @@
 """What a command line means, before Hydra reads it."""
 
-import re
+import sys
 from contextlib import nullcontext, suppress
 from pathlib import Path
+from typing import NoReturn
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from framework.configuration.composition import folder, groups, in_quotes, options, register
 from framework.configuration.foreign_configs import require_harmless
+from framework.configuration.newest import LAST, newest_run
 from framework.configuration.stored_keys import as_stored
-from framework.errors import ConfigError, did_you_mean
+from framework.errors import ConfigError, did_you_mean, nearest, printable
 from framework.tracking.stores import require_no_password
-
-FLAGS = ("--cfg=", "--package=", "--config-", "--info=", "--experimental-rerun=")  # the last is refused
-"""Of Hydra's, those that take a value."""
 
 
 def command_line(arguments: list[str]) -> list[str]:
     """The arguments as Hydra is to read them.
 
     Raises:
-        ConfigError: one would run code or store a password, or names a run to resume that is not there.
+        ConfigError: one would run code or store a password, is no flag, or names a run to resume that is not there.
     """
-    for argument in arguments:
-        if re.match("--[^=]+=", argument) and not argument.startswith(FLAGS):
-            raise ConfigError(
-                f"{argument}: no such flag. Settings are written without dashes: {argument.lstrip('-')}"
-            )
     _refuse_code_and_passwords(arguments)
+    arguments = _flags_first(arguments)
     require_harmless(arguments, groups())
-    return _swept_with_experiment(_preset_for_the_data(_in_resumed_folder(as_stored(arguments))))
+    arguments = _newest_checkpoint(_in_resumed_folder(as_stored(arguments)))
+    return _swept_with_experiment(_preset_for_the_data(arguments))
+
+
+def _newest_checkpoint(arguments: list[str]) -> list[str]:
+    """Write `checkpoint=last` as the folder of the newest run, so that a config names one run for good.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    if f"checkpoint={LAST}" not in arguments or Path(LAST).exists():
+        return arguments
+    run = newest_run(Path("outputs"))
+    sys.stderr.write(f"checkpoint={LAST} is {printable(str(run), kept='')}\n")
+    return [
+        f"checkpoint={in_quotes(str(run))}" if argument == f"checkpoint={LAST}" else argument
+        for argument in arguments
+    ]
+
+
+def _flags_first(arguments: list[str]) -> list[str]:
+    """Return Hydra's flags, then the settings, which Hydra reads in one piece only.
+
+    Raises:
+        ConfigError: a flag is unknown, or lacks its value.
+    """
+    parser = get_args_parser()
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigError(f"{message}. `--hydra-help` lists the flags; settings are written as key=value.")
+
+    parser.error = refuse  # type: ignore[method-assign]
+    known, unknown = parser.parse_known_intermixed_args(arguments)
+    if unknown:
+        raise ConfigError(_no_flag(unknown[0], arguments))
+    settings: list[str] = list(known.overrides)
+    flags = []
+    left = iter(settings)
+    awaited = next(left, None)
+    for argument in arguments:
+        if argument == awaited:
+            awaited = next(left, None)
+        else:
+            flags.append(argument)
+    return flags + settings
+
+
+def _no_flag(flag: str, arguments: list[str]) -> str:
+    """Say what an unknown flag, such as `--epochs 5`, is written as."""
+    key, equals, value = flag.lstrip("-").partition("=")
+    after = arguments[arguments.index(flag) + 1 :] if flag in arguments else []
+    if not equals:
+        value = after[0] if after and not after[0].startswith("-") and "=" not in after[0] else "..."
+    key = key.replace("-", "_") if "." not in key else key
+    return f"{flag}: no such flag. Settings are written without dashes: {_setting_like(key)}={value}"
+
+
+def _setting_like(key: str) -> str:
+    """Return the dotted key of the setting that is called like this; the key itself where none is."""
+    from framework.configuration.settings import OptimizerSettings, Settings, TrainerSettings
+
+    models = {"": Settings, "trainer.": TrainerSettings, "optimizer.": OptimizerSettings}
+    known = {
+        name: f"{before}{name}"
+        for before, model in reversed(models.items())
+        for name in model.model_fields
+        if not name.startswith("min_")  # --epochs are the most
+    }
+    if key in groups() or "." in key:
+        return key
+    near = key if key in known else nearest(key, known)
+    return known[near] if near else key
 
 
 def _preset_for_the_data(arguments: list[str]) -> list[str]:
@@ -124,7 +191,10 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
         ConfigError: an argument chooses or changes such a config, names such a file, or holds a password.
     """
     for argument in arguments:
-        if argument.startswith("--exp"):  # argparse takes abbreviations
+        flag = argument.partition("=")[0]
+        if flag in ("--experiment", "--exp"):
+            raise ConfigError(_no_flag(argument, arguments))
+        if flag.startswith("--e") and "--experimental-rerun".startswith(flag):  # argparse takes abbreviations
             raise ConfigError(
                 f"{argument}: refused, since Hydra unpickles that file, which runs what it holds. Use resume=<folder>, "
                 "or repeat the command that the run's overrides.yaml lists."

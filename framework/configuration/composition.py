@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configuration.registry import config_folders
-from framework.errors import ConfigError, did_you_mean, nearest, shown
+from framework.errors import ConfigError, did_you_mean, listed, nearest, shown
 
 PLURAL = ("encoder", "uncertainty", "objective", "metric")
 """Groups of which an experiment may choose several; their configs are keyed by name."""
@@ -153,7 +153,7 @@ def sentence(error: BaseException) -> str | None:
         wanted = error.missing_cfg_file or ""
         group, _, name = wanted.partition("/")
         known = [str(option) for option in error.options or ()] or options(group)
-        available = f" Available in {group}: {', '.join(known)}." if known else ""
+        available = f" Available in {group}: {listed(name, known)}." if known else ""
         return f"No configuration {wanted!r}.{did_you_mean(name, known)}{available}"
     if isinstance(error, ValueError) and "Config group override must be" in str(error):
         return (
@@ -252,7 +252,7 @@ def _unknown(cause: OmegaConfBaseException) -> str:
         return f"No {key} is chosen, so {cause.full_key}... sets nothing. Choose one: {key}=<name>, or {key}=[<name>]."
     hint = f" Did you mean {(near if near in beside else elsewhere[near])!r}?" if near else ""
     return (
-        f"{cause.full_key}: unknown key.{hint} Known keys: {', '.join(known) or 'none'}. "
+        f"{cause.full_key}: unknown key.{hint} Known keys: {listed(key, known) or 'none'}. "
         f"(+{cause.full_key}=... adds one the plugin knows but its yaml does not show.)"
     )
 

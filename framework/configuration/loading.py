@@ -1,6 +1,7 @@
 """Gives a trained model back, from a run folder, a checkpoint file or an MLflow run id; no Hydra needed."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import get_ident
@@ -19,7 +20,7 @@ from framework.configuration.schema import resolve
 from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
 from framework.distributions.moved import Moved
-from framework.errors import CheckpointError, ConfigError
+from framework.errors import CheckpointError, ConfigError, DataError, UserError, shown
 from framework.model import FrozenFrontEnd, Predictor
 from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
@@ -38,9 +39,11 @@ def load(
     """The trained model in evaluation mode, on the CPU; it takes what its user has, and answers in the user's unit.
 
     `model(given)` is the density over the target, with batch_shape (batch,): of files, arrays, or what else the data
-    set takes (`Data.inputs`); angles in radians, reals in their own unit, classes by their number in
-    `model.description.target.names`. Its other methods take inputs as the data set makes them. What is drawn (latent
-    variables, dropout, samples) comes from torch's global generator: `torch.manual_seed` before a call repeats it.
+    set takes (`Data.inputs`); angles in radians, reals in their own unit, classes by their number in `density.names`,
+    which of other targets are those of their numbers. Its other methods take inputs as the data set makes them. What is
+    drawn (latent variables, dropout, samples) comes from torch's global generator: `torch.manual_seed` before a call
+    repeats it. Loading draws nothing from it. The weights ask for no gradient, so that NumPy, pandas and Matplotlib
+    take what comes out; `model.requires_grad_()` before training on.
 
     Args:
         run_or_checkpoint: a run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
@@ -54,6 +57,7 @@ def load(
     """
     predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
     predictor.description = description
+    predictor.requires_grad_(False)
     user = User(reader(description))
     predictor.register_forward_pre_hook(user.asks, prepend=True)  # before what looks at inputs
     predictor.register_forward_hook(user.hears)
@@ -79,20 +83,49 @@ class User:
 
     def hears(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
         frame: Frame | None = self.frames.pop(inputs[0])
-        return density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
+        answer = density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
+        with suppress(AttributeError):  # a density may have names of its own
+            answer.names = self.data.target.names  # type: ignore[attr-defined]
+        return answer
 
     def __reduce__(self) -> tuple[type["User"], tuple[Data]]:
         return User, (self.data,)  # weak references cannot be pickled, and no call is under way in the copy
 
 
 def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
-    """What a model reads, of what a user gives; errors as `Data.asked`."""
-    batch = data.asked(given)
+    """Return what a model reads of what a user gives; a path may begin with `~`.
+
+    Raises:
+        DataError: as `Data.asked`, and for whatever else it cannot make inputs of.
+    """
+    given = _without_tilde(given)
+    if hasattr(given, "__len__") and not isinstance(given, str) and not len(given):
+        raise DataError(
+            f"An empty {type(given).__name__} holds no input. Give at least one file, row or array."
+        )
+    try:
+        batch = data.asked(given)
+    except UserError:
+        raise
+    except Exception as error:  # of NumPy, pandas or torch, about a date or a tensor with a gradient, say
+        raise DataError(
+            f"{type(given).__name__} cannot be read as inputs ({shown(error)}). Give files, an array of numbers, or "
+            "what else the data set of this model takes."
+        ) from error
     inputs = batch["input"]
     own = next(model.parameters(), inputs)
     # bytes are pixels, which encoders scale; any other number is one of the model's own type
     kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
     return {**batch, "input": inputs.to(own.device, kind)}
+
+
+def _without_tilde(given: Any) -> Any:
+    """Return paths in which `~` is the user's folder; anything else as it is."""
+    if isinstance(given, str | Path):
+        return type(given)(Path(given).expanduser()) if str(given).startswith("~") else given
+    if isinstance(given, list | tuple) and given and all(isinstance(item, str | Path) for item in given):
+        return [_without_tilde(item) for item in given]
+    return given
 
 
 def reader(description: Description) -> Data:
@@ -145,7 +178,8 @@ def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
             # the checkpoint holds the weights now; the file they were started from may be gone
             part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
         shape, columns = description.input_shape, description.columns
-        with budget.building(description.path, state.values()):
+        # the initial weights are drawn, and replaced: the user's own draws stay what they were
+        with budget.building(description.path, state.values()), torch.random.fork_rng(devices=[]):
             predictor = build_predictor(parts, description.target, shape, 0, columns)
             fill(predictor, state, description.path)
     bounded_at_first(predictor, description.path)

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, did_you_mean, quoted
+from framework.errors import ConfigError, did_you_mean, listed, quoted
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
 
@@ -68,7 +68,7 @@ def find(group: str, name: str) -> Entry:
     if name not in names:
         raise ConfigError(
             f"No {group} is called {quoted(name)}.{did_you_mean(name, [*names, *refused(group)])} "
-            f"Installed: {', '.join(names) or 'none'}. "
+            f"Installed: {listed(name, names) or 'none'}. "
             "A name added to a pyproject.toml counts only after `pip install -e .`."
         )
     return names[name]

@@ -30,7 +30,7 @@ from pydantic_core import to_jsonable_python
 
 from framework.configuration.registry import load
 from framework.configuration.signature import arguments, parts, positional, signature
-from framework.errors import ConfigError, did_you_mean, quoted, shown
+from framework.errors import ConfigError, did_you_mean, listed, quoted, shown
 
 
 def forbid_targets(config: Any, path: str = "") -> None:
@@ -171,7 +171,7 @@ def _unknown(where: str, key: str, known: Sequence[str], left: bool) -> ConfigEr
     # of another plugin that an experiment had chosen; Hydra deletes no key whose value is null
     advice = f" ~{where} leaves out what an experiment sets." if left else ""
     return ConfigError(
-        f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {', '.join(known) or 'none'}.{advice}"
+        f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {listed(key, known) or 'none'}.{advice}"
     )
 
 

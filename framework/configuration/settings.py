@@ -71,6 +71,7 @@ class OptimizerSettings(_Strict):
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     schedule: Literal["constant", "cosine", "step", "plateau"] = "constant"
     warmup_steps: NotNegative = 0
+    """Steps over which the rate rises linearly; of a short training at most a tenth of all."""
     factor: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Of a reduction by step or plateau."""
     milestones: list[Count] = []
@@ -177,13 +178,17 @@ class Settings(_Strict):
 
 
 def store_experiment(config: Mapping[str, Any]) -> str:
-    """The tracking store's experiment for a run: "data" for `experiment=data/method`, unless the logger names one.
+    """Return the tracking store's experiment for a run, which the logger may name.
 
-    One for all methods on the same data, so that a sweep over methods stands under its parent and compares.
+    Else it is "data" for `experiment=data/method`, the name of the data set for a run without an experiment, and for
+    one without data "Default", which MLflow makes itself. One for all methods on the same data, so that a sweep over
+    methods stands under its parent and compares.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")
-    return str(logger.get("experiment") or (name.partition("/")[0] if name else "default"))
+    data = config.get("data")
+    chosen = data.get("name") if isinstance(data, Mapping) else data
+    return str(logger.get("experiment") or (name.partition("/")[0] if name else chosen) or "Default")
 
 
 def settings(config: Mapping[str, Any]) -> Settings:

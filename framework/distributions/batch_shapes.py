@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Estimate,
     Normals,
@@ -38,6 +39,7 @@ class Stacked(Distribution):
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, densities: Sequence[Distribution]) -> None:
         first = densities[0]
@@ -101,6 +103,7 @@ class Reshaped(Distribution):
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, density: Distribution, batch_shape: torch.Size | tuple[int, ...]) -> None:
         shape = torch.Size(batch_shape)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, circular, grid
+from framework.distributions.description import one_line
 from framework.distributions.highest import crossings, highest
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.picked import PickedMixture
@@ -71,6 +72,7 @@ class Mixture(Distribution):
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, log_weights: Tensor, components: Distribution) -> None:
         if log_weights.shape != components.batch_shape:

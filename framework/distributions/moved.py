@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Estimate,
     Normals,
@@ -41,6 +42,7 @@ class Moved(Distribution):
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, density: Distribution, location: Tensor, scale: Tensor) -> None:
         shape = density.batch_shape + density.event_shape

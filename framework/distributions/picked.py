@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import pick, take
 
 
@@ -20,6 +21,7 @@ class PickedMixture(Distribution):
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+    __repr__ = one_line
 
     def __init__(self, log_weights: Tensor, components: Distribution, index: Tensor, rows: int) -> None:
         self.log_weights = log_weights

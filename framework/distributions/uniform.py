@@ -10,6 +10,7 @@ from torch.distributions import Categorical, Distribution, constraints
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular, circular
 from framework.distributions.density import Mixture
+from framework.distributions.description import one_line
 from framework.distributions.protocol import about, arc, estimate, exactly, marginal, pick, turn
 from framework.errors import UserError
 
@@ -47,6 +48,7 @@ class UniformAngles(Distribution):
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    __repr__ = one_line
 
     def __init__(self, like: Tensor, batch_shape: torch.Size, event_shape: torch.Size) -> None:
         self.like = like

@@ -108,6 +108,8 @@ def opened(config: Config) -> Iterator[Run]:
             if not resumed:
                 _begin_folder(config)
             _describe(run)
+            if resumed:  # how it ended before says nothing of how it ends now
+                tracker.set_tags({"error": None})
             yield run
         except BaseException as error:
             _record(run, error)
@@ -157,7 +159,7 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
     if config.settings.logger.name == "none":
         return NoTracker(config.folder, resumed=resumed)
     parent = os.environ.get(PARENT)
-    named = run_name(config.settings, config.mode, config.overrides)
+    named = run_name(config.settings, _method(config) or config.mode, config.overrides)
     return MlflowTracker(
         config.folder,
         Destination(config.settings.logger.uri, store_experiment(config.values), named, parent, run_id),
@@ -166,9 +168,22 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
     )
 
 
-def run_name(settings: Settings, mode: str, overrides: Sequence[str]) -> str:
-    """What tells a run from its neighbours: the method, then what was changed on the command line, then the seed."""
-    parts = [(settings.experiment_name or mode).rpartition("/")[2]]
+def _method(config: Config) -> str | None:
+    """Return the head that a training without an experiment is called by; None for other runs."""
+    head = config.values.get("density_head")
+    return str(head.get("name")) if config.mode == "train" and isinstance(head, Mapping) else None
+
+
+def run_name(settings: Settings, method: str, overrides: Sequence[str]) -> str:
+    """Return what tells a run from its neighbours.
+
+    That is the method, then what was changed on the command line, then the seed. Up to the first comma it is also the
+    name of the run's model in the store.
+
+    Args:
+        method: of a run without an experiment.
+    """
+    parts = [(settings.experiment_name or method).rpartition("/")[2]]
     for override in overrides:
         key, _, value = override.lstrip("+~").partition("=")
         if key.partition(".")[0] not in (

@@ -4,10 +4,12 @@ import ctypes
 import logging
 import platform
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -27,7 +29,7 @@ from framework.configuration.assembly import (
     require_outliers,
 )
 from framework.configuration.config import Config
-from framework.configuration.description import Description
+from framework.configuration.description import Description, stored_names, stored_shape, stored_target
 from framework.configuration.loading import (
     PREFIX,
     fill,
@@ -53,6 +55,7 @@ from framework.runs.run import Run, goes_on
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
+from framework.storage.reading import guarded
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, told
@@ -170,6 +173,11 @@ def for_training(config: Config) -> Session:
     console = begin(config.settings)
     parts = config.parts
     data = build_data(parts)
+    started = config.settings.checkpoint is not None and not (
+        goes_on(config) and trained(config.folder / "checkpoints")
+    )
+    if started:
+        refuse_other_model(parts, data, config.settings)
     data.prepare()
     introduce(data, console)
     objectives = build_objectives(parts)
@@ -183,9 +191,7 @@ def for_training(config: Config) -> Session:
             if fitted_models(predictor)
             else "Nothing in this model learns by gradient, which objectives work by. Leave objective out."
         )
-    if config.settings.checkpoint is not None and not (
-        goes_on(config) and trained(config.folder / "checkpoints")
-    ):
+    if started:
         start_from(predictor, config.settings, console)
     device = torch.device("cpu")
     method = method_of(config, parts)
@@ -206,6 +212,32 @@ def start_from(predictor: Predictor, settings: Settings, console: Console) -> No
     fill(predictor, weights(read(path)), str(path))
     said = "a run that was stopped goes on with resume=<its folder>"
     console.print(f"starting anew from the weights of {path} ({said})", soft_wrap=True)
+
+
+def refuse_other_model(parts: Resolved, data: Data, settings: Settings) -> None:
+    """Compare the model with the one whose weights it starts from, before data is read or generated.
+
+    It is built for the target and the inputs that the checkpoint describes, unless the data set knows its own target
+    already; `start_from` compares it with the data as they are.
+
+    Raises:
+        CheckpointError: the checkpoint is another model's.
+    """
+    path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
+    content = read(path)
+    described = content.get("framework")
+    if not isinstance(described, Mapping):  # `start_from` says what is wrong with the weights
+        return
+    with guarded(path, "a checkpoint of this framework", kind=CheckpointError):
+        target = getattr(data, "target", None) or stored_target(described["target"])
+        shape = stored_shape(described["input_shape"])
+        columns = stored_names(described.get("columns", ()), "columns")
+    try:
+        fill(build_predictor(parts, target, shape, settings.seed, columns), weights(content), str(path))
+    except ConfigError as error:
+        raise CheckpointError(
+            f"{path} belongs to another model: {error} Use the config it was trained with, or another checkpoint."
+        ) from error
 
 
 def method_of(config: Config, parts: Resolved) -> str:
@@ -346,13 +378,36 @@ def around(
         tests = config.mode != "predict"  # which reads no metrics
         outliers = tests and "outliers" not in chosen and bool(reading_outliers(parts))
         require_said(dropped, ["data", *["metric"] * tests, *["outliers"] * outliers], description.path)
+        if "data" in chosen:
+            require_target(getattr(build_data(parts), "target", None), description)
     data = reader(replace(description, config=parts, dropped=dropped))
     if prepare:
         data.prepare()
         require_fit(data, description)
+    elif "data" in chosen:
+        data.read = partial(_reading, data.read, description)  # type: ignore[method-assign]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     method = description.method or method_of(config, parts)
     return Session(config, parts, method, description.target, data, predictor, device, console)
+
+
+def _reading(
+    read: Callable[[Sequence[Path]], Dataset[Batch]], description: Description, files: Sequence[Path]
+) -> Dataset[Batch]:
+    """Read a user's own files by a data set that the command chose.
+
+    Raises:
+        CheckpointError: the first sample is of another shape than the model reads.
+    """
+    samples = read(files)
+    found, wanted = tuple(fetched(samples, range(1))["input"].shape[1:]), description.input_shape
+    free = len(wanted) == 2  # clouds have any number of points
+    if found[free:] != wanted[free:] or len(found) != len(wanted):
+        raise CheckpointError(
+            f"{description.path} reads inputs of shape {wanted}, but with data={description.config['data']['name']} as "
+            f"this command sets it {files[0]} is one of shape {found}. Leave data out: the model knows its own."
+        )
+    return samples
 
 
 def inherited(config: Config, description: Description) -> Config:
@@ -378,6 +433,24 @@ def require_fit(data: Data, description: Description) -> None:
             f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.told}), but the "
             f"data has inputs of shape {found[0]} and targets {found[1]} ({data.target.told}). Give the data it was "
             "trained on."
+        )
+
+
+def require_target(target: Target | None, description: Description) -> None:
+    """Refuse data that is known, before it is read or generated, to have other targets than the model.
+
+    Raises:
+        CheckpointError: it has.
+    """
+    wanted = description.target
+    if target is not None and (target.kind, target.names, target.size) != (
+        wanted.kind,
+        wanted.names,
+        wanted.size,
+    ):
+        raise CheckpointError(
+            f"{description.path} predicts {wanted.kind} ({wanted.told}), but the data has targets {target.kind} "
+            f"({target.told}). Give the data it was trained on."
         )
 
 
@@ -407,6 +480,8 @@ def quiet() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")
     warnings.filterwarnings("ignore", message=".*does not have many workers", module="pytorch_lightning")
+    # a machine of a cluster, on which nobody asked for SLURM
+    warnings.filterwarnings("ignore", message="The `srun` command is available on your system")
     # ours is resumable, by another way than the one Lightning looks for
     warnings.filterwarnings(
         "ignore", message=".*your dataloader is not resumable", module="pytorch_lightning"

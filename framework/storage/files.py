@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import logging
 import os
 import socket
 import threading
@@ -9,9 +10,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import walk_tb
 
 from filelock import FileLock
 
+_log = logging.getLogger(__name__)
+_THREADS = threading.RLock()
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _CLOSED = (
     errno.EACCES,
@@ -31,11 +36,17 @@ def full(error: OSError) -> bool:
 
 def unwritable(error: BaseException) -> str | None:
     """What is wrong with a place that takes nothing, and what to do, as a sentence; None for any other error."""
-    if not isinstance(error, OSError) or error.errno not in (*_FULL, *_CLOSED):
+    if not isinstance(error, OSError) or not (error.errno in (*_FULL, *_CLOSED) or _unmade(error)):
         return None
     where = f"{error.filename} cannot be written" if error.filename else "A file cannot be written"
     remedy = "Free some space" if full(error) else "Choose a place that can"
     return f"{where} ({error.strerror}). {remedy}."
+
+
+def _unmade(error: OSError) -> bool:
+    """Return whether a folder could not be made; /proc, say, then says that there is no such file."""
+    frames = [frame.f_code.co_name for frame, _ in walk_tb(error.__traceback__)]
+    return error.errno == errno.ENOENT and frames[-1:] == ["mkdir"]
 
 
 @contextmanager
@@ -105,6 +116,48 @@ def lock_within(descriptor: int, seconds: float) -> None:
 
 @contextmanager
 def alone(path: Path) -> Iterator[None]:
-    """Hold the lock `path`; waits for other processes and threads. It ends with the process, whatever ends that."""
-    with FileLock(path, thread_local=False):
+    """Hold the lock `path`; waits for other processes and threads. It ends with the process, whatever ends that.
+
+    A file system without `flock` (Lustre and NFS as some mount them) gets a POSIX record lock, and one without either
+    a warning.
+    """
+    lock = FileLock(path, thread_local=False)
+    try:
+        lock.acquire()
+    except (NotImplementedError, OSError) as error:
+        if not unlockable(error):
+            raise
+        with _alone_by_record(path):
+            yield
+        return
+    try:
         yield
+    finally:
+        lock.release()
+
+
+def unlockable(error: BaseException) -> bool:
+    """Return whether a file system has no such locks."""
+    return isinstance(error, NotImplementedError) or (isinstance(error, OSError) and error.errno in _NO_LOCKS)
+
+
+@contextmanager
+def _alone_by_record(path: Path) -> Iterator[None]:
+    with _THREADS:  # a record lock is the whole process's
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.lockf(descriptor, fcntl.LOCK_EX)
+            except OSError as error:
+                if not unlockable(error):
+                    raise
+                warn_unlocked(path, error)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def warn_unlocked(path: Path, error: BaseException) -> None:
+    """Say that nothing keeps other processes away."""
+    why = error.strerror if isinstance(error, OSError) else error
+    _log.warning("%s: no locks on this file system (%s); let one command at a time use it.", path.parent, why)

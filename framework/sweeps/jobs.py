@@ -19,7 +19,7 @@ from typing import Any
 from framework.errors import ConfigError, UserError
 from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
 from framework.storage.enclosed import read_plain, read_stream
-from framework.storage.files import write_whole
+from framework.storage.files import unlockable, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
 from framework.storage.reading import guarded
 from framework.sweeps.processes import Fresh, Process, Starter
@@ -48,6 +48,7 @@ class Job:
         config: hash of the whole composed config: whether a completed job still stands.
         attempts: how often it was started by this process.
         waits: whether a process of another sweep was seen in its folder.
+        unlocked: whether its folder is on a file system without locks.
     """
 
     number: int
@@ -58,6 +59,7 @@ class Job:
     config: str
     attempts: int = 0
     waits: bool = False
+    unlocked: bool = False
     record: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -352,11 +354,28 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _lock(job: Job) -> int | None:
-    """A descriptor that holds the job's folder; None where a process of another sweep does."""
-    descriptor = os.open(job.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    """A descriptor that holds the job's folder; None where a process of another sweep does.
+
+    A file system without `flock` gets a POSIX record lock, which holds as long as this process lives; one without
+    either a warning.
+    """
+    path = job.folder / ".lock"
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if not unlockable(error):
+                raise
+            try:
+                fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as none:
+                if not unlockable(none):
+                    raise
+                if not job.attempts and not job.unlocked:
+                    warn_unlocked(path, none)
+                job.unlocked = True
+    except (BlockingIOError, PermissionError):
         os.close(descriptor)
         if not job.waits:
             log.info(f"#{job.number} waits: a process of another sweep is still in {job.folder}")

@@ -21,7 +21,7 @@ class SilentTracker(Tracker):
     def log_params(self, flat: Mapping[str, object]) -> None:
         pass
 
-    def set_tags(self, tags: Mapping[str, str]) -> None:
+    def set_tags(self, tags: Mapping[str, str | None]) -> None:
         pass
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:

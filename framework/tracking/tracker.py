@@ -55,8 +55,8 @@ class Tracker(ABC):
         """Record the config, keys dotted. A value stays; another one later becomes a tag `changed.<key>`."""
 
     @abstractmethod
-    def set_tags(self, tags: Mapping[str, str]) -> None:
-        """Record texts that describe the run; the last value of a tag counts."""
+    def set_tags(self, tags: Mapping[str, str | None]) -> None:
+        """Record texts that describe the run; the last value of a tag counts, and None removes it."""
 
     @abstractmethod
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
@@ -118,7 +118,7 @@ class NoTracker(Tracker):
     def log_params(self, flat: Mapping[str, object]) -> None:
         """Nothing: the config is in the run folder."""
 
-    def set_tags(self, tags: Mapping[str, str]) -> None:
+    def set_tags(self, tags: Mapping[str, str | None]) -> None:
         """Nothing: nobody could search them."""
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
@@ -220,7 +220,7 @@ class MlflowTracker(Tracker):
             self._keep_whole(long)
         self._log(params=shown)
 
-    def set_tags(self, tags: Mapping[str, str]) -> None:
+    def set_tags(self, tags: Mapping[str, str | None]) -> None:
         self._log(tags=dict(tags))
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:

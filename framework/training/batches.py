@@ -1,8 +1,11 @@
 """The order of batches, a function of (seed, epoch)."""
 
+import os
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any, final
 
 import pytorch_lightning as pl
@@ -17,6 +20,7 @@ from framework.distributions.noise import hashed
 from framework.errors import ConfigError, DataError
 from framework.storage.progress import tracked
 from framework.target import Target
+from framework.tracking.signals import SIGNALS
 
 Position = tuple[int, int]
 """(epoch, first batch within it), both from 0."""
@@ -164,6 +168,7 @@ class Batches(pl.LightningDataModule):
             self.data.read(self.files),
             batch_size=self.batch_size,
             num_workers=self.workers,
+            worker_init_fn=outlive_signals if self.workers else None,
             collate_fn=as_batch,
             generator=self._generator(),
         )
@@ -184,6 +189,7 @@ class Batches(pl.LightningDataModule):
             ),
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
+            worker_init_fn=outlive_signals if self.workers else None,
             collate_fn=collate or partial(with_targets, self.data.target),
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
             generator=self._generator(),
@@ -213,6 +219,19 @@ class Batches(pl.LightningDataModule):
             epoch, first = epoch.started - 1, processed
         # Overfitting wants the same few batches every time.
         return (0 if trainer.overfit_batches else epoch), first
+
+
+def outlive_signals(worker: int) -> None:
+    """Let a data-loading process go on after a signal to all processes of a run.
+
+    The run then saves its checkpoint and ends its workers itself. A second SIGTERM ends a worker at once.
+    """
+    for number in SIGNALS:
+        signal.signal(number, _end_at_second if number == signal.SIGTERM else signal.SIG_IGN)
+
+
+def _end_at_second(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, lambda *_: os._exit(0))
 
 
 def with_targets(target: Target, items: Mapping[str, Tensor] | list[Batch]) -> Batch:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
 from framework.distributions.noise import seed_step
-from framework.errors import NonFiniteAnswer, NonFiniteLoss
+from framework.errors import ConfigError, NonFiniteAnswer, NonFiniteLoss
 from framework.model import FrozenFrontEnd, Predictor, one_pass
 from framework.objective import Objective, Rival
 from framework.tracking.signals import Stopper
@@ -33,6 +33,9 @@ OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
 }
 FUSED = ("adam", "adamw", "sgd")
 """One pass over the memory of each parameter instead of several, half the time of a small network's step."""
+
+ONE_VALUE = "Expected more than 1 value per channel"
+"""What torch says of batch norm over one value."""
 
 
 class Training(pl.LightningModule):
@@ -104,6 +107,14 @@ class Training(pl.LightningModule):
                 "checkpoints are kept. Lower optimizer.learning_rate, set trainer.gradient_clip_val, or train in "
                 "trainer.precision=32-true."
             ) from answer
+        except ValueError as error:
+            if ONE_VALUE not in str(error):
+                raise
+            raise ConfigError(
+                f"A training batch of {len(batch['input'])} leaves batch norm one value of each channel, and its "
+                "variance needs two. Give a batch_size (and a training split) of at least 2, or choose layers without "
+                "batch norm."
+            ) from error
 
     def _orders(self) -> int:
         """How many models' batches a batch holds, one after the other (training.batches)."""

@@ -9,6 +9,15 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from framework.configuration.settings import OptimizerSettings
 
+WARMUP_SHARE = 0.1
+"""Largest part of a training that its warm-up takes: a training shorter than ten times `warmup_steps` warms up for a
+tenth of its steps. Longer ones are not changed by this."""
+
+
+def warmup(chosen: OptimizerSettings, steps: int) -> int:
+    """Return the steps of the warm-up in a training of so many `steps`."""
+    return min(chosen.warmup_steps, int(WARMUP_SHARE * steps))
+
 
 def schedule(chosen: OptimizerSettings, steps: int, epoch: int) -> Callable[[int], float]:
     """The factor by the number of the optimiser step, from 0.
@@ -17,13 +26,14 @@ def schedule(chosen: OptimizerSettings, steps: int, epoch: int) -> Callable[[int
         steps: of the whole training.
         epoch: steps of one epoch.
     """
+    warming = warmup(chosen, steps)
     if chosen.schedule == "plateau":
-        return Plateau(chosen.factor, chosen.patience, chosen.warmup_steps)
+        return Plateau(chosen.factor, chosen.patience, warming)
     if chosen.schedule == "step":
         starts = [milestone * epoch for milestone in chosen.milestones]
-        return partial(stepped, starts=starts, factor=chosen.factor, warmup_steps=chosen.warmup_steps)
+        return partial(stepped, starts=starts, factor=chosen.factor, warmup_steps=warming)
     total = steps if chosen.schedule == "cosine" else None
-    return partial(smooth, total=total, warmup_steps=chosen.warmup_steps)
+    return partial(smooth, total=total, warmup_steps=warming)
 
 
 def warm(step: int, warmup_steps: int) -> float:

@@ -70,6 +70,13 @@ class PoolLauncher(Launcher):
         hydra = self.config.hydra
         configure_log(hydra.hydra_logging, hydra.verbose)
         folder = Path(str(hydra.sweep.dir)).absolute()
+        if not job_overrides:
+            _leave_nothing(folder)
+            swept = [one for one in hydra.overrides.task if one.endswith(")")]
+            raise ConfigError(
+                f"{' '.join(swept) or 'The sweep'} has no value, so there is no job. Give a range that holds a number, "
+                "or a glob that fits a name."
+            )
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
         # for the rehearsal, which takes longer than other sweeps should wait
         for index, config in enumerate(configs, initial_job_idx):

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 from torch.nn.functional import logsigmoid
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     each_cdf,
     estimate,
@@ -32,6 +33,7 @@ class BernoulliImage(Distribution):
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    __repr__ = one_line
 
     def __init__(self, logits: Float[Tensor, "*batch height width number"]) -> None:
         self.logits = logits

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     each_cdf,
     estimate,
@@ -33,6 +34,7 @@ class LaplaceImage(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = True
+    __repr__ = one_line
 
     def __init__(
         self, location: Float[Tensor, "*batch height width number"], scale: Float[Tensor, "*any"]

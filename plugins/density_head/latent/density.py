@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.description import one_line
 from framework.distributions.protocol import Estimate, estimate, marginal, median, peaks, scales, tempered
 from framework.distributions.tempering import tempered_classes
 from framework.distributions.uniform import uniform
@@ -101,6 +102,7 @@ class LatentDensity(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, latent: Latent, effort: Effort) -> None:
         self.latent = latent

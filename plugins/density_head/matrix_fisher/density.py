@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid
+from framework.distributions.description import one_line
 from framework.distributions.panels import entropy_of_one
 from framework.distributions.protocol import estimate, exactly, marginal, pick, take, tempered
 from framework.distributions.uniform import uniform
@@ -45,6 +46,7 @@ class MatrixFisher(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, parameter: Float[Tensor, "*batch 3 3"], dtype: torch.dtype | None = None) -> None:
         self.parameter = parameter
@@ -102,6 +104,7 @@ class Angle(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, joint: MatrixFisher, index: int) -> None:
         self.joint = joint

@@ -9,6 +9,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular
 from framework.distributions.density import merged
+from framework.distributions.description import one_line
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
@@ -40,6 +41,7 @@ class Floored(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(self, density: Distribution, weight: float, floor: Distribution | None = None) -> None:
         self.density = density

@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints, register_kl
 
 from framework.distributions.circular import circular
+from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Slope,
     about,
@@ -39,6 +40,7 @@ class VonMises(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
+    __repr__ = one_line
 
     def __init__(
         self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]

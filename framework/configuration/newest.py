@@ -1,0 +1,30 @@
+"""The newest run of the working directory, which `checkpoint=last` means."""
+
+import os
+from pathlib import Path
+
+from framework.errors import CheckpointError
+
+LAST = "last"
+MODELS = ("model.ckpt", "best.ckpt", "last.ckpt", "previous.ckpt")
+
+
+def newest_run(outputs: Path) -> Path:
+    """Return the folder of the run below `outputs` whose checkpoints were written last; links are not followed.
+
+    Raises:
+        CheckpointError: no run there has a checkpoint.
+    """
+    written: dict[Path, float] = {}
+    for name, below, files in os.walk(outputs):
+        folder = Path(name)
+        times = [(folder / file).lstat().st_mtime for file in files if file in MODELS]
+        if folder.name == "checkpoints" and times:
+            written[folder.parent] = max(times)
+            below.clear()
+    if not written:
+        raise CheckpointError(
+            f"checkpoint={LAST} names the newest run in {outputs}, and no run there has a checkpoint. Train one, or "
+            "give the folder of a run elsewhere."
+        )
+    return max(written, key=lambda folder: (written[folder], str(folder)))

@@ -1,0 +1,42 @@
+"""A density in one line, for a notebook: its kind, its shapes and what its distribution parameters are."""
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+LONGEST = 200
+"""Most characters of a line."""
+WHOLE = 6
+"""Most numbers of a parameter that are shown; of more the range is."""
+
+
+def one_line(density: Distribution) -> str:
+    """Return the kind of a density, its shapes, its names where it has some, and its parameters.
+
+    Nothing is drawn or integrated for it. Densities take it as their `__repr__`.
+    """
+    batch, event = (tuple(shape) for shape in (density.batch_shape, density.event_shape))
+    said = [f"batch={batch}", f"event={event}"]
+    names = getattr(density, "names", ())
+    if names:
+        said.append(f"names={', '.join(map(str, names[:WHOLE]))}{', …' * (len(names) > WHOLE)}")
+    said += [f"{key}={text}" for key, value in vars(density).items() if (text := _parameter(key, value))]
+    line = f"{type(density).__name__}({', '.join(said)})"
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 2]}…)"
+
+
+def _parameter(key: str, value: object) -> str:
+    """Return a parameter in a few characters; '' for what is none."""
+    if key.startswith("_"):
+        return ""
+    if isinstance(value, Distribution):
+        return type(value).__name__
+    if not isinstance(value, Tensor) or not value.numel():
+        return ""
+    numbers = value.detach()
+    if numbers.numel() <= WHOLE:
+        return f"[{', '.join(f'{number:.4g}' for number in numbers.flatten().tolist())}]"
+    if numbers.dtype == torch.bool or numbers.is_complex():
+        return ""
+    least, most = (float(number) for number in (numbers.min(), numbers.max()))
+    return f"{least:.4g}…{most:.4g}"
