@@ -30,7 +30,8 @@ def to_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
 def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]:
     """KL(u ‖ p) = E_u[-log p] - H(u) of a continuous density, nats, from a few targets drawn from u; unbiased.
 
-    u is uniform in every angle, over the range that the density's support gives it, and N(0, scale²) in every real.
+    u is uniform in every angle and N(0, scale²) in every real. Where the density's support has ranges, the angles are
+    those of a rotation, and u is uniform over rotations: sin e is uniform of an elevation e in [-π/2, π/2].
     Places are a Latin hypercube: each of n equal shares of each number's mass holds one (McKay, Beckman & Conover
     1979), so that the estimate of one number errs by O(n^-3/2) and not O(n^-1/2). All members of a batch of
     (batch, member) see the same targets.
@@ -43,12 +44,18 @@ def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]
     if isinstance(support, Circular):
         ranges = support.ranges or ((-math.pi, math.pi),) * numbers
         low, high = torch.tensor(ranges, dtype=place.dtype, device=place.device).T
-        drawn = low + place * (high - low)
-        entropy = sum(math.log(highest - lowest) for lowest, highest in ranges)
+        # an elevation, half a turn, has the density cos e / 2 of random rotations
+        elevation = high - low < 1.5 * math.pi
+        drawn = torch.where(elevation, (2 * place - 1).asin(), low + place * (high - low))
+        log_each = torch.where(elevation, (drawn.cos() / 2).log(), -(high - low).log())
+        entropy = -log_each.sum(-1).mean(
+            0
+        )  # at the targets drawn: of equal densities nothing is left to chance
     else:
         drawn = scale * normal_quantile(place)
         entropy = numbers * (0.5 + 0.5 * math.log(2 * math.pi) + math.log(scale))
-    return -density.log_prob(drawn.to(like.dtype)).mean(0) - entropy
+    found = -density.log_prob(drawn.to(like.dtype)).mean(0)
+    return found - torch.as_tensor(entropy).to(found)
 
 
 def latin_hypercube(shape: tuple[int, ...], device: torch.device) -> Float[Tensor, "draw *shape"]:
