@@ -113,13 +113,15 @@ def _in_degrees(key: str, title: str) -> bool:
     return "deg" in key.split("_") or "degrees" in key.split("_") or "°" in title
 
 
-def scaled(columns: Mapping[str, str], found: Numbers, wanted: Numbers, numbers: int, worst: Worst) -> None:
+def scaled(
+    columns: Mapping[str, str], found: Numbers, again: Numbers, wanted: Numbers, numbers: int, worst: Worst
+) -> None:
     """Of reals in another unit, SCALE times as large, a number scales or does not, and its standard error likewise;
     logarithms of densities shift by nats.
 
     Args:
         columns: the metric's.
-        found, wanted: its numbers in the other unit, and in the first.
+        found, again, wanted: its numbers in the other unit, in one SCALE times as large as that, and in the first.
         numbers: how many reals a target has.
     """
     worst.count(False, "no number scales")
@@ -127,6 +129,8 @@ def scaled(columns: Mapping[str, str], found: Numbers, wanted: Numbers, numbers:
         if key.endswith(SEM) or not value.isfinite() or not found[key].isfinite() or value == 0:
             continue
         power = _power(found[key], value)
+        if power is not None and _power(again[key], found[key]) != power:
+            continue  # a share that happens to be so many times as large
         title = f"{key} {columns.get(key, '')}".lower()
         worst.count(
             power == 2 and (not SQUARES.search(title) or bool(ROOTS.search(title))),

@@ -448,15 +448,17 @@ def _unit(build: Make, row: MetricRow, worst: Worst) -> None:
         wide = [_after(build, other, [index]) for other in (anywhere, some, far)]
         degrees(columns, wide, _after(build, off, [index]), worst)
     if kind == "real":
-        large = replace(
-            some,
-            target=some.target.double() * SCALE,
-            place=some.place.double() * SCALE,
-            breadth=torch.full((SAMPLES,), SCALE, dtype=torch.float64),
+        first, other, again = (
+            replace(
+                some,
+                target=some.target.double() * scale,
+                place=some.place.double() * scale,
+                breadth=torch.full((SAMPLES,), scale, dtype=torch.float64),
+            )
+            for scale in (1.0, SCALE, SCALE**2)
         )
-        small = replace(some, target=some.target.double(), place=some.place.double())
-        found, wanted = (_after(build, other, [index]) for other in (large, small))
-        scaled(columns, found, wanted, len(row.target.names), worst)
+        wanted, found, more = (_after(build, one, [index]) for one in (first, other, again))
+        scaled(columns, found, more, wanted, len(row.target.names), worst)
     worst.count(False, "nothing has a unit")
 
 
