@@ -1,8 +1,8 @@
-"""What the contracts of other parts are worth: python benchmarks/check_parts.py GROUP [seeds, 20 by default] [names ...]
+"""What contracts of other parts are worth: python benchmarks/check_parts.py GROUP [seeds, 20 by default] [names ...]
 
-GROUP is data, metric, encoder or renderer. Finds the planted faults of tests/planted_*.py, and counts false alarms: every
-row of every part that is shipped, and right parts as strangers write them, over seeds of everything that is drawn. Writes
-check_<group>.md beside this file, after each seed. With names only those shipped parts are tried.
+GROUP is data, metric, encoder or renderer. Finds the planted faults of tests/planted_*.py, and counts false alarms:
+every row of every part that is shipped, and right parts as strangers write them, over seeds of everything that is
+drawn. Writes check_<group>.md beside this file, after each seed. With names only those shipped parts are tried.
 """
 
 import statistics
