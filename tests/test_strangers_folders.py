@@ -177,7 +177,7 @@ def mlflow_database(once: Once) -> Path:
     """An SQLite store with an experiment, which takes MLflow seconds to make."""
 
     def make(folder: Path) -> None:
-        made = f"c = MlflowClient('sqlite:///{folder}/mlflow.db'); c.create_experiment('default', '{folder}/artifacts')"
+        made = f"c = MlflowClient('sqlite:///{folder}/mlflow.db'); c.create_experiment('dial', '{folder}/artifacts')"
         code = f"from mlflow import MlflowClient; {made}"
         subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=200, cwd=folder)
 

@@ -5,7 +5,7 @@ import os
 import stat
 import sys
 from contextlib import suppress
-from typing import final
+from typing import Any, final
 
 
 @final
@@ -15,10 +15,10 @@ class DroppingWriter(io.FileIO):
     Then its descriptor becomes that of the null device, so that child processes lose nothing but their output, too.
     """
 
-    def write(self, data: "bytes | bytearray | memoryview", /) -> int:  # type: ignore[override]
+    def write(self, data: Any, /) -> int | None:
         """Write, or drop where nobody reads any more."""
         try:
-            return super().write(data) or 0
+            return super().write(data)
         except (BrokenPipeError, ConnectionResetError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self.fileno())
