@@ -9,7 +9,7 @@ from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.distributions.batch_shapes import Stacked
-from framework.errors import ConfigError
+from framework.errors import ConfigError, UserError
 from framework.model import Predictor, each_alone
 from framework.objective import Objective
 from framework.target import Target
@@ -22,6 +22,8 @@ from framework.testing.wrappers import LENGTH
 Make = Callable[[float], Objective]
 """Builds the row's objective with its weight times a factor."""
 SAMPLES = 12
+MANY = 130
+DRAWS = 8
 
 
 class Network(nn.Module):
@@ -79,7 +81,13 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
         "same seed, same bits": (0.0, lambda worst: _repeatable(build, row, worst)),
         "leaves no trace": (0.0, lambda worst: _traces(build, row, worst)),
         "order does not matter": (1e-5, lambda worst: _order(build, row, worst)),
+        "every sample counts": (0.0, lambda worst: _each_sample(build, row, worst)),
+        "a mean over samples": (1e-5, lambda worst: _mean(build, row, worst)),
         "members train as if alone": (1e-5, lambda worst: _members(build, row, worst)),
+        "members that differ": (1e-5, lambda worst: _different_members(build, row, worst)),
+        "terms to be logged": (0.0, lambda worst: _told(build, row, worst)),
+        "random numbers of others": (0.0, lambda worst: _generator(build, row, worst)),
+        "NaN is not hidden": (0.0, lambda worst: _nan(build, row, worst)),
         "number types": (0.0, lambda worst: _number_types(build, row, worst)),
         "extreme raw numbers": (0.0, lambda worst: _extreme(build, row, worst)),
         "empty and single batches": (0.0, lambda worst: _small(build, row, worst)),
@@ -231,6 +239,101 @@ def _order(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     wanted = penalty(build(1.0), predictor, batch).item()
     found = penalty(build(1.0), predictor, backwards).item()
     worst.see(abs(found - wanted) / max(abs(wanted), 1e-6), f"backwards {found:.9g}, forwards {wanted:.9g}")
+
+
+def _each_sample(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """In a batch of MANY the first, the last and one between have a part in the penalty; in evaluation."""
+    objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, MANY)
+    wanted = penalty(objective, predictor, batch).item()
+
+    def changed(at: slice) -> bool:
+        other = {**batch, "input": batch["input"].clone(), "target": batch["target"].clone()}
+        other["input"][at] = 1.5 - 2 * batch["input"].flip(0)[at]
+        other["target"][at] = (1 + batch["target"][at]) % max(2, len(row.target.names))
+        return penalty(objective, predictor, other).item() != wanted
+
+    if not changed(slice(None)):
+        worst.count(False, "reads no sample of the batch")
+        return
+    for at in (0, MANY // 2, MANY - 1):
+        worst.count(not changed(slice(at, at + 1)), f"sample {at} of {MANY} changes nothing")
+
+
+def _mean(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """A batch in which every sample comes twice has the same penalty: a weight means the same in a batch of any size.
+
+    Of one that draws random numbers on average over DRAWS seeds, and about.
+    """
+    objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, SAMPLES)
+    twice = {name: torch.cat([field, field]) for name, field in batch.items()}
+    found = []
+    for some in (batch, twice):
+        values = []
+        for number in range(DRAWS):
+            torch.manual_seed(number)
+            values.append(objective(predictor, some).item())
+        found.append(values)
+    wanted, doubled = (sum(values) / DRAWS for values in found)
+    error = abs(doubled - wanted) / max(abs(wanted), 1e-6)
+    if len(set(found[0])) > 1:
+        error = max(0.0, error - 0.4)
+    worst.see(error, f"every sample twice {doubled:.9g}, once {wanted:.9g}")
+
+
+def _different_members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """The penalty is the mean of those of the members alone, and each one's gradient its own; without dropout."""
+    objective, together, batch = build(1.0), predictor_of(row, 3).eval(), batch_of(row, SAMPLES)
+    whole = gradients(objective, together, batch)
+    found, each = penalty(objective, together, batch).item(), []
+    for index, network in enumerate(together.networks):
+        alone = predictor_of(row).eval()
+        alone.networks[0].load_state_dict(network.state_dict())
+        each.append(penalty(objective, alone, batch).item())
+        for name, gradient in gradients(objective, alone, batch).items():
+            other = whole.get(name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient))
+            scale = gradient.abs().max().clamp(min=1e-6)
+            worst.see((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
+    wanted = sum(each) / len(each)
+    worst.see(
+        abs(found - wanted) / max(abs(wanted), 1e-6), f"penalty of three {found:.9g}, their mean {wanted:.9g}"
+    )
+
+
+def _told(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """Scalars without a graph, of the last batch."""
+    objective = build(1.0)
+    penalty(objective, predictor_of(row), batch_of(row, SAMPLES))
+    worst.count(False, "none")
+    for name, term in objective.told.items():
+        worst.same(f"shape of {name}", tuple(term.shape), ())
+        worst.count(term.requires_grad, f"{name} holds the graph of the batch")
+        worst.finite(name, term)
+
+
+def _generator(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """What others draw after a penalty still depends on the seed before it."""
+    objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, SAMPLES)
+    drawn = []
+    for number in (0, 1):
+        torch.manual_seed(number)
+        objective(predictor, batch)
+        drawn.append(torch.rand(4))
+    worst.count(torch.equal(*drawn), "two seeds, and the same random numbers after the penalty")
+
+
+def _nan(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """A network that gives NaN has a penalty of NaN, or is refused."""
+    predictor = predictor_of(row).eval()
+    with torch.no_grad():
+        for network in predictor.networks:
+            assert isinstance(network, Network)
+            network.last.weight.fill_(float("nan"))
+    try:
+        found = penalty(build(1.0), predictor, batch_of(row, SAMPLES))
+    except (ValueError, UserError):
+        worst.count(False, "refused")
+        return
+    worst.count(bool(found.isfinite()), f"penalty {found.item():g} of a network that gives NaN")
 
 
 def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:

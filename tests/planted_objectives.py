@@ -1,0 +1,157 @@
+"""Objectives as somebody else may write them: a right one, and others wrong in one thing each."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.calibration.module_flags import BATCH_NORM, flagged
+from framework.data import Batch
+from framework.model import Predictor, each_alone
+from framework.objective import Objective
+from framework.target import Target
+from tests.planted_heads import CLASSES, PLACE
+
+
+class Confidence(Objective):
+    """Punishes large log-densities of the label, sample by sample and member by member."""
+
+    bibtex = ""
+
+    def __init__(self, *, weight: float = 1.0) -> None:
+        super().__init__()
+        self.weight = weight
+
+    def each(self, predictor: Predictor, batch: Batch) -> Tensor:
+        """Of each sample, (batch,) or (batch, member)."""
+        with flagged(predictor, BATCH_NORM, "track_running_stats", False):  # the loss has counted this batch
+            density = predictor.training_densities(batch["input"])
+        target = batch["target"]
+        if len(density.batch_shape) == 2:
+            target = target.unsqueeze(1).expand(len(target), density.batch_shape[1], *target.shape[1:])
+        return density.log_prob(target).square().log1p()
+
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        found = each_alone(self.each(predictor, batch))
+        return self.weight * (found.mean() if len(found) else found.sum())
+
+
+class Summed(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return self.weight * each_alone(self.each(predictor, batch)).sum()
+
+
+class MeanOfMembers(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return self.weight * self.each(predictor, batch).sum() / max(1, self.each(predictor, batch).numel())
+
+
+class OfTheSurest(Confidence):
+    """Judges the members by the one that is worst on each sample."""
+
+    def each(self, predictor: Predictor, batch: Batch) -> Tensor:
+        found = super().each(predictor, batch)
+        return found if found.dim() == 1 else found.amax(-1, keepdim=True).expand_as(found)
+
+
+class FirstSixtyFour(Confidence):
+    def each(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return super().each(predictor, {name: field[:64] for name, field in batch.items()})
+
+
+class DropsTheLast(Confidence):
+    def each(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return super().each(predictor, batch)[: max(1, len(batch["target"]) // 8 * 8)]
+
+
+class TellsTheGraph(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        found = super().forward(predictor, batch)
+        self.told = {"confidence": found}
+        return found
+
+
+class TellsEach(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        self.told = {"confidence": self.each(predictor, batch).detach()}
+        return super().forward(predictor, batch)
+
+
+class Seeds(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        torch.manual_seed(0)
+        return super().forward(predictor, batch)
+
+
+class HidesNaN(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return super().forward(predictor, batch).nan_to_num()
+
+
+class Detached(Confidence):
+    def each(self, predictor: Predictor, batch: Batch) -> Tensor:
+        found = super().each(predictor, batch)
+        return found * found.detach()
+
+
+class Clamped(Confidence):
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return super().forward(predictor, batch).clamp(max=10)
+
+
+class Moving(Confidence):
+    """Less the penalties that it has seen before."""
+
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        found = super().forward(predictor, batch)
+        seen = getattr(self, "seen", 0.0)
+        self.seen: Any = 0.9 * seen + 0.1 * found.item()
+        return found - seen
+
+
+class Evaluates(Confidence):
+    """In evaluation mode, in which it leaves the predictor."""
+
+    def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
+        return super().forward(predictor.eval(), batch)
+
+
+class Neighbours(Confidence):
+    """Weighted by place in the batch."""
+
+    def each(self, predictor: Predictor, batch: Batch) -> Tensor:
+        found = super().each(predictor, batch)
+        weight = torch.linspace(0.5, 1.5, len(found), dtype=found.dtype)
+        return found * weight.reshape(-1, *(1,) * (found.dim() - 1))
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One wrong objective: what is wrong, its class, the target, and a property that has to find it."""
+
+    name: str
+    kind: Callable[..., Objective]
+    target: Target
+    by: str
+
+
+ALL_FAULTS = (
+    Fault("a sum over samples", Summed, CLASSES, "a mean over samples"),
+    Fault("a mean over members too", MeanOfMembers, CLASSES, "members train as if alone"),
+    Fault("the worst member stands for all", OfTheSurest, CLASSES, "members that differ"),
+    Fault("the first 64 of a batch", FirstSixtyFour, CLASSES, "every sample counts"),
+    Fault("the last ones of a batch are left out", DropsTheLast, PLACE, "every sample counts"),
+    Fault("logs with the graph", TellsTheGraph, CLASSES, "terms to be logged"),
+    Fault("logs every sample", TellsEach, PLACE, "terms to be logged"),
+    Fault("seeds the generator", Seeds, CLASSES, "random numbers of others"),
+    Fault("NaN is 0", HidesNaN, PLACE, "NaN is not hidden"),
+    Fault("half of the gradient is detached", Detached, PLACE, "gradient"),
+    Fault("never above 10", Clamped, PLACE, "weight is a factor"),
+    Fault("less what it has seen", Moving, CLASSES, "same seed, same bits"),
+    Fault("leaves the evaluation mode", Evaluates, CLASSES, "leaves no trace"),
+    Fault("weighs by place", Neighbours, CLASSES, "order does not matter"),
+)
+
+RIGHT: Mapping[str, Callable[..., Objective]] = {"confidence": Confidence}
