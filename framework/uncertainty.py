@@ -28,6 +28,9 @@ class Uncertainty(Predictor):
     knobs: Mapping[str, tuple[int, ...]] = {}
     """Attributes that trade error for run time and may be set at any time after training, with the values worth
     trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
+    remark: str = ""
+    """What `calibrate` found that whoever uses the model should know, a sentence that it sets; runs print it, and it
+    travels with the model. "" where there is nothing to say."""
 
     @abstractmethod
     def forward(self, inputs: Tensor) -> Distribution:
@@ -62,6 +65,12 @@ class Several(ABC):
     @abstractmethod
     def clip_each(self, most: float) -> None:
         """Shorten the gradient of each to the norm `most` where it is longer."""
+
+
+def remarks(predictor: Predictor) -> tuple[str, ...]:
+    """What its wrappers found when they were calibrated, the innermost last."""
+    found = (one.remark for one in predictor.modules() if isinstance(one, Uncertainty))
+    return tuple(dict.fromkeys(remark for remark in found if remark))
 
 
 def outermost(predictor: Predictor) -> Several | None:

@@ -11,10 +11,12 @@ from framework.configuration.paths import MODEL, UNUSED, require_said, without_p
 from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
-from framework.errors import CheckpointError, quoted
+from framework.errors import CheckpointError, quoted, shown
 from framework.storage.limits import LONGEST_NAME, MOST_DRAWN, MOST_DRAWS, MOST_INPUT, MOST_NAMES, MOST_SIDES
 from framework.target import Kind, Target
 
+MOST_REMARKS, LONGEST_REMARK = 8, 500
+"""Remarks of a stored model that are read, and letters of each."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
 """Settings that a later test of the model repeats, so that it gives the numbers of the model's own run."""
 
@@ -34,6 +36,7 @@ class Description:
         path: of the checkpoint it was read from.
         dropped: paths that the stored config names and the user has not said again, by dotted keys; in `config` they
             have their defaults.
+        remarks: what the wrappers found when they were calibrated (`Uncertainty.remark`).
     """
 
     config: Resolved
@@ -46,13 +49,17 @@ class Description:
     data_state: Mapping[str, Any] = field(default_factory=dict)
     path: str = ""
     dropped: Mapping[str, Any] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, parts: Resolved, data: Data, method: str, settings: Settings) -> "Description":
+    def of(
+        cls, parts: Resolved, data: Data, method: str, settings: Settings, remarks: tuple[str, ...] = ()
+    ) -> "Description":
         """Of a model made of `parts` for `data`, which is prepared."""
         kept = {key: getattr(settings, key) for key in INHERITED}
         state = dict(data.state_dict())
-        return cls(parts, data.target, data.input_shape, data.columns, data.synthetic, method, kept, state)
+        about = data.target, data.input_shape, data.columns, data.synthetic
+        return cls(parts, *about, method, kept, state, remarks=remarks)
 
     def __str__(self) -> str:
         parts = [*self.config["encoder"], self.config["density_head"], *self.config["uncertainty"]]
@@ -70,6 +77,7 @@ class Description:
                 f"  predicts {unit[self.target.kind]}: {self.target.told}",
                 f"  made of  {names}",
                 f"  from     {self.path}",
+                *(f"  {remark}" for remark in self.remarks),
             ]
         )
 
@@ -116,6 +124,7 @@ class Description:
             dict(stored.get("data_state", {})),
             path,
             dropped,
+            tuple(shown(remark, LONGEST_REMARK) for remark in list(stored.get("remarks", ()))[:MOST_REMARKS]),
         )
 
 

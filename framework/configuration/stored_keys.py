@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from framework.configuration.registry import GROUPS
 
-READING = ("test", "predict", "work_precision", "combine")
+READING = ("test", "calibrate", "predict", "work_precision", "combine")
 """Modes that take the plugins of a stored model where the command chooses none."""
 
 

@@ -11,9 +11,12 @@ from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
 from framework.storage.enclosed import require_enclosed
 
-MODES = ("train", "test", "combine", "predict", "encode", "work_precision", "check", "plugins", "sync")
+MODES = (
+    *("train", "test", "calibrate", "combine", "predict", "encode", "work_precision", "check", "plugins"),
+    "sync",
+)
 
-READING = ("train", "test", "predict", "work_precision")
+READING = ("train", "test", "calibrate", "predict", "work_precision")
 """Modes that read `checkpoint`; training starts from its weights."""
 
 

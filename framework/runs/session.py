@@ -60,6 +60,7 @@ from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, told
 from framework.training.checkpoint import WholeCheckpoints, trained
+from framework.uncertainty import remarks
 
 FEW = 8
 """With so many validation samples wrappers are tried before training: some want more than one."""
@@ -124,7 +125,8 @@ class Session:
 
     def description(self) -> dict[str, Any]:
         """What a checkpoint holds beside the weights."""
-        return Description.of(self.parts, self.data, self.method, self.settings).stored()
+        remarks_now = remarks(self.predictor)
+        return Description.of(self.parts, self.data, self.method, self.settings, remarks_now).stored()
 
     def record(self, run: Run) -> None:
         """Tell the run what it is fed, and leave what to cite with it."""
@@ -388,6 +390,8 @@ def around(
         data.read = partial(_reading, data.read, description)  # type: ignore[method-assign]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     method = description.method or method_of(config, parts)
+    for remark in description.remarks:
+        console.print(remark, soft_wrap=True, highlight=False, markup=False)
     return Session(config, parts, method, description.target, data, predictor, device, console)
 
 
@@ -460,6 +464,8 @@ def calibrate(session: Session) -> None:
     seed_step(session.settings.seed, 0, "calibrate")
     batches = told(session.blocks().val_dataloader(), "calibrating")
     session.predictor.calibrate(on_device(batches, session.device))
+    for remark in remarks(session.predictor):
+        session.console.print(remark, soft_wrap=True, highlight=False, markup=False)
 
 
 def keep_memory() -> None:

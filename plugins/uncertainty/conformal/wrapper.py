@@ -21,6 +21,10 @@ from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
 SEED = 71
 """Of the split into halves."""
+NEAR = 0.03
+"""How far a coverage may be from the promised one without a word, and the rows that keep it there in 90 % of cases."""
+NINETY = 1.645
+"""Standard deviations that hold the middle 90 % of a normal density, to either side."""
 _log = logging.getLogger(__name__)
 
 
@@ -108,6 +112,7 @@ class Conformal(Uncertainty):
         scores = torch.cat([one.scores(batch["target"]) for one, batch in zip(sets, mine, strict=True)])
         require_numbers(scores, mine, "score")
         self.threshold.fill_(threshold(scores, self.miscoverage))
+        self.remark = remark(len(scores), self.miscoverage)
         if self.threshold.isinf():
             _log.warning(
                 "conformal: with %d validation samples no set short of everything is certain to miss %g of the targets "
@@ -136,10 +141,37 @@ def halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
     return found
 
 
+def remark(count: int, miscoverage: float) -> str:
+    """How far the sets from so many scores may cover more or less than promised, and how many rows would tell better.
+
+    The share that sets from n distinct scores cover is itself random, Beta(k, n + 1 - k) with k as in `threshold`
+    (Vovk 2012, prop. 2a): on average over validation sets it is k / (n + 1).
+    """
+    left_out = _left_out(count, miscoverage)
+    if not left_out:
+        return f"conformal: the threshold is set by {count} validation rows, too few for any: the sets are everything."
+    from scipy.special import betaincinv  # importing SciPy takes longer than most commands need it
+
+    low, high = betaincinv(count + 1 - left_out, left_out, [0.05, 0.95])
+    told = (
+        f"conformal: the threshold is set by {count} validation rows; of sets that so many make, 90 % hold between "
+        f"{100 * low:.3g} and {100 * high:.3g} % of the targets, where {100 * (1 - miscoverage):g} % are promised on "
+        "average over validation sets"
+    )
+    if max(high - (1 - miscoverage), 1 - miscoverage - low) <= NEAR:
+        return f"{told}."
+    wanted = math.ceil(miscoverage * (1 - miscoverage) * (NINETY / NEAR) ** 2)
+    return f"{told}. These are few: about {wanted:,} keep it within {100 * NEAR:g} %."
+
+
+def _left_out(count: int, miscoverage: float) -> int:
+    """How many of n scores are above the threshold or at it, ⌊(n + 1) α⌋."""
+    # from the other side, so that (n + 1) α is whole where it should be: α itself is rounded
+    return min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
+
+
 def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
     """The k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉ (Vovk, Gammerman & Shafer 2005, §4.1); infinite if k > n."""
     count = len(scores)
-    # from the other side, so that (n + 1) α is whole where it should be: α itself is rounded
-    # k is at least 1
-    left_out = min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
+    left_out = _left_out(count, miscoverage)  # k is at least 1
     return scores.sort().values[count - left_out].item() if left_out else math.inf

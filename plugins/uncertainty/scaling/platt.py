@@ -95,6 +95,7 @@ class Platt(Uncertainty):
         slope, biases = fit(log_prob, label, smoothing=self.smoothing)
         self.slope.fill_(slope)
         self.biases.copy_(biases)
+        self.remark = f"platt: slope {slope:.3g}, the likeliest of {len(label)} validation rows."
 
 
 def fit(

@@ -81,6 +81,8 @@ class Temperature(Uncertainty):
         self.model.calibrate(seen)
         found = fit(densities(self.model, seen), seen, self.lower, self.upper)
         self.temperature.fill_(found)
+        rows = sum(len(batch["target"]) for batch in seen)
+        self.remark = f"temperature: {found:.3g}, the likeliest of {rows} validation rows."
 
 
 def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: float, upper: float) -> float:

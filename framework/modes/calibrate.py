@@ -1,0 +1,127 @@
+"""mode=calibrate: wrappers around a trained model, fitted to the validation split and tested."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.configuration.config import Config, Options
+from framework.configuration.registry import load
+from framework.configuration.schema import build, resolve
+from framework.datasets.fields import fetched
+from framework.distributions.protocol import value_set
+from framework.errors import ConfigError
+from framework.model import FrozenFrontEnd, Predictor
+from framework.reports.report import report_test
+from framework.runs.run import opened
+from framework.runs.session import calibrate, for_trained, tested
+from framework.target import Target
+from framework.uncertainty import Several
+
+FEW = 2
+"""Samples of which wrappers are tried before anything is fitted."""
+
+
+class CalibrateOptions(Options):
+    """Nothing: what is fitted is chosen by `uncertainty`."""
+
+
+def run(config: Config) -> None:
+    """Write checkpoints/model.ckpt, which every other mode takes; print its table row.
+
+    Raises:
+        ConfigError: no wrapper is chosen, or one that has to be trained, or has been fitted already.
+    """
+    config.options(CalibrateOptions)
+    wrappers = chosen(config.values.get("uncertainty") or {})
+    session = for_trained(config)
+    there = [part["name"] for part in session.parts["uncertainty"]]
+    for part in wrappers:
+        if part["name"] in there:
+            raise ConfigError(
+                f"uncertainty={part['name']}: {config.settings.checkpoint} is wrapped in {' + '.join(there)} already, "
+                "and another one around it would fit what was fitted. Give the checkpoint of the model without it, or "
+                "another wrapper."
+            )
+    parts = {**session.parts, "uncertainty": [*session.parts["uncertainty"], *wrappers]}
+    method = " + ".join([session.method, *(part["name"] for part in wrappers)])
+    splits = session.data.splits()
+    inputs = fetched(splits.validation, range(min(FEW, len(splits.validation))))["input"]  # type: ignore[arg-type]
+    predictor = around_trained(session.predictor, wrappers, session.target, inputs)
+    session = tested(replace(session, parts=parts, method=method, predictor=predictor))
+    with opened(session.config) as run:
+        session.record(run)
+        calibrate(session)
+        session.save_model(run)
+        report_test(run, session)
+
+
+def chosen(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The wrappers of a config, innermost first, checked.
+
+    Raises:
+        ConfigError: there is none, or one of them trains several models.
+    """
+    if not wrappers:
+        raise ConfigError(
+            "mode=calibrate fits wrappers to a trained model, and none is chosen. Give uncertainty=[...], of which "
+            "mode=plugins lists the names."
+        )
+    found = [resolve("uncertainty", part, f"uncertainty.{key}") for key, part in wrappers.items()]
+    for part in found:
+        if issubclass(load("uncertainty", part["name"]), Several):
+            raise ConfigError(
+                f"uncertainty={part['name']} trains several models, and a checkpoint holds one. Train it with "
+                "mode=train, or join models that were trained apart with mode=combine mode.members=[...]."
+            )
+    return found
+
+
+@torch.no_grad()
+def around_trained(
+    predictor: Predictor, wrappers: Sequence[Mapping[str, Any]], target: Target, inputs: Tensor
+) -> Predictor:
+    """A trained predictor in wrappers, behind its fixed encoders, in evaluation mode.
+
+    Args:
+        inputs: of a few samples.
+
+    Raises:
+        ConfigError: a wrapper wants more than one model, has weights of its own to be trained, or drops the sets that
+            what it wraps promises; or as it says.
+    """
+    front = predictor if isinstance(predictor, FrozenFrontEnd) else None
+    inner = predictor if front is None else front.predictor
+    features = inputs if front is None else front.features(inputs)
+    for part in wrappers:
+        if value_set(inner(features)) is not None:
+            raise ConfigError(
+                f"uncertainty={part['name']} is put around a model that predicts sets which hold a promised share of "
+                "the targets, and would drop them: what was promised of a density is not so of what is made of it. Put "
+                "what makes the sets last, around a model without them."
+            )
+        inner = _wrapped(part, inner, target).eval()
+    return inner if front is None else FrozenFrontEnd(list(front.encoders), inner).eval()  # type: ignore[arg-type]
+
+
+def _wrapped(part: Mapping[str, Any], inner: Predictor, target: Target) -> Predictor:
+    asked = 0
+
+    def model() -> Predictor:
+        nonlocal asked
+        asked += 1
+        return inner
+
+    found: Predictor = build("uncertainty", part, model=model, target=target)
+    own = {id(one) for one in found.parameters() if one.requires_grad} - {
+        id(one) for one in inner.parameters()
+    }
+    if asked != 1 or own:
+        does = "has weights of its own that are trained by gradient" if own else f"wraps {asked} models"
+        raise ConfigError(
+            f"uncertainty={part['name']} {does}, and mode=calibrate only fits what is calibrated on the validation "
+            "split of one trained model. Choose it in mode=train."
+        )
+    return found
