@@ -1,8 +1,9 @@
 """What contracts of other parts are worth: python benchmarks/check_parts.py GROUP [seeds, 20 by default] [names ...]
 
-GROUP is data, metric, encoder or renderer. Finds the planted faults of tests/planted_*.py, and counts false alarms:
-every row of every part that is shipped, and right parts as strangers write them, over seeds of everything that is
-drawn. Writes check_<group>.md beside this file, after each seed. With names only those shipped parts are tried.
+GROUP is data, metric, encoder, renderer, uncertainty or objective. This finds the planted faults of
+tests/planted_*.py, and counts false alarms: every row of every part that is shipped, and right parts as strangers
+write them, over seeds of everything that is drawn. Writes check_<group>.md beside this file, after each seed. With
+names only those shipped parts are tried.
 """
 
 import statistics
@@ -22,9 +23,18 @@ from framework.testing.data import examine_data
 from framework.testing.encoders import examine_encoder
 from framework.testing.finding import Finding
 from framework.testing.metrics import examine_metric
+from framework.testing.objectives import examine_objective
 from framework.testing.renderers import examine_renderer
-from framework.testing.rows import EncoderRow, MetricRow, RendererRow
-from tests import planted_data, planted_encoders, planted_metrics, planted_renderers
+from framework.testing.rows import EncoderRow, MetricRow, ObjectiveRow, RendererRow, WrapperRow
+from framework.testing.wrappers import Plain, examine_wrapper
+from tests import (
+    planted_data,
+    planted_encoders,
+    planted_metrics,
+    planted_objectives,
+    planted_renderers,
+    planted_wrappers,
+)
 
 Look = Callable[[], Iterator[Finding]]
 
@@ -46,6 +56,20 @@ def planted(group: str) -> dict[str, Look]:
             return {
                 fault.name: lambda fault=fault: examine_encoder(EncoderRow("", fault.shape), fault.build)
                 for fault in planted_encoders.ALL_FAULTS
+            }
+        case "uncertainty":
+            return {
+                fault.name: lambda fault=fault: examine_wrapper(
+                    WrapperRow("", fault.target), lambda target: fault.kind(lambda: Plain(target)), None
+                )
+                for fault in planted_wrappers.ALL_FAULTS
+            }
+        case "objective":
+            return {
+                fault.name: lambda fault=fault: examine_objective(
+                    ObjectiveRow("", fault.target), lambda factor: fault.kind(weight=factor)
+                )
+                for fault in planted_objectives.ALL_FAULTS
             }
     others = {
         fault.name: dict(planted_renderers.RIGHT["discs"][1]) if fault.by == "points" else {}
@@ -76,6 +100,22 @@ def strangers(group: str) -> dict[str, Look]:
             return {
                 name: lambda kind=kind, shape=shape: examine_encoder(EncoderRow("", shape), kind)
                 for name, (kind, shape) in planted_encoders.RIGHT.items()
+            }
+        case "uncertainty":
+            return {
+                f"{name}, {target.kind} {len(target.names)}": lambda kind=kind, target=target: (
+                    examine_wrapper(WrapperRow("", target), lambda other: kind(lambda: Plain(other)), None)
+                )
+                for name, kind in planted_wrappers.RIGHT.items()
+                for target in planted_wrappers.TARGETS
+            }
+        case "objective":
+            return {
+                f"{name}, {target.kind}": lambda kind=kind, target=target: examine_objective(
+                    ObjectiveRow("", target), lambda factor: kind(weight=factor)
+                )
+                for name, kind in planted_objectives.RIGHT.items()
+                for target in planted_wrappers.TARGETS[:3]
             }
     return {
         name: lambda build=build, rest=rest: examine_renderer(RendererRow("", leave_out=rest), build)
