@@ -10,8 +10,11 @@ from framework.geometry.camera import Camera, look_from
 from framework.renderer import Scene
 from framework.testing.finding import SEED
 
-CLEAR = 0.6
-"""Pixels from a pixel's centre within which nothing else may be seen where a picture is compared."""
+CLEAR = (0.05, 0.15, 0.3, 0.45, 0.6)
+"""Pixels from a pixel's centre at which nothing else may be seen where a picture is compared; the small ones are for
+triangles thinner than half a pixel."""
+AROUND = ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7))
+"""Directions in which the neighbourhood of a pixel's centre is looked at."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +44,10 @@ def picture(scene: Scene) -> Picture:
     if len(scene.faces):
         shares.scatter_add_(-1, scene.faces.long()[face.clamp(min=0)], weights)
     clear = torch.ones_like(face, dtype=torch.bool)
-    for row, column in ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7)):
-        around, _, _ = _first(scene, CLEAR * row, CLEAR * column)
-        clear &= around == face
+    for distance in CLEAR:
+        for row, column in AROUND:
+            around, _, _ = _first(scene, distance * row, distance * column)
+            clear &= around == face
     return Picture(face, depth, shares @ scene.colors.double(), shares, clear)
 
 
