@@ -129,14 +129,14 @@ def test_warm_up_is_a_share_of_the_run(kind: str, steps: int, asked: int) -> Non
     assert warmup(chosen, steps) <= WARMUP_SHARE * steps
     if steps >= asked / WARMUP_SHARE:
         assert warmup(chosen, steps) == asked
-    if kind == "cosine" and steps >= 10 * asked:  # not a bit of a long training changes
+    if kind == "cosine" and steps >= 4 * asked:  # not a bit of a long training changes
         expected = [
             min(1.0, (step + 1) / (asked + 1)) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
             for step in range(0, steps, 97)
         ]
         assert [factor(step) for step in range(0, steps, 97)] == expected
     if kind == "cosine" and steps >= 10:
-        assert max(factor(step) for step in range(steps)) > 0.9
+        assert max(factor(step) for step in range(steps)) > 0.8
     assert smooth(0, total=None) == 1
 
 

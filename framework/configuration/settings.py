@@ -71,7 +71,7 @@ class OptimizerSettings(_Strict):
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     schedule: Literal["constant", "cosine", "step", "plateau"] = "constant"
     warmup_steps: NotNegative = 0
-    """Steps over which the rate rises linearly; of a short training at most a tenth of all."""
+    """Steps over which the rate rises linearly; of a short training at most a quarter of all."""
     factor: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Of a reduction by step or plateau."""
     milestones: list[Count] = []

@@ -10,18 +10,18 @@ WHOLE = 6
 """Most numbers of a parameter that are shown; of more the range is."""
 
 
-def one_line(density: Distribution) -> str:
+def one_line(self: Distribution) -> str:
     """Return the kind of a density, its shapes, its names where it has some, and its parameters.
 
     Nothing is drawn or integrated for it. Densities take it as their `__repr__`.
     """
-    batch, event = (tuple(shape) for shape in (density.batch_shape, density.event_shape))
+    batch, event = (tuple(shape) for shape in (self.batch_shape, self.event_shape))
     said = [f"batch={batch}", f"event={event}"]
-    names = getattr(density, "names", ())
+    names = getattr(self, "names", ())
     if names:
         said.append(f"names={', '.join(map(str, names[:WHOLE]))}{', …' * (len(names) > WHOLE)}")
-    said += [f"{key}={text}" for key, value in vars(density).items() if (text := _parameter(key, value))]
-    line = f"{type(density).__name__}({', '.join(said)})"
+    said += [f"{key}={text}" for key, value in vars(self).items() if (text := _parameter(key, value))]
+    line = f"{type(self).__name__}({', '.join(said)})"
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 2]}…)"
 
 
