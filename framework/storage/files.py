@@ -39,7 +39,7 @@ def unwritable(error: BaseException) -> str | None:
     if not isinstance(error, OSError) or not (error.errno in (*_FULL, *_CLOSED) or _unmade(error)):
         return None
     where = f"{error.filename} cannot be written" if error.filename else "A file cannot be written"
-    remedy = "Free some space" if full(error) else "Choose a place that can"
+    remedy = "Free some space" if full(error) else "Choose another place"
     return f"{where} ({error.strerror}). {remedy}."
 
 
