@@ -15,7 +15,7 @@ from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.intervals import DRAWS, Interval, middle
 from framework.distributions.moved import Moved
 from framework.distributions.noise import Draw
-from framework.distributions.protocol import Estimate, estimate, images, marginal, median
+from framework.distributions.protocol import Estimate, ValueSet, estimate, images, marginal, median
 from framework.errors import DataError
 from framework.target import Target
 
@@ -96,6 +96,11 @@ class Prediction:
         """The middle `mass` of each real or angle, (batch, number) each (`framework.distributions.intervals`)."""
         with self._draw("interval"):
             return middle(self.density, mass, draws)
+
+    def set_size(self, sets: ValueSet) -> Tensor:
+        """Size of the sets that come with the densities, (batch,); where it is drawn, always from the same draws."""
+        with self._draw("set"):
+            return sets.size()
 
     def deviation(self, draws: int = 999) -> Tensor:
         """The standard deviation of each real, (batch, number). Where the density does not know its own it is that

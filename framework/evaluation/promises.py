@@ -34,7 +34,7 @@ def promised(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
         return {}
     degrees = target.kind == "angle" and len(target.names) == 1
     unit = 180 / math.pi if degrees else 1.0
-    size = {"set_size_deg" if degrees else "set_size": (unit * sets.size()).tolist()}
+    size = {"set_size_deg" if degrees else "set_size": (unit * prediction.set_size(sets)).tolist()}
     parts = sets.parts()
     if parts is None:
         return size

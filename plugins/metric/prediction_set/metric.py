@@ -62,7 +62,7 @@ class PredictionSetMetric(Metric):
                 f"prediction_set judges sets, but the model predicts a {type(prediction.density).__name__}, which has "
                 "none. Put conformal last among the wrappers, uncertainty=[..., conformal], or leave this metric out."
             )
-        size = sets.size()
+        size = prediction.set_size(sets)
         broken = (size.isnan() | prediction.log_prob.isnan()).nonzero().flatten()
         if len(broken):
             index = prediction.batch.get("index")
