@@ -14,7 +14,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
-from framework.configuration.description import Description
+from framework.configuration.description import Description, stored_names, stored_shape, stored_target
 from framework.configuration.paths import require_said
 from framework.configuration.schema import resolve
 from framework.data import Batch, Data, Frame
@@ -27,6 +27,7 @@ from framework.storage.checkpoints import latest_good, read
 from framework.storage.enclosed import require_plain_within
 from framework.storage.reading import guarded
 from framework.storage.weights import describe_mismatch
+from framework.target import Target
 
 FOREIGN = "This framework did not write it: do not use it."
 PREFIX = "predictor."
@@ -164,6 +165,20 @@ def stored(
     content = read(path)
     with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         return Description.read(content, str(path), paths), weights(content)
+
+
+def interface(described: Mapping[str, Any], path: Path) -> tuple[Target, tuple[int, ...], tuple[str, ...]]:
+    """Return the target, the shape of an input and its columns that the checkpoint `path` describes.
+
+    Raises:
+        CheckpointError: what stands there describes none.
+    """
+    with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+        return (
+            stored_target(described["target"]),
+            stored_shape(described["input_shape"]),
+            stored_names(described.get("columns", ()), "columns"),
+        )
 
 
 def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:

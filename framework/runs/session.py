@@ -29,11 +29,12 @@ from framework.configuration.assembly import (
     require_outliers,
 )
 from framework.configuration.config import Config
-from framework.configuration.description import Description, stored_names, stored_shape, stored_target
+from framework.configuration.description import Description
 from framework.configuration.loading import (
     PREFIX,
     fill,
     find_checkpoint,
+    interface,
     load_with_description,
     reader,
     weights,
@@ -55,7 +56,6 @@ from framework.runs.run import Run, goes_on
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
-from framework.storage.reading import guarded
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, told
@@ -230,10 +230,8 @@ def refuse_other_model(parts: Resolved, data: Data, settings: Settings) -> None:
     described = content.get("framework")
     if not isinstance(described, Mapping):  # `start_from` says what is wrong with the weights
         return
-    with guarded(path, "a checkpoint of this framework", kind=CheckpointError):
-        target = getattr(data, "target", None) or stored_target(described["target"])
-        shape = stored_shape(described["input_shape"])
-        columns = stored_names(described.get("columns", ()), "columns")
+    stored, shape, columns = interface(described, path)
+    target = getattr(data, "target", None) or stored
     try:
         fill(build_predictor(parts, target, shape, settings.seed, columns), weights(content), str(path))
     except ConfigError as error:
