@@ -96,7 +96,6 @@ OWN_FILES = {
     "framework/runs/repository.py": "the copy of an index that it has made",
     "framework/tracking/watch.py": "/proc",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
-    "plugins/renderer/rasterizer/parts.py": "bytes that a guard has read",
 }
 """Who opens a file beside `framework.storage`, and which."""
 WHO_READS = """
