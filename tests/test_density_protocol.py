@@ -817,7 +817,7 @@ def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: s
     value = LOC + torch.tensor([-1e3, -2.0, 0.0, 0.3, 50.0], dtype=torch.float64).reshape(5, 1, 1, 1)
     found = each_cdf(density, value)
     columns = [cdf(marginal(density, index), value[..., index : index + 1]) for index in range(3)]
-    if family in ("student", "gamma"):
+    if family == "gamma":
         assert found is None and columns == [None] * 3
         return
     assert found is not None
@@ -825,8 +825,9 @@ def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: s
         wanted = reference.cdf(value.numpy())
     close(found, torch.as_tensor(wanted), 1e-12)
     close(found, torch.stack([column for column in columns if column is not None], -1), 1e-12)
-    single = Independent(type(base)(base.loc.float(), base.scale.float()), 1)
-    assert each_cdf(single, value).dtype == torch.float64
+    if family != "student":  # which has a third parameter
+        single = Independent(type(base)(base.loc.float(), base.scale.float()), 1)
+        assert each_cdf(single, value).dtype == torch.float64
 
 
 def test_what_draws_nothing_says_so() -> None:

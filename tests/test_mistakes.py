@@ -74,7 +74,7 @@ trainer.keep=beest | Did you mean 'best'?
 +trainer.accumulate_grad_batches=0 | trainer.accumulate_grad_batches = 0
 +trainer.deterministic=maybe | trainer.deterministic = 'maybe'
 +trainer.max_time=soon | trainer.max_time = 'soon'
-mode=check checkpoint=outputs/run | mode=check reads none, train, test, predict, work_precision do
+mode=check checkpoint=outputs/run | mode=check reads none, train, test, calibrate, predict, work_precision do
 experiment=moons/vanilla_128 checkpoint=outputs/run | outputs/run is neither a file, a folder nor an MLflow run id
 seed=-1 | seed = -1
 seed=one | seed = 'one'
@@ -246,9 +246,9 @@ DAMAGED = {
     "null byte": (TOP + b"seed: 1\x00\n", r"#x0000: .*mine\.yaml\", position 27"),
     "latin-1": (
         TOP + b"seed: M\xfcller\n",
-        r"In 'experiment/mine': byte 0xfc at position 27 is not UTF-8\. Save",
+        r"line 2 holds the byte 0xfc, which is not UTF-8\. Save",
     ),
-    "utf-16": ("seed: 1\n".encode("utf-16"), r"In 'experiment/mine': byte 0xff at position 0 is not UTF-8"),
+    "utf-16": ("seed: 1\n".encode("utf-16"), r"it is text in UTF-16; wanted UTF-8\. Save"),
     "list": (TOP + b"- seed\n- 1\n", r"In 'experiment/mine': .*Wanted keys and values"),
     "list of keys": (TOP + b"- seed: 1\n", r"In 'experiment/mine': .*Wanted keys and values"),
     "number": (

@@ -85,8 +85,12 @@ def numbers(done: Done, prefix: str) -> dict[str, float]:
 
 SAME = {
     "moons/vanilla_128": ("experiment=moons/vanilla_128", "trainer.max_epochs=2", "trainer.check_val_every_n_epoch=1"),
-    # augmentation, dropout, batch norm, and batches that two ranks cannot halve
-    "pascal3d/von_mises": ("experiment=pascal3d/von_mises", "debug=fast", "batch_size=15", "trainer.log_every_steps=1"),
+    # augmentation, dropout, batch norm, and batches that two ranks cannot halve; a small rate, since training amplifies
+    # what two orders of summation round differently
+    "pascal3d/von_mises": (
+        "experiment=pascal3d/von_mises", "debug=fast", "batch_size=15", "trainer.log_every_steps=1",
+        "optimizer.learning_rate=1e-4",
+    ),
 }  # fmt: skip
 
 

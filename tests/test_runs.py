@@ -505,7 +505,7 @@ def test_predictions_of_a_folder_leave_out_what_is_no_input(framework: Framework
     skip = ("data=caviar", "data.image_size=32", "data.skip_unreadable=true")
     done = framework(*predict, *skip, folder="predicted")
     assert done.code == 0, done.out
-    assert "3 files ignored, being of another kind" in done.out
+    assert "2 files ignored, being of another kind: README, angles.csv" in done.out
     assert (done.folder / "unreadable.txt").read_text() == f"{folder / 'broken.png'}\n"
     rows = (done.folder / "predictions.csv").read_text().splitlines()[1:]
     assert [row.partition(",")[0] for row in rows] == [str(folder / "one.png"), str(folder / "two.png")]

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import laplace, rankdata, sem, spearmanr
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Laplace, StudentT
+from torch.distributions import Distribution, HalfNormal, Independent, Laplace
 
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
@@ -160,7 +160,7 @@ def test_what_it_cannot_judge_gets_a_sentence() -> None:
     with pytest.raises(DataError, match="looks inside the true mask too"):
         measured(laplaces(place, wide), value, masked=True)
     with pytest.raises(UserError, match=r"protocol\.each_cdf\.register"):
-        measured(Independent(StudentT(torch.full_like(value, 5.0)), 3), value)
+        measured(Independent(HalfNormal(torch.full_like(value, 5.0)), 3), value)
     place[1, 0, 0, 0] = torch.nan
     with pytest.raises(
         UserError, match="1 of 2 images' transforms and scales in this batch are NaN, the first in row 1"

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.data import Batch
+from framework.distributions.batch_shapes import Stacked
 from framework.model import Predictor
 from framework.uncertainty import Uncertainty
 
@@ -26,9 +27,7 @@ class Committee(Uncertainty):
 
     def forward(self, inputs: Tensor) -> Distribution:
         densities = [member(inputs) for member in self.members]
-        places = torch.stack([density.location for density in densities], 1)
-        components = type(densities[0])(places)
-        return Mixture(torch.zeros(places.shape[:2], dtype=places.dtype), components)
+        return Mixture(torch.zeros(*densities[0].batch_shape, len(densities)), Stacked(densities))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return torch.stack([member.loss(inputs, target) for member in self.members]).mean(0)
@@ -37,7 +36,9 @@ class Committee(Uncertainty):
         return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        pass
+        kept = list(batches)
+        for member in self.members:
+            member.calibrate(kept)
 
 
 class AveragedCommittee(Uncertainty):
