@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 SHARE = 0.04
 """Share of tables of two equal methods in which a difference is called significant. It is a percentage point below the
-5 % that are promised: Welch's test is approximate, and where spreads differ fourfold it errs by up to half a point."""
+5 % that are promised, since Welch's test is approximate where runs are few and their spreads differ."""
 RULE = "every difference significant at 95 %, Welch's t-test"
 """The rule, for a caption."""
 

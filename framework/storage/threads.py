@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 def wait_passively() -> None:
     """Have OpenMP's threads sleep between two parallel operations; call it before torch is imported.
 
-    They spin by default. As soon as another process wants a core, each of them spins while it waits for one that does
-    not run: two threads then took 7 to 9 times the processor time and up to 12 times the wall time of one. What the
-    user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT stands.
+    They spin by default. As soon as another process wants a core, each thread spins while it waits for one that does
+    not run. A training with two threads then took several times the processor time and the wall time of one thread.
+    What the user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT stands.
     """
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
