@@ -23,6 +23,7 @@ from torch import nn
 from torch.serialization import get_unsafe_globals_in_checkpoint
 
 from framework.errors import CheckpointError
+from framework.storage import plain_tensors
 from framework.storage.checkpoints import MARK, latest_good, read, verify
 from framework.storage.weights import describe_mismatch, read_weights
 from framework.training.checkpoint import WholeCheckpoints
@@ -370,6 +371,23 @@ def test_only_dense_tensors_are_written_and_read(kind: str, saved: Path) -> None
         read_weights(str(saved.with_name("one.pth")))
 
 
+@pytest.fixture(params=["torch 2.13", "torch 2.10"])
+def _reader_of_torch(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read archives with what this and what the oldest admitted torch offer."""
+    if request.param == "torch 2.13":
+        return
+    whole = torch._C.PyTorchFileReader  # pyright: ignore[reportAttributeAccessIssue]
+
+    class Reader:
+        def __init__(self, file: Any) -> None:
+            reader = whole(file)
+            self.get_all_records, self.get_record = reader.get_all_records, reader.get_record
+            self.get_record_header_offset = reader.get_record_header_offset
+
+    monkeypatch.setattr(plain_tensors, "_reader", Reader)
+
+
+@pytest.mark.usefixtures("_reader_of_torch")
 def test_whatever_is_plain_is_read_as_torch_reads_it(saved: Path) -> None:
     """Every type of numbers, views, shared storage, parameters, and the plain values beside them."""
     numbers = torch.arange(24.0).reshape(4, 6)
@@ -454,6 +472,7 @@ def test_what_a_pickle_calls_is_refused_before_it_is_called(name: str, saved: Pa
         assert time.process_time() - began < 1
 
 
+@pytest.mark.usefixtures("_reader_of_torch")
 def test_an_archive_that_can_be_read_in_two_ways_is_refused(saved: Path) -> None:
     """What is looked through must be what torch reads: parts of one name, other bytes before them, an older format."""
     sound, other = packed(CONTENTS), packed({"other": torch.zeros(3).to_sparse()})

@@ -102,12 +102,9 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
         yield from _pickles_before_zip(file)
         return
     file.seek(0)
-    reader = torch._C.PyTorchFileReader(file)
+    reader = _reader(file)
     names = reader.get_all_records()
-    found = {
-        name: (reader.get_record_header_offset(name), reader.get_record_size(name))  # pyright: ignore[reportAttributeAccessIssue]
-        for name in names
-    }
+    found = {name: (reader.get_record_header_offset(name), _record_size(reader, name)) for name in names}
     file.seek(0)
     with zipfile.ZipFile(file) as archive:
         parts = {
@@ -117,6 +114,18 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
         if parts != found or len(archive.infolist()) != len(names) or "data.pkl" not in found:
             raise ValueError("its directory can be read in two ways, or has no values")
     yield reader.get_record("data.pkl")
+
+
+def _reader(file: BinaryIO) -> Any:
+    """Return the reader that `torch.load` uses."""
+    return torch._C.PyTorchFileReader(file)
+
+
+def _record_size(reader: Any, name: str) -> int:
+    """Return the bytes of a record as torch finds them; torch before 2.13 says them only of what it has read."""
+    if hasattr(reader, "get_record_size"):
+        return reader.get_record_size(name)
+    return len(reader.get_record(name))
 
 
 def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
