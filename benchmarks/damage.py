@@ -213,13 +213,12 @@ def _word(content: bytes, random: np.random.Generator) -> bytes:
 FAULTS: tuple[Damage, ...] = (_flipped, _replaced, _cut, _run, _field, _field, _block, _word)
 
 
-def fuzz(reader: Reader, count: int, folder: Path) -> Tally:
-    """Have so many damaged files read, in forks of this process that must not have started threads."""
-    tally = Tally(files=count)
+def fuzz(reader: Reader, count: int, folder: Path, first: int = 0) -> Tally:
+    """Read the damaged files `first` to `count`, in forks of this process, which must not have started threads."""
+    tally = Tally(files=count - first)
     shared = mmap.mmap(-1, 64)
     log = folder / "faults.jsonl"
     log.unlink(missing_ok=True)
-    first = 0
     while first < count:
         child = os.fork()
         if child == 0:
