@@ -23,6 +23,7 @@ import framework.configuration.schema as schema
 from framework.configuration.registry import GROUPS, installed
 from framework.configuration.registry import load as load_installed
 from framework.configuration.schema import build, forbid_targets, resolve
+from framework.configuration.settings import device_of
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.storage import checkpoints
@@ -629,3 +630,17 @@ def test_plugins_that_no_config_can_name_are_refused() -> None:
         ConfigError, match=r"Named: `experts` holds plugins of the group encoder as dict.*a list or a tuple"
     ):
         resolve("encoder", "named")
+
+
+@pytest.mark.parametrize("there", [True, False])
+@pytest.mark.parametrize("accelerator", [None, "auto", "cpu", "gpu", "cuda", "mps", "tpu"])
+def test_a_stored_model_is_tested_on_the_device_that_the_user_chose(
+    accelerator: str | None, there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    if accelerator in ("mps", "tpu") or (accelerator in ("gpu", "cuda") and not there):
+        with pytest.raises(ConfigError, match=f"'{accelerator}'.*Choose"):
+            device_of(accelerator)
+    else:
+        assert device_of(accelerator).type == ("cuda" if there and accelerator != "cpu" else "cpu")

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -10,6 +10,9 @@ from framework.configuration.registry import GROUPS
 from framework.configuration.schema import check, forbid_targets
 from framework.errors import ConfigError
 from framework.tracking.stores import require_no_password
+
+if TYPE_CHECKING:
+    import torch
 
 
 def _share(value: Any) -> Any:
@@ -212,6 +215,27 @@ def settings(config: Mapping[str, Any]) -> Settings:
     if every and epochs:  # a shorter run is validated at its end, too
         checked.trainer["check_val_every_n_epoch"] = min(every, epochs)
     return checked
+
+
+def device_of(accelerator: str | None) -> "torch.device":
+    """Return the device on which a stored model is tested: a GPU where there is one, unless the user chose another.
+
+    Args:
+        accelerator: `trainer.accelerator`; None and "auto" leave the choice to the machine.
+
+    Raises:
+        ConfigError: this machine does not have it, or it is one that only trains.
+    """
+    import torch
+
+    require_device(accelerator)
+    if accelerator == "tpu":
+        raise ConfigError(
+            "trainer.accelerator = 'tpu': a TPU only trains here. Choose auto, cpu, gpu, cuda or mps."
+        )
+    if accelerator in (None, "auto", "gpu"):
+        accelerator = "cuda" if torch.cuda.is_available() else "mps" if accelerator == "gpu" else "cpu"
+    return torch.device(accelerator)
 
 
 def require_device(accelerator: str | None) -> None:

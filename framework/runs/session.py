@@ -41,7 +41,7 @@ from framework.configuration.loading import (
 )
 from framework.configuration.paths import flat, require_said, without_paths
 from framework.configuration.schema import resolve
-from framework.configuration.settings import Settings
+from framework.configuration.settings import Settings, device_of
 from framework.data import Batch, Data
 from framework.datasets.fields import fetched
 from framework.distributions.noise import seed_step
@@ -356,6 +356,7 @@ def around(
     Raises:
         ConfigError: `prepare`, and a path of the stored data, outliers or metrics is not said again.
     """
+    device = device_of(config.settings.trainer.get("accelerator"))
     parts: Resolved = {**description.config}
     chosen = {group for group in ("data", "outliers", "metric") if config.values.get(group)}
     used = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
@@ -386,7 +387,6 @@ def around(
         require_fit(data, description)
     elif "data" in chosen:
         data.read = partial(_reading, data.read, description)  # type: ignore[method-assign]
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     method = description.method or method_of(config, parts)
     for remark in description.remarks:
         console.print(remark, soft_wrap=True, highlight=False, markup=False)
