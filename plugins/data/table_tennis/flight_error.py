@@ -189,7 +189,8 @@ def landings(
     place, lands = crossing(truth, height)
     drawn, there = crossing(draws, height)
     enough = lands & (there.sum(0) >= 10)
-    found = torch.stack([lands.sum().double(), *[torch.zeros((), dtype=torch.float64)] * 3])
+    found = truth.new_zeros(4, dtype=torch.float64)
+    found[0] = lands.sum()
     for row in lands.nonzero()[:, 0].tolist():
         found[3] += 1 - there[:, row].double().mean()
         if not enough[row]:
