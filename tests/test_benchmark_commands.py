@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -60,13 +59,14 @@ def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
     """A sweep begun by other means goes on by itself, or is killed in the middle of what it writes."""
     others = [
         path.name
-        for path in Path(ROOT, "benchmarks").glob("*.py")
+        for folder in ("benchmarks", "reproduction", "tests/fuzz")
+        for path in Path(ROOT, folder).rglob("*.py")
         if '"-m", "framework"' in (text := path.read_text(encoding="utf-8")) and "subprocess.run(" in text
     ]
     assert others == []
 
 
-def test_no_benchmark_hides_a_module() -> None:
-    """A script's folder comes first on its path, which torch's compiler hands on: of `encodings` Python starts."""
-    names = {path.stem for path in Path(ROOT, "benchmarks").glob("*.py")}
-    assert names & {*sys.stdlib_module_names, *packages_distributions()} == set()
+@pytest.mark.parametrize("package", ["benchmarks", "reproduction"])
+def test_an_installed_package_of_the_same_name_does_not_hide_it(package: str) -> None:
+    """A folder without `__init__.py` gives way to any package of its name, wherever that is on the path."""
+    assert Path(ROOT, package, "__init__.py").is_file()

@@ -9,7 +9,13 @@ import pytest
 
 from benchmarks.rounds import Rounds, in_turn, others_use, replace_section
 
-PAGES = sorted((Path(__file__).parent.parent / "benchmarks").glob("*.md"))
+ROOT = Path(__file__).parent.parent
+PAGES = sorted(
+    page
+    for folder in ("benchmarks/*", "reproduction", "reproduction/chapter*", "tests/fuzz")
+    for page in ROOT.glob(f"{folder}/*.md")
+    if page.name != "README.md"
+)
 MACHINE = re.compile(r"\d+ cores?\b[^\n]*; 20\d\d-\d\d-\d\d; Python 3\.\d+\.\d+")
 TIMED = re.compile(r"\bms\b|[Mm]illiseconds|\bseconds\b|times as (fast|long)|times \S+'s speed|× torch")
 SPREAD = re.compile(r"least to largest|\brounds\b|±|standard deviation")
@@ -20,7 +26,6 @@ WITHOUT_MACHINE = {"claims.md"}
 WITHOUT_SPREAD = {
     "ball_flights.md",
     "ball_stiffness.md",
-    "cest.md",
     "evaluation_time.md",
     "fit_pose.md",
     "fuzz.md",
@@ -30,7 +35,6 @@ WITHOUT_SPREAD = {
     "served.md",
     "smplpix_flicker.md",
     "smplpix_growth.md",
-    "smplpix_networks.md",
     "smplpix_projection.md",
     "smplpix_work_precision.md",
     "sweep_start.md",

@@ -1,12 +1,12 @@
-"""What `benchmarks/contradictions.py` compares is run, by itself or by the tables, and all that it runs is compared."""
+"""What `reproduction.contradictions` compares is run, by itself or by the tables, and all that it runs is compared."""
 
 import math
 
 import numpy as np
 import pytest
 
-from benchmarks import thesis_tables
-from benchmarks.contradictions import NOISE_DEG, PARTS, Part, wrong
+from reproduction import thesis_tables
+from reproduction.contradictions import NOISE_DEG, PARTS, Part, wrong
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.sweep)

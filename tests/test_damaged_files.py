@@ -1,6 +1,7 @@
 """Damaged and harmful files: every reader of the project reads them or says a sentence, and soon."""
 
 import ast
+import os
 import pickle
 import subprocess
 import sys
@@ -29,8 +30,9 @@ def test_no_reader_crashes_hangs_or_raises_anything_but_a_sentence(tmp_path: Pat
     Nor takes one of them more than 1 GiB, changes an array elsewhere, or has damage answer as if it were whole.
     """
     done = subprocess.run(
-        [sys.executable, ROOT / "benchmarks" / "fuzz.py", "--files", "100", "--check"],
+        [sys.executable, "-m", "tests.fuzz.fuzz", "--files", "100", "--check"],
         cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=300,
@@ -100,9 +102,9 @@ OWN_FILES = {
 """Who opens a file beside `framework.storage`, and which."""
 WHO_READS = """
 import sys
-from benchmarks.damage import scratch
-from benchmarks.damaged_readers import readers
-from benchmarks.fuzz import whole
+from tests.fuzz.damage import scratch
+from tests.fuzz.damaged_readers import readers
+from tests.fuzz.fuzz import whole
 from framework.storage.reading import guarded
 
 code, found = guarded.__wrapped__.__code__, set()

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import ROOT, Command, differences, status
 from framework.tracking.ended import mark_dead
+from tests.fuzz.kills import ROOT, Command, differences, status
 from tests.test_pool import App
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere nothing tells a process that its parent has died"
 )
 LOADED = 25.0
-"""Seconds for what takes at most 10 on a machine that does nothing else (benchmarks/kills.md)."""
+"""Seconds for what takes at most 10 on a machine that does nothing else (tests/fuzz/kills.md)."""
 RUN = """
 import json, os, signal, sys, threading, time
 from pathlib import Path

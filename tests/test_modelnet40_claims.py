@@ -1,11 +1,11 @@
-"""Standard errors and verdicts of `benchmarks/modelnet40.py`, against counts and simulation."""
+"""Standard errors and verdicts of `reproduction/chapter6/modelnet40.py`, against counts and simulation."""
 
 import math
 
 import numpy as np
 import pytest
 
-from benchmarks.modelnet40 import CLAIMS, ROWS, Method, claims, compared, seed_variance, verdict
+from reproduction.chapter6.modelnet40 import CLAIMS, ROWS, Method, claims, compared, seed_variance, verdict
 
 
 def method(*runs):

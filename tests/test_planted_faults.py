@@ -31,7 +31,7 @@ def test_the_fault_is_found(fault: Fault) -> None:
     failed = (finding.name for finding in fault.findings() if not finding.holds)
     first = next(failed, None)
     assert first is not None, "missed"
-    # benchmarks/check.py asks further: that no other property finds it
+    # benchmarks/framework/check.py asks further: that no other property finds it
     assert first == fault.only or not fault.only
 
 
@@ -56,7 +56,7 @@ def test_the_fault_is_found_by_the_property_that_is_for_it(fault: Fault) -> None
     ids=lambda part: part if isinstance(part, str) else str(len(part.names)),
 )
 def test_a_right_head_of_somebody_else_is_not_refused(name: str, target: Target) -> None:
-    """With one seed of what is drawn; benchmarks/check.py tries more."""
+    """With one seed of what is drawn; benchmarks/framework/check.py tries more."""
     require(*right_findings(name, target))
 
 

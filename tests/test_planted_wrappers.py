@@ -33,7 +33,7 @@ def test_the_fault_is_found(fault: Fault) -> None:
 @pytest.mark.parametrize("name", RIGHT)
 @pytest.mark.parametrize("target", [CLASSES, HEIGHT], ids=lambda target: target.kind)
 def test_a_right_wrapper_passes(name: str, target: Target) -> None:
-    """benchmarks/check.py asks all kinds of target, over many seeds."""
+    """benchmarks/framework/check.py asks all kinds of target, over many seeds."""
     build = RIGHT[name]
     require(*examine_wrapper(WrapperRow("", target), lambda target: build(lambda: Plain(target)), None))
 

@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks.kills import differences, status
 from framework.training.ranks import Share, WholeBatch
 from tests.conftest import TINY, Done, Forks, Framework, command, paths_again
+from tests.fuzz.kills import differences, status
 from tests.test_kills import Lives
 
 TWO = ("trainer=ddp", "trainer.devices=2", "trainer.accelerator=cpu")

@@ -19,10 +19,17 @@ from framework.configuration.config import Config
 from framework.modes import MODES
 
 ROOT = Path(__file__).parent.parent
-CLAIMS = ROOT / "benchmarks" / "claims.md"
+CLAIMS = ROOT / "reproduction" / "claims.md"
 READMES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", CLAIMS, *sorted(ROOT.glob("plugins/*/*/README.md"))]
 FOLDERS = cache(composition.config_folders)
 """Found once for all commands."""
+PAGES = [
+    page
+    for folder in ("benchmarks/*", "reproduction", "reproduction/chapter*", "tests/fuzz")
+    for page in ROOT.glob(f"{folder}/*.md")
+    if page.name != "README.md"
+]
+MODULES = ("benchmarks.", "reproduction.")
 NOT_OURS = ("=mine", "=theirs", "X=", "resume=", "--")
 """Parts of commands that stand for a reader's own plugin, take their config from a run folder, or compose nothing."""
 
@@ -75,7 +82,7 @@ def test_there_are_many() -> None:
 
 def test_the_readme_leads_to_every_plugin_and_every_benchmark() -> None:
     text = READMES[0].read_text(encoding="utf-8")
-    wanted = [*ROOT.glob("plugins/*/*/README.md"), *ROOT.glob("benchmarks/*.md")]
+    wanted = [*ROOT.glob("plugins/*/*/README.md"), *PAGES]
     assert not [str(page) for page in wanted if f"({page.relative_to(ROOT)})" not in text]
     linked = re.findall(r"\]\(((?!https)[^)]*)\)", text)
     assert not [path for path in linked if not (ROOT / path).exists()]
@@ -86,11 +93,11 @@ def test_a_number_of_the_readmes_table_stands_on_the_page_it_links_to() -> None:
     rows = [
         line.split("|")[1:-1]
         for line in READMES[0].read_text(encoding="utf-8").splitlines()
-        if "](benchmarks/" in line and line.startswith("|")
+        if re.match(r"\|.*\]\((benchmarks|reproduction)/", line)
     ]
     assert len(rows) >= 4
     for first, *told in rows:
-        page = re.search(r"\((benchmarks/\w+\.md)\)", first)
+        page = re.search(r"\(((?:benchmarks|reproduction)/\w+/\w+\.md)\)", first)
         assert page
         there = [float(found) for found in number.findall((ROOT / page[1]).read_text(encoding="utf-8"))]
         for said in number.findall(" ".join(told)):
@@ -111,7 +118,8 @@ def test_every_claim_has_evidence_a_verdict_and_a_command() -> None:
         verdicts.setdefault(number[0], Counter())[verdict.partition(":")[0]] += 1
         words = shlex.split(command.strip("`"))
         assert command == f"`{command.strip('`')}`" and words[0] in ("python", "pytest"), number
-        files = [ROOT / word for word in words if word.startswith(("benchmarks/", "plugins/", "tests/"))]
+        files = [ROOT / word for word in words if word.startswith(("plugins/", "tests/"))]
+        files += [ROOT / f"{word.replace('.', '/')}.py" for word in words if word.startswith(MODULES)]
         assert all(file.exists() for file in files), number
         if "-k" in words:  # a test of that name is there
             sources = [one for file in files for one in (file, *file.glob("test_*.py")) if one.is_file()]

@@ -1,4 +1,4 @@
-"""What `benchmarks/thesis_tables.md` says of runs that are here, half done, or on another machine."""
+"""What `reproduction/thesis_tables.md` says of runs that are here, half done, or on another machine."""
 
 import datetime
 import itertools
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import thesis_tables
+from reproduction import thesis_tables
 
 PAGE = """
 | 2.1 | moons | page | 45 of 45 | 19 | 2.0 | elsewhere |

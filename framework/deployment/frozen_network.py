@@ -41,7 +41,7 @@ class Layer:
             found = np.empty((1, len(self.bias)), self.bias.dtype)
             connected(numbers[0], self.weight, self.bias, self.rectified, found[0])
             return found
-        # from two samples on they share the reading of the weights (benchmarks/frozen.md)
+        # from two samples on they share the reading of the weights (benchmarks/framework/frozen.md)
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused in the end
             found = numbers @ self.weight
             found += self.bias

@@ -52,7 +52,7 @@ def fit(
 
     Where a pool has vanished (amplitude 0), it has no width that could lead it back: such spectra are fitted once more
     from another start, and the better fit is kept. So are all where centres are free, unless a start is given: the line
-    of amide may be the sharp or the broad one of two (benchmarks/cest.md counts how often it matters in a brain).
+    of amide may be the sharp or the broad one of two (benchmarks/spectra/cest.md counts how often that matters).
 
     Args:
         measured: NaN where nothing was measured.

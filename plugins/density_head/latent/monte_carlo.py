@@ -26,7 +26,7 @@ STRETCH = 0.4
 MOST = 2**18
 """Samples after which an item that has not reached its tolerance is given up."""
 GENERATOR = 1267
-"""Of the lattice; chosen by measured variance (benchmarks/latent.md)."""
+"""Of the lattice; chosen by measured variance (benchmarks/densities/latent.md)."""
 LARGEST_KEPT = 2**22
 """Numbers of normal points that a density holds (16 MiB in float32); more are computed anew for every value."""
 

@@ -1,5 +1,6 @@
 """The largest numbers over each cloud after layers of `layers`, without the numbers of every point where they can be
-spared: a step of PointNet then takes a quarter of the time and a third of the memory (benchmarks/set_steps.md)."""
+spared: a step of PointNet then takes a quarter of the time and a third of the memory, as benchmarks/clouds/set_steps.md
+says."""
 
 from typing import cast
 

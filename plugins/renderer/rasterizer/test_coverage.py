@@ -185,7 +185,7 @@ def total(found: Iterable[tuple[str, Seen]]) -> Seen:
 
 
 def test_every_pixel_of_a_tessellated_plane_is_covered_once_whatever_the_camera() -> None:
-    """From 2,000 cameras; benchmarks/rasterizer_coverage.py has 10,000."""
+    """From 2,000 cameras; benchmarks/rendering/rasterizer_coverage.py has 10,000."""
     seen = total(views(2000))
     assert seen.inside > 600_000
     assert (seen.holes, seen.doubled, seen.strays, seen.other) == (0, 0, 0, 0)

@@ -299,7 +299,7 @@ def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
 
 @pytest.mark.parametrize("gradient", get_args(Gradient))
 def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mib(gradient: Gradient) -> None:
-    """Of NumPy's memory, outputs too; benchmarks/rasterizer_memory.md has what a process grows by."""
+    """Of NumPy's memory, outputs too; benchmarks/rendering/rasterizer_memory.md has what a process grows by."""
     vertices, faces, colors = blob(117)
     assert len(vertices) > 27_554
     learned, painted = vertices.float().requires_grad_(), colors.float().requires_grad_()

@@ -568,7 +568,7 @@ def test_a_bad_gltf_gets_its_sentence(
 
 
 def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
-    """Cut anywhere, a .glb is never taken for a whole one. `benchmarks/fuzz.py` damages files in other ways."""
+    """Cut anywhere, a .glb is never taken for a whole one. `tests/fuzz/fuzz.py` damages files in other ways."""
     whole = glb(*quad())
     file = tmp_path / "one.glb"
     for end in range(0, len(whole), 29):

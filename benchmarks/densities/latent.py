@@ -1,0 +1,373 @@
+"""Work-precision curves of log-likelihoods that are integrals over a latent variable, on a toy known by quadrature.
+
+    python -m benchmarks.densities.latent
+    python -m benchmarks.densities.latent --draw
+
+Writes latent.md, latent.csv and latent.png beside this file, about three minutes on one core; `--draw` draws latent.png
+anew from latent.csv.
+"""
+
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from torch import Tensor, nn
+
+from benchmarks import committed
+from benchmarks.densities.latent_points import sequences
+from benchmarks.machine import machine
+from framework.configuration.schema import build, resolve
+from framework.density_head import DensityHead
+from framework.distributions.protocol import estimate
+from framework.evaluation.pareto import front
+from framework.evaluation.tradeoff import run_times
+from framework.figures.style import BLUE, GREEN, RED, saved, titled_figure
+from framework.reports import table
+from framework.target import Target
+from plugins.density_head.latent.cvae import CVAEHead
+from plugins.density_head.latent.monte_carlo import NormalPoints
+from plugins.density_head.latent.scvae import SCVAEHead
+
+HERE = Path(__file__)
+CPU = torch.device("cpu")
+SAMPLES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+TOLERANCES = (0.1, 0.03, 0.01, 0.003, 0.001)
+SEEDS = 10
+ITEMS = 64
+STEPS = 1500
+HEADS = {
+    "mixture": {"name": "mixture", "components": 2},
+    "scvae, 1 latent": {"name": "scvae", "latent": 1, "hidden": 32},
+    "scvae, 2 latent": {"name": "scvae", "latent": 2, "hidden": 32},
+    "cvae, 1 latent": {"name": "cvae", "latent": 1, "hidden": 32},
+    "cvae, 2 latent": {"name": "cvae", "latent": 2, "hidden": 32},
+}
+KINDS = {
+    ("lattice", "samples"): ("lattice points", BLUE, "o"),
+    ("independent", "samples"): ("independent points", RED, "s"),
+    ("lattice", "tolerance"): ("lattice points until a tolerance is met", GREEN, "^"),
+}
+"""How each kind of points looks in the picture."""
+COLUMNS = {
+    "method": "method",
+    "knob": "knob",
+    "value": "value",
+    "error_nats": "one sample's error, nats",
+    "error_of_mean_nats": "error of the mean, nats",
+    "bias_nats": "bias, nats",
+    "debiased_bias_nats": "debiased bias, nats",
+    "told_error_nats": "error it tells, nats",
+    "samples_mean": "samples",
+    "excess_nats": "above the truth's entropy, nats",
+    "milliseconds_per_sample": "ms / sample",
+    "pareto": "Pareto",
+}
+
+
+class IndependentPoints:
+    """Ordinary Monte Carlo in the place of plugins.density_head.latent.monte_carlo.NormalPoints."""
+
+    def __init__(
+        self,
+        items: int,
+        replicates: int,
+        dimensions: int,
+        *,
+        dtype: torch.dtype,
+        device: torch.device,
+        kept: int = 0,
+    ) -> None:
+        self.shape, self.dtype, self.points = (replicates, items, dimensions), dtype, torch.empty(0)
+
+    def __call__(self, items: Tensor, start: int, count: int) -> Tensor:
+        replicates, everything, dimensions = self.shape
+        if len(self.points) == 0:
+            self.points = torch.randn(replicates, start + count, everything, dimensions, dtype=self.dtype)
+        missing = start + count - self.points.shape[1]
+        if missing > 0:
+            more = torch.randn(replicates, missing, everything, dimensions, dtype=self.dtype)
+            self.points = torch.cat([self.points, more], 1)
+        return self.points[:, start : start + count, items]
+
+
+def components(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Means, concentrations and weights of the two von Mises of p(φ|x), (batch, 2); x within ±1."""
+    mean = torch.cat([2 * x, math.pi - x], -1)
+    concentration = torch.cat([8 + 4 * x, 4 - 2 * x], -1)
+    weight = torch.cat([0.6 + 0.2 * x, 0.4 - 0.2 * x], -1)
+    return mean, concentration, weight
+
+
+def true_log_prob(x: Tensor, value: Tensor) -> Tensor:
+    mean, kappa, weight = components(x)
+    log_prob = kappa * (value - mean).cos() - math.log(2 * math.pi) - torch.special.i0e(kappa).log() - kappa
+    return torch.logsumexp(log_prob + weight.log(), -1)
+
+
+def drawn(count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """x and φ, (count, 1)."""
+    generator = np.random.default_rng(seed)
+    x = torch.from_numpy(generator.uniform(-1, 1, (count, 1)))
+    mean, kappa, weight = (part.numpy() for part in components(x))
+    which = (generator.uniform(size=count) > weight[:, 0]).astype(int)
+    rows = np.arange(count)
+    return x.float(), torch.from_numpy(generator.vonmises(mean[rows, which], kappa[rows, which]))[
+        :, None
+    ].float()
+
+
+def trained(config: dict[str, object]) -> tuple[nn.Module, DensityHead]:
+    torch.manual_seed(0)
+    head = build("density_head", resolve("density_head", config), target=Target("angle", ("azimuth",)))
+    encoder = nn.Sequential(
+        nn.Linear(1, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, head.size)
+    )
+    parameters = [*encoder.parameters(), *head.parameters()]
+    optimizer = torch.optim.Adam(parameters, lr=2e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    x, value = drawn(20_000, 1)
+    order = torch.randint(len(x), (STEPS, 128))
+    for rows in order:
+        optimizer.zero_grad()
+        head.loss(encoder(x[rows]), value[rows]).mean().backward()
+        optimizer.step()
+        schedule.step()
+    head.eval().requires_grad_(False)
+    return encoder.requires_grad_(False), head
+
+
+def integral(head: DensityHead, raw: Tensor, value: Tensor) -> Tensor:
+    """log p(φ|x) of the head itself by the trapezium rule over ±8 standard deviations of z, float64, (items,)."""
+    if not isinstance(head, CVAEHead | SCVAEHead):
+        return head(raw).log_prob(value)
+    latent = head.decoder.spread.shape[-1]
+    axis = torch.linspace(-8, 8, 8001 if latent == 1 else 301, dtype=torch.float64)
+    z = torch.stack(torch.meshgrid(*[axis] * latent, indexing="ij"), -1).reshape(-1, latent)
+    log_weight = -z.square().sum(-1) / 2 + latent * (
+        math.log(16 / (len(axis) - 1)) - math.log(2 * math.pi) / 2
+    )
+    found = []
+    for row, target in zip(raw, value, strict=True):
+        if isinstance(head, CVAEHead):
+            networks = head.networks(row)
+            number = networks.decode(networks.prior.at(z))
+        else:
+            number = head.decoder(row, z)
+        found.append(torch.logsumexp(head.component(number).log_prob(target) + log_weight, 0))
+    return torch.stack(found)
+
+
+@contextmanager
+def points(kind: str) -> Iterator[None]:
+    """Points by lattice, or independent."""
+    if kind == "lattice":
+        yield
+        return
+    with (
+        patch("plugins.density_head.latent.density.NormalPoints", IndependentPoints),
+    ):
+        yield
+
+
+def turned(head: DensityHead, knob: str, value: float) -> None:
+    if not isinstance(head, CVAEHead | SCVAEHead):
+        return
+    if knob == "samples":
+        head.samples, head.tolerance = int(value), None
+    elif knob == "tolerance":
+        head.samples, head.tolerance = 64, value
+
+
+def curve(method: str, encoder: nn.Module, head: DensityHead) -> list[dict[str, object]]:
+    """Rows of one head: for every knob, both kinds of points."""
+    x, value = drawn(ITEMS, 2)
+    with torch.no_grad():
+        raw = encoder(x)
+        double = head.double()
+        truth = integral(double, raw.double(), value.double())
+        head.float()
+        family = float((true_log_prob(x.double(), value.double()) - truth).mean())
+        kinds: list[tuple[str, str, tuple[float, ...]]] = [("exact", "none", (0.0,))]
+        if hasattr(head, "samples"):
+            kinds = [("lattice", "samples", SAMPLES), ("independent", "samples", SAMPLES)]
+            kinds.append(("lattice", "tolerance", TOLERANCES))
+        rows: list[dict[str, object]] = []
+        for kind, knob, values in kinds:
+            with points("lattice" if kind == "exact" else kind):
+
+                def predict(setting: float, knob: str = knob) -> None:
+                    turned(head, knob, setting)
+                    head(raw).log_prob(value)
+
+                # knobs are numbers here, of which `samples` are whole
+                taken = run_times(predict, values, CPU, calls=7, budget_seconds=6.0)  # pyright: ignore
+                for setting, seconds in zip(values, taken, strict=True):
+                    turned(head, knob, setting)
+                    found = []
+                    for seed in range(SEEDS):
+                        torch.manual_seed(seed)
+                        found.append(estimate(head(raw), value))
+                    log_prob = torch.stack([one.log_mean for one in found]).double()
+                    debiased = torch.stack([one.debiased for one in found]).double()
+                    told = torch.stack([one.standard_error for one in found]).double()
+                    error = log_prob - truth
+                    rows.append(
+                        {
+                            "method": f"{method}, {kind}" if kind != "exact" else method,
+                            "knob": knob,
+                            "value": setting,
+                            "error_nats": float(error.square().mean().sqrt()),
+                            "error_nats_std": float(error.square().mean(1).sqrt().std()),
+                            "error_of_mean_nats": float(error.mean(1).square().mean().sqrt()),
+                            "bias_nats": float(error.mean()),
+                            "debiased_bias_nats": float((debiased - truth).mean()),
+                            "told_error_nats": float(told.square().mean().sqrt()),
+                            "samples_mean": float(
+                                torch.stack([one.samples for one in found]).double().mean()
+                            ),
+                            "family_excess_nats": family,
+                            "excess_nats": family - float(error.mean()),
+                            "excess_nats_std": float(error.mean(1).std()),
+                            "milliseconds_per_sample": 1e3 * seconds / ITEMS,
+                            "synthetic": True,
+                        }
+                    )
+    return rows
+
+
+def mark(rows: list[dict[str, object]]) -> None:
+    """Pareto points of each method and knob."""
+    for method, knob in dict.fromkeys((row["method"], row["knob"]) for row in rows):
+        own = [row for row in rows if (row["method"], row["knob"]) == (method, knob)]
+        best = front([row["error_nats"] for row in own], [row["milliseconds_per_sample"] for row in own])  # pyright: ignore
+        for row, kept in zip(own, best, strict=True):
+            row["pareto"] = kept
+
+
+def picture(rows: list[dict[str, object]]) -> None:
+    """A column a model, a row a quantity; colours and markers are kinds of points, line styles sizes of the latent."""
+    figure = titled_figure((11, 8.5), "Log-likelihoods of latent-variable models on a toy of two modes", True)
+    axes = figure.subplots(2, 2, sharex=True, sharey="row")
+    for column, (key, name) in enumerate((("scvae", "sCVAE"), ("cvae", "CVAE"))):
+        for line in curves(rows, key):
+            for axis, quantity in zip(axes[:, column], ("error_nats", "excess_nats"), strict=True):
+                banded(axis, line, quantity)
+        axes[0, column].set_title(f"{name}: error of the estimate", fontsize=11)
+        axes[1, column].set_title(f"{name}: error of the model", fontsize=11)
+        axes[1, column].set_xlabel("run time (ms per sample, batches of 64, one core)")
+    exact = next(row for row in rows if row["knob"] == "none")
+    for axis in axes[1]:
+        axis.axhline(exact["excess_nats"], color="black", linewidth=1, linestyle=":")
+    for axis in axes.flat:
+        axis.set(xscale="log", yscale="log")
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0, 0].set_ylabel("RMS error of one log-likelihood\nagainst the model's own integral (nats)")
+    axes[1, 0].set_ylabel("negative log-likelihood\nabove the entropy of the truth (nats)")
+    handles = [
+        Line2D([], [], color=colour, marker=marker, label=label) for label, colour, marker in KINDS.values()
+    ]
+    handles += [
+        Line2D([], [], color="black", label="one latent number, filled"),
+        Line2D(
+            [],
+            [],
+            color="black",
+            linestyle="--",
+            marker="o",
+            markerfacecolor="white",
+            label="two latent numbers, hollow",
+        ),
+        Line2D(
+            [],
+            [],
+            color="black",
+            linestyle=":",
+            linewidth=1,
+            label=f"mixture of two von Mises: exact, in {exact['milliseconds_per_sample']:.3f} ms",
+        ),
+    ]
+    said = f"Bands: standard deviation over {SEEDS} seeds. " if "error_nats_std" in exact else ""
+    said += f"Dots: {SAMPLES[0]} to {SAMPLES[-1]} points, or tolerances of {TOLERANCES[0]} to {TOLERANCES[-1]} nats."
+    legend = figure.legend(
+        handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False, title=said
+    )
+    legend.get_title().set(fontsize=9)
+    saved(figure, HERE.with_suffix(""), True)
+
+
+def curves(
+    rows: list[dict[str, object]], key: str
+) -> Iterator[tuple[list[dict[str, object]], dict[str, Any]]]:
+    """The rows of each curve of a model, and how it looks."""
+    for latent in (1, 2):
+        for (kind, knob), (_, colour, marker) in KINDS.items():
+            method = f"{key}, {latent} latent, {kind}"
+            own = [row for row in rows if (row["method"], row["knob"]) == (method, knob)]
+            style: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 4.5}
+            if latent == 2:
+                style |= {"linestyle": "--", "markerfacecolor": "white"}
+            yield own, style
+
+
+def banded(axis: Axes, line: tuple[list[dict[str, object]], dict[str, Any]], key: str) -> None:
+    """One curve against run time, with its standard deviation over seeds where that was measured."""
+    own, style = line
+    time, mean, spread = (
+        np.array([row.get(name, math.nan) for row in own], dtype=float)
+        for name in ("milliseconds_per_sample", key, f"{key}_std")
+    )
+    axis.plot(time, mean, linewidth=1.2, **style)
+    # on a logarithmic axis a band that reaches zero ends at a third of its middle
+    low = np.maximum(mean - spread, mean / 3)
+    axis.fill_between(time, low, mean + spread, color=style["color"], alpha=0.12, linewidth=0)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    assert NormalPoints is not IndependentPoints
+    rows: list[dict[str, object]] = []
+    for method, config in HEADS.items():
+        rows += curve(method, *trained(config))
+    mark(rows)
+    table.csv(rows, [*COLUMNS, "family_excess_nats"], HERE.with_suffix(".csv"))
+    picture(rows)
+    shown = [
+        row
+        for row in rows
+        if row["knob"] != "samples" or row["value"] in (1, 10, 100, 1000) or row["value"] == 500
+    ]
+    gains = sequences()
+    text = (
+        "# Log-likelihoods that are integrals over a latent variable\n\n"
+        "`python -m benchmarks.densities.latent`: heads trained briefly (same MLP encoder) on a synthetic toy, two "
+        "von Mises "
+        f"whose modes, widths and weights move with x; {ITEMS} test samples, {SEEDS} seeds, one thread. Errors are "
+        "root mean squares against the head's own integral by quadrature; the last error is the mean negative "
+        "log-likelihood above that of the truth, on the same samples. `lattice`: randomised "
+        "quasi-Monte-Carlo points of the framework; `independent`: plain Monte Carlo. "
+        "All values: `latent.csv`; picture: `latent.png`.\n\n"
+        f"{table.markdown(shown, COLUMNS)}\n\n"
+        "## Points\n\n"
+        "Variance of independent normal points over that of a sequence with a random shift, same number of points: "
+        "geometric mean over five smooth weights, and the worst of them.\n\n"
+        f"{table.markdown(gains, {key: key for key in gains[0]})}\n\n"
+        f"{machine('torch')}\n"
+    )
+    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    sys.stdout.write(text)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["--draw"]:
+        picture(committed.rows(HERE.with_suffix(".csv")))
+    else:
+        main()
