@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from framework.deployment.frozen import freeze as freeze
 
 __all__ = ["freeze", "load"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _LAZY = {"load": "framework.configuration.loading", "freeze": "framework.deployment.frozen"}
 

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,10 +37,10 @@ def show() -> None:
 
 
 def paper(bibtex: str) -> str:
-    """'Author et al. 2015, Title' out of a BibTeX entry; nothing out of nothing."""
-    if not bibtex.strip():
-        return ""
+    """Return 'Author et al. 2015, Title' from a BibTeX entry; "" from one without an author."""
     authors = _value(bibtex, "author").split(" and ")
+    if authors == [""]:
+        return ""
     first = authors[0].partition(",")[0] if "," in authors[0] else authors[0].split(" ")[-1]
     name = f"{first} et al." if len(authors) > 1 else first
     return f"{name} {_value(bibtex, 'year')}, {_value(bibtex, 'title')}"
@@ -47,7 +48,16 @@ def paper(bibtex: str) -> str:
 
 def _value(bibtex: str, key: str) -> str:
     found = re.search(rf"\b{key}\s*=\s*[{{\"]+(.*?)[}}\"]+\s*,?\s*(?:\n|$)", bibtex, re.DOTALL)
-    return re.sub(r"[{}]", "", " ".join(found.group(1).split())) if found else ""
+    if not found:
+        return ""
+    accented = re.sub(r"\\+([\"'`^~])\{?(\w)\}?", _with_accent, " ".join(found.group(1).split()))
+    return re.sub(r"[{}]", "", accented)
+
+
+def _with_accent(command: re.Match[str]) -> str:
+    """Return the letter that a LaTeX command for an accent stands for."""
+    marks = {'"': "\u0308", "'": "\u0301", "`": "\u0300", "^": "\u0302", "~": "\u0303"}
+    return unicodedata.normalize("NFC", command[2] + marks[command[1]])
 
 
 @dataclass(frozen=True)

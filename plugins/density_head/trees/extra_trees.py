@@ -21,7 +21,7 @@ from plugins.density_head.trees.heads_without_gradient import (
     WIDEST,
     load_any_shape,
     require_fitted,
-    require_no_angle,
+    require_class_or_real,
     single,
     with_gradient_of_0,
 )
@@ -90,7 +90,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         smoothing: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     ) -> None:
         super().__init__()
-        require_no_angle(target, by="density_head extra_trees")
+        require_class_or_real(target, by="density_head extra_trees")
         self.classes = len(target.names) if target.kind == "class" else 0
         self.trees = trees
         self.share, self.leaf, self.depth = features, leaf, depth

@@ -21,7 +21,7 @@ from plugins.density_head.trees.heads_without_gradient import (
     WIDEST,
     load_any_shape,
     require_fitted,
-    require_no_angle,
+    require_class_or_real,
     single,
     with_gradient_of_0,
 )
@@ -85,7 +85,7 @@ class XGBoostHead(DensityHead, Fitted):
         splits: Literal["hist", "exact"] = "hist",
     ) -> None:
         super().__init__()
-        require_no_angle(target, by="density_head xgboost")
+        require_class_or_real(target, by="density_head xgboost")
         self.classes = len(target.names) if target.kind == "class" else 0
         if self.classes == 1:
             raise ConfigError(

@@ -19,15 +19,15 @@ WIDEST = 1e18
 """The largest standard deviation of such a density: the square of a wider one is more than float32 holds."""
 
 
-def require_no_angle(target: Target, by: str) -> None:
-    """Refuse targets other than classes and reals.
+def require_class_or_real(target: Target, by: str) -> None:
+    """Refuse targets other than classes and real numbers.
 
     Raises:
-        ConfigError: angles.
+        ConfigError: the target is an angle or an image.
     """
-    if target.kind == "angle":
+    if target.kind not in ("class", "real"):
         raise ConfigError(
-            f"{by} describes targets of kind 'class' or 'real', but this data set's are 'angle' "
+            f"{by} describes targets of kind 'class' or 'real', but this data set's are {target.kind!r} "
             f"({target.told}). Choose another density_head, or other data."
         )
 
