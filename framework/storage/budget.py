@@ -9,7 +9,8 @@ The sizes have formulas here. torch computes shapes too, on its device "meta", b
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -107,27 +108,61 @@ def result_bytes(func: Any, args: tuple[Any, ...], given: Mapping[str, Any]) -> 
     Operations without a formula count as much as they are given: their results are no larger, or their shapes hang on
     numbers.
     """
-    schema = func._schema
-    if all(result.alias_info is not None for result in schema.returns):
+    operation = _operation(func)
+    if not operation.allocates:
         return 0
-    called = {argument.name: value for argument, value in zip(schema.arguments, args, strict=False)} | dict(
-        given
-    )
-    tensors = [item for item in tree_iter((args, dict(given))) if isinstance(item, Tensor)]
+    tensors = _tensors((*args, *given.values()))
+    if operation.elementwise and "dtype" not in given and len({one.shape for one in tensors}) == 1:
+        return tensors[0].numel() * max(one.element_size() for one in tensors)
+    called = dict(zip(operation.arguments, args, strict=False)) | dict(given)
     width = max((one.element_size() for one in tensors), default=torch.get_default_dtype().itemsize)
     if isinstance(called.get("dtype"), torch.dtype):
         width = called["dtype"].itemsize
-    formula = _FORMULAS.get(schema.name.removeprefix("aten::"))
     try:
-        if formula is not None:
-            return int(width * formula(called))
-        if torch.Tag.pointwise in func.tags:
+        if operation.formula is not None:
+            return int(width * operation.formula(called))
+        if operation.elementwise:
             return width * math.prod(np.broadcast_shapes(*(one.shape for one in tensors)))
-        if "size" in called and schema.name not in _SAME_SIZE:
+        if "size" in called and operation.name not in _SAME_SIZE:
             return width * math.prod(map(int, called["size"]))
     except (ArithmeticError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
         pass  # wrong arguments: the operation itself says so
     return width * sum(one.numel() for one in tensors)
+
+
+class _Operation(NamedTuple):
+    """What `result_bytes` needs to know of an operation of torch."""
+
+    name: str
+    arguments: tuple[str, ...]
+    allocates: bool
+    elementwise: bool
+    formula: Callable[[Mapping[str, Any]], int | float] | None
+
+
+@cache
+def _operation(func: Any) -> _Operation:
+    """Read the schema of an operation, once: every operation of every prediction is looked at."""
+    schema = func._schema
+    formula = _FORMULAS.get(schema.name.removeprefix("aten::"))
+    return _Operation(
+        schema.name,
+        tuple(argument.name for argument in schema.arguments),
+        any(result.alias_info is None for result in schema.returns),
+        formula is None and torch.Tag.pointwise in func.tags,
+        formula,
+    )
+
+
+def _tensors(values: Iterable[Any]) -> list[Tensor]:
+    """Return the tensors among arguments and in their lists; operations of torch nest no deeper."""
+    found = []
+    for value in values:
+        if isinstance(value, Tensor):
+            found.append(value)
+        elif isinstance(value, list | tuple):
+            found += [one for one in value if isinstance(one, Tensor)]
+    return found
 
 
 _SAME_SIZE = ("aten::_unsafe_view", "aten::_reshape_copy", "aten::view_copy", "aten::expand_copy")
