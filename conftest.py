@@ -1,16 +1,28 @@
-"""Shape and type annotations are checked while tests run, and only then."""
+"""The tests' environment: one thread, no store, no cluster; shape and type annotations are checked where asked for.
 
+`CHECK_TYPES=1 pytest` checks the shapes and types of every call (jaxtyping, beartype), which costs a quarter more time.
+`.ci/run` does so in a step of its own.
+"""
+
+import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+for name in [
+    name
+    for name in os.environ
+    if name.startswith("SLURM_") or name in ("RANK", "LOCAL_RANK", "NODE_RANK", "WORLD_SIZE")
+]:  # the job that the tests run in is not the one that a test starts
+    del os.environ[name]
 
-from jaxtyping import install_import_hook
+if os.environ.get("CHECK_TYPES", "0") != "0":
+    from jaxtyping import install_import_hook
 
-install_import_hook(["framework", "plugins"], "beartype.beartype")
+    install_import_hook(["framework", "plugins"], "beartype.beartype")
 
 
 @pytest.fixture(autouse=True)
@@ -19,3 +31,14 @@ def no_store_in_the_environment() -> Iterator[None]:
     os.environ.pop("MLFLOW_TRACKING_URI", None)
     yield
     os.environ.pop("MLFLOW_TRACKING_URI", None)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Keep what the collected tests import out of every later garbage collection, which would visit it each time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()

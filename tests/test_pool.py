@@ -427,6 +427,7 @@ def test_a_signal_that_comes_before_a_job_has_begun_reaches_it(tmp_path: Path) -
     process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=2")
     try:
         app.until((app.folder / "importing").exists)
+        app.until(lambda: all(app.record(number)["status"] == "running" for number in range(2)))
         process.send_signal(signal.SIGTERM)
         app.until(lambda: "told to stop" in app.said())
         (app.folder / "signalled").touch()
