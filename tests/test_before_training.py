@@ -132,9 +132,8 @@ def test_a_label_of_the_test_split_costs_the_test_alone(framework: Framework) ->
     assert done.code == 1, done.out
     assert "is 7, wanted 0 to 1" in done.out
     assert "Traceback" not in done.out
-    again = framework(
-        "mode=test", f"checkpoint={done.folder}", "data.fault=none", *SMALL, *chosen, folder="again"
-    )
+    data = ("data=trial", "data.kind=class", "data.fault=none", "metric=[accuracy]", "logger=none")
+    again = framework("mode=test", f"checkpoint={done.folder}", *data, "pictures=false", folder="again")
     assert again.code == 0, again.out
 
 

@@ -171,7 +171,7 @@ def test_images_are_predicted_loaded_frozen_served_and_trained_further(
 
 def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: Path) -> None:
     """A rasteriser has nothing to train; its one scale is fitted."""
-    run = [item for item in people(tmp_path) if not item.startswith(("experiment", "encoder"))]
+    run = [item for item in people(tmp_path) if not item.startswith(("experiment", "encoder", "trainer"))]
     done = framework("experiment=smplpix/rasterised", *run, folder="drawn")
     assert done.code == 0, done.out
     assert "epoch 1" not in done.out
@@ -182,9 +182,16 @@ def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: 
     assert unsaid.code == 2 and "encoder.rasterised.body=" in unsaid.out, unsaid.out
     tested = framework(*test, *paths_again([f"resume={done.folder}"]), folder="tested")
     assert tested.code == 0, tested.out
-    refused = framework("experiment=smplpix/rasterised", *run, "objective=[random_features]", folder="no")
-    assert refused.code == 2
-    assert "Nothing in this model learns by gradient" in refused.out
+    for further, sentence in (
+        ("objective=[random_features]", "Nothing in this model learns by gradient"),
+        (
+            "trainer.max_epochs=2",
+            "trainer.max_epochs=2 sets nothing: nothing in this model learns by gradient",
+        ),
+    ):
+        refused = framework("experiment=smplpix/rasterised", *run, further, folder="no")
+        assert refused.code == 2
+        assert sentence in refused.out
 
 
 def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(

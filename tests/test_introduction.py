@@ -6,7 +6,7 @@ import pytest
 
 from framework.configuration.schema import build, resolve
 from framework.data import Data
-from framework.runs.introduction import lines
+from framework.runs.introduction import BUSY, Cores, lines, threads_line
 
 
 def prepared(**config: object) -> Data:
@@ -44,3 +44,32 @@ def test_data_that_say_nothing_more_have_three_lines() -> None:
         "predicts one of 2 classes: upper, lower",
         "samples: train 20, validation 10, test 10",
     ]
+
+
+CORES = Cores(2, 2, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("threads", "chosen", "cores", "environment", "said"),
+    [
+        (2, None, CORES, {}, "threads: 2 on 2 cores, one for each core; threads=1 sets another number"),
+        (1, None, Cores(1, 1, 0.0), {}, "threads: 1 on 1 core, one for each core"),
+        (4, 4, CORES, {"OMP_NUM_THREADS": "1"}, "threads: 4 on 2 cores, as threads=4 says"),
+        (1, None, CORES, {"OMP_NUM_THREADS": "1"}, "as OMP_NUM_THREADS=1 says, which a sweep sets"),
+        (1, None, CORES, {"MKL_NUM_THREADS": "1"}, "as MKL_NUM_THREADS=1 says"),
+        (
+            2,
+            None,
+            Cores(2, 64, 0.0),
+            {},
+            "2 cores that this process may use of the machine's 64, one for each",
+        ),
+        (2, None, Cores(2, 2, 3.27), {}, "a load of 3.3 in the last minute"),
+    ],
+)
+def test_a_run_says_how_many_threads_compute_and_why(
+    threads: int, chosen: int | None, cores: Cores, environment: dict[str, str], said: str
+) -> None:
+    line = threads_line(threads, chosen, cores, environment)
+    assert said in line
+    assert ("load" in line) == (cores.load >= BUSY)

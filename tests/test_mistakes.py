@@ -74,7 +74,7 @@ trainer.keep=beest | Did you mean 'best'?
 +trainer.accumulate_grad_batches=0 | trainer.accumulate_grad_batches = 0
 +trainer.deterministic=maybe | trainer.deterministic = 'maybe'
 +trainer.max_time=soon | trainer.max_time = 'soon'
-mode=check checkpoint=outputs/run | mode=check reads none, train, test, calibrate, predict, work_precision do
+mode=check checkpoint=outputs/run | mode=check reads no checkpoint, train, test, calibrate, predict, work_precision do
 experiment=moons/vanilla_128 checkpoint=outputs/run | outputs/run is neither a file, a folder nor an MLflow run id
 seed=-1 | seed = -1
 seed=one | seed = 'one'
@@ -182,6 +182,29 @@ renderer=opengl | 'renderer/opengl'. Available in renderer
 uncertainty=[ensembl] | Did you mean 'ensemble'?
 data=cifar10 | 'data/cifar10'. Available in data
 experiment=moons/vanilla_128 'encoder.mlp.widths=[0]' | encoder
+experiment=moons/vanilla_128 renderer=zbuffer | renderer=zbuffer: mode=train reads no renderer, check does
+-m experiment=moons/vanilla_128 renderer=zbuffer,rasterizer | renderer=zbuffer: mode=train reads no renderer
+mode=test checkpoint=nowhere density_head=bernoulli | mode=test reads no density_head, train, check do
+mode=test checkpoint=nowhere encoder=[mlp] | mode=test reads no encoder, train, encode, check do
+mode=test checkpoint=nowhere trainer.max_epochs=3 | mode=test reads no trainer.max_epochs, train does
+mode=test checkpoint=nowhere optimizer=sgd | mode=test reads no optimizer, train does
+mode=test checkpoint=nowhere debug=fast | debug=fast sets nothing
+mode=predict checkpoint=nowhere metric=[accuracy] | mode=predict reads no metric
+mode=predict checkpoint=nowhere pictures=false | mode=predict reads no pictures
+mode=predict checkpoint=nowhere metric.x.y=1 | metric.x.y=1: mode=predict reads no metric
+mode=calibrate checkpoint=nowhere objective=[adversarial] | mode=calibrate reads no objective, train, check do
+mode=combine mode.members=nowhere checkpoint=nowhere | mode=combine reads no checkpoint
+mode=encode mode.files=a mode.into=b data=point_cloud_folder samples=3 | mode=encode reads no samples
+mode=plugins data=moons | mode=plugins reads no data
+mode=sync mode.run=nowhere data=moons | mode=sync reads no data
+mode=check data=moons samples=3 | mode=check reads no samples
++mode.files=a experiment=moons/vanilla_128 | mode.files: unknown key
+experiment=moons/vanilla_128 optimizer.patience=3 | only the schedule plateau reads it
+experiment=moons/vanilla_128 +trainer.limit_test_batches=3 | the test always covers its whole split
+experiment=moons/vanilla_128 logger=none +logger.uri=x | logger=none has no store
+experiment=moons/vanilla_128 metric=[accuracy] outliers.test=9 | no metric of this run reads outliers
+data=moons density_head=extra_trees metric=[accuracy] trainer.max_epochs=3 | is fitted at once, without gradient
+data=moons density_head=extra_trees metric=[accuracy] optimizer=sgd | is fitted at once, without gradient
 experiment=moons/vanilla_128 encoder.mlp.width=3 | Did you mean 'widths'?
 """
 

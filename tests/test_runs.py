@@ -351,10 +351,12 @@ def test_test_and_predict_repeat_what_training_reported(framework: Framework) ->
     points = []
     for folder in ("predicted", "again"):
         predict = ("mode=predict", f"checkpoint={trained.folder}", "logger=none")
-        done = framework(*predict, f"batch_size={len(folder)}", folder=folder)
+        done = framework(*predict, f"workers={len(folder) % 2}", folder=folder)
         assert done.code == 0, done.out
         points.append((done.folder / "predictions.csv").read_text())
     assert points[0] == points[1]
+    refused = framework(*predict, "batch_size=7", folder="refused")
+    assert refused.code == 2 and "batch_size=7: mode=predict reads no batch_size" in refused.out
     rows = points[0].splitlines()
     assert rows[0] == "sample,needle_deg,entropy_nats"
     assert len(rows) == 49

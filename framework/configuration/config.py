@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
+from framework.configuration.modes import is_below, key_of
 from framework.configuration.schema import check
 from framework.configuration.settings import Settings, settings
 
@@ -32,12 +33,14 @@ class Config:
         settings: the core's own part, checked.
         folder: of the run.
         overrides: what the command line changed.
+        trained_on: the data set of the stored model that the command is about; empty where there is none.
     """
 
     values: Mapping[str, Any]
     settings: Settings
     folder: Path
     overrides: Sequence[str]
+    trained_on: str = ""
 
     @classmethod
     def of(cls, values: Mapping[str, Any], folder: Path, overrides: Sequence[str]) -> "Config":
@@ -70,3 +73,8 @@ class Config:
             ConfigError: an unknown key, or a value out of range.
         """
         return kind.model_validate(check(kind, self.values["mode"], "mode"))
+
+    def given(self, key: str) -> str | None:
+        """What the command line says of a key, or of one below it; None where it says nothing."""
+        found = (item for item in self.overrides if is_below(key_of(item).removeprefix("stored."), (key,)))
+        return next(found, None)

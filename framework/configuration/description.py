@@ -7,7 +7,8 @@ from importlib.metadata import version
 from typing import Any, get_args
 
 from framework.configuration.assembly import Resolved
-from framework.configuration.paths import MODEL, UNUSED, require_said, without_paths
+from framework.configuration.paths import UNUSED, require_said, without_paths
+from framework.configuration.registry import MODEL
 from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data

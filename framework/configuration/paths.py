@@ -17,15 +17,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from framework.configuration.registry import GROUPS, load
+from framework.configuration.registry import GROUPS, MODEL, load
 from framework.configuration.signature import parts, signature
 from framework.errors import ConfigError, did_you_mean, printable, quoted, shown
 from framework.storage.path_marks import FilePath as FilePath
 from framework.storage.path_marks import Mark
 from framework.storage.path_marks import Words as Words
 
-MODEL = ("encoder", "density_head", "uncertainty")
-"""Groups of what a model predicts with."""
 SINGLE = ("data", "outliers", "density_head", "renderer")
 """Groups of which a config names one plugin; of others it names several."""
 OPTIONS = ("files", "into", "members", "run")

@@ -11,6 +11,8 @@ from typing import Any
 from framework.errors import ConfigError, did_you_mean, listed, quoted
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
+MODEL = ("encoder", "density_head", "uncertainty")
+"""Groups of what a model predicts with."""
 
 Entry = Any
 """An importlib.metadata.EntryPoint, or that of its backport, which takes over once MLflow has been imported."""

@@ -180,18 +180,20 @@ class Settings(_Strict):
     mode: dict[str, Any] = {}
 
 
-def store_experiment(config: Mapping[str, Any]) -> str:
+def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
     """Return the tracking store's experiment for a run, which the logger may name.
 
-    Else it is "data" for `experiment=data/method`, the name of the data set for a run without an experiment, and for
-    one without data "Default", which MLflow makes itself. One for all methods on the same data, so that a sweep over
-    methods stands under its parent and compares.
+    Else it is "data" for `experiment=data/method`, the name of the data set for a run without an experiment, that of
+    the data which a stored model was `trained_on`, and for a run without data "Default", which MLflow makes itself. One
+    for all methods on the same data, so that a sweep over methods stands under its parent and compares.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")
     data = config.get("data")
     chosen = data.get("name") if isinstance(data, Mapping) else data
-    return str(logger.get("experiment") or (name.partition("/")[0] if name else chosen) or "Default")
+    return str(
+        logger.get("experiment") or (name.partition("/")[0] if name else chosen) or trained_on or "Default"
+    )
 
 
 def settings(config: Mapping[str, Any]) -> Settings:

@@ -3,9 +3,10 @@
 import re
 from collections.abc import Sequence
 
+from framework.configuration.modes import MODES
 from framework.configuration.registry import GROUPS
 
-READING = ("test", "calibrate", "predict", "work_precision", "combine")
+READING = tuple(name for name, mode in MODES.items() if mode.stored)
 """Modes that take the plugins of a stored model where the command chooses none."""
 
 

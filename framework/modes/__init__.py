@@ -7,17 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from framework.configuration.config import Config
+from framework.configuration.modes import MODES as MODES
+from framework.configuration.modes import idle, require_read
 from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
+from framework.runs.job import refuse_idle
 from framework.storage.enclosed import require_enclosed
-
-MODES = (
-    *("train", "test", "calibrate", "combine", "predict", "encode", "work_precision", "check", "plugins"),
-    "sync",
-)
-
-READING = ("train", "test", "calibrate", "predict", "work_precision")
-"""Modes that read `checkpoint`; training starts from its weights."""
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
@@ -27,21 +22,21 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
         ConfigError: an unknown mode, or a fault in the config.
     """
     require_enclosed(folder)
-    if values.get("resume") not in ("auto", "never", None):
+    resumed = values.get("resume") not in ("auto", "never", None)
+    if resumed:
         if _sent_the_rest(folder, (values.get("logger") or {}).get("uri")):
             return None
         values, overrides = _stored(folder, values, overrides)
     name = values["mode"].get("name") if isinstance(values.get("mode"), dict) else None
-    if name not in MODES:
+    if not isinstance(name, str) or name not in MODES:
         raise ConfigError(
             f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}."
         )
     config = Config.of(values, folder, overrides)
-    if config.settings.checkpoint is not None and name not in READING:
-        raise ConfigError(
-            f"checkpoint={config.settings.checkpoint}: mode={name} reads none, {', '.join(READING)} do. Leave "
-            "it out."
-        )
+    if not resumed:  # which has the settings of a run that was begun, perhaps when they were not looked at
+        require_read(name, overrides)
+        for sentence in idle(values, overrides):
+            refuse_idle(folder, sentence)
     if name == "train":  # what is wrong is found before Lightning is imported, which takes seconds
         require_device(config.settings.trainer.get("accelerator"))
         _ = config.parts

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from framework.configuration.config import Config
+from framework.configuration.config import Config, Options
 from framework.errors import ConfigError, UserError
 from framework.reports.table import csv
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
@@ -45,6 +45,7 @@ def run(config: Config) -> None:
         ConfigError: nothing that has a contract is chosen.
         ContractBroken: a property does not hold; the table says which and where.
     """
+    config.options(Options)
     if config.settings.threads:
         torch.set_num_threads(config.settings.threads)
     chosen = _chosen(config.values)

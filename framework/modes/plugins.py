@@ -10,13 +10,14 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from framework.configuration.config import Config
+from framework.configuration.config import Config, Options
 from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, refused
 from framework.errors import shown
 
 
 def run(config: Config) -> None:
     """Print the list."""
+    config.options(Options)
     show()
 
 

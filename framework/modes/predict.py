@@ -10,12 +10,10 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.data import Data, Mapped
-from framework.datasets.fields import as_batch
 from framework.datasets.png import png
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
@@ -29,7 +27,7 @@ from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, files_in, say_left_out, to_read
 from framework.storage.names import spelled
 from framework.target import Target
-from framework.training.batches import told
+from framework.training.batches import Batches, told
 
 ERRORS = ("_low_error", "_high_error", "_low_error_deg", "_high_error_deg")
 ENDS = ("_low", "_high", "_low_deg", "_high_deg")
@@ -98,7 +96,7 @@ def predictions(
     Predicted images are written into the folder `images`; the row names the file.
     """
     dataset = data.read(files) if files else data.splits().test
-    loader = DataLoader(dataset, batch_size=BLOCK, collate_fn=as_batch)
+    loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
     mapped: list[tuple[Tensor, Tensor]] = []

@@ -1,6 +1,6 @@
 """mode=test: test a trained model again, on its own data or on other data."""
 
-from framework.configuration.config import Config
+from framework.configuration.config import Config, Options
 from framework.reports.report import report_test
 from framework.runs.run import opened
 from framework.runs.session import for_trained, tested
@@ -8,6 +8,7 @@ from framework.runs.session import for_trained, tested
 
 def run(config: Config) -> None:
     """Print the table row of `checkpoint`."""
+    config.options(Options)
     session = tested(for_trained(config))
     with opened(session.config) as run:
         session.record(run)

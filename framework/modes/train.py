@@ -1,6 +1,6 @@
 """mode=train: fit, calibrate, test, report."""
 
-from framework.configuration.config import Config
+from framework.configuration.config import Config, Options
 from framework.reports.report import report_test, report_training
 from framework.runs.fit import fit, keep_model_alone
 from framework.runs.job import leave_value
@@ -11,6 +11,7 @@ from framework.storage.first_rank import first_rank
 
 def run(config: Config) -> float:
     """Returns the validation loss of the kept weights, nats: what a sweeper minimises."""
+    config.options(Options)
     session = for_training(config)
     with opened(config) as run:
         session.console.print(f"run folder: {run.folder}")

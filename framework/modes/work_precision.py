@@ -6,6 +6,7 @@ from pydantic import Field
 
 from framework.configuration.assembly import build_metrics
 from framework.configuration.config import Config, Options
+from framework.configuration.modes import sets_nothing
 from framework.configuration.settings import Positive
 from framework.data import Batch
 from framework.density_head import DensityHead
@@ -16,6 +17,7 @@ from framework.evaluation.tradeoff import first_knob, owners, rows, tradeoff
 from framework.metric import Metric
 from framework.reports.report import picture
 from framework.reports.table import Better, csv, machine, results_table
+from framework.runs.job import refuse_idle
 from framework.runs.run import Run, opened
 from framework.runs.session import Session, for_trained
 
@@ -53,6 +55,7 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     better = _chosen(options.metrics, metrics, own=isinstance(owner, DensityHead))
     measured = [key for key in better if key not in reference.COLUMNS]
     compared = len(measured) < len(better)
+    _refuse_unmeasured(run.config, bool(measured), compared)
     predictor.to(session.device)
     curve = tradeoff(
         predictor,
@@ -90,13 +93,37 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
         floors=floors,
         machine=f"{machine(curve.device, curve.threads)}, batches of {curve.batch_size}",
     )
-    where = picture(run, figure, "work_precision")
+    where = [picture(run, figure, "work_precision")] if settings.pictures else []
     columns = {"method": "method", "value": knob, **headings, "milliseconds_per_sample": "ms / sample"}
     for key in better:
         columns[f"{key}_pareto"] = "Pareto" if len(better) == 1 else f"Pareto: {headings[key]}"
     console = session.console
     console.print(results_table(found, columns, title=f"{session.title}, {curve.samples} test samples"))
-    console.print(f"{path}\n{where}", soft_wrap=True, highlight=False)
+    console.print("\n".join(map(str, [path, *where])), soft_wrap=True, highlight=False)
+
+
+def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
+    """Refuse settings of what is not measured.
+
+    Args:
+        config: of the command.
+        measured: whether metrics are.
+        compared: whether the error against a reference is.
+
+    Raises:
+        ConfigError: names the first.
+    """
+    for key, used, why in (
+        ("metric", measured, f"{ERROR} alone is measured here, unless mode.metrics=[...] names others"),
+        (
+            "mode.reference",
+            compared,
+            f"only {ERROR}, which mode.metrics may name, is compared with a reference",
+        ),
+    ):
+        given = config.given(key)
+        if given and not used:
+            refuse_idle(config.folder, sets_nothing(given, why))
 
 
 def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:

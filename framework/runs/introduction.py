@@ -1,21 +1,53 @@
-"""What a run says first: what it reads, what it predicts, and what it leaves out."""
+"""What a command says first: what it reads, what it predicts, what it leaves out, and how many threads compute."""
 
-from collections.abc import Sequence, Sized
+import os
+from collections.abc import Mapping, Sequence, Sized
+from typing import NamedTuple
 
+import torch
 from rich.console import Console
 
+from framework.configuration.description import Description
 from framework.data import Data, Splits
 from framework.errors import shown
 from framework.target import Target
 
 MOST = 12
 """Names that a line lists."""
+BUSY = 1.0
+"""Load of a machine from which on it is said."""
 
 
 def introduce(data: Data, console: Console) -> None:
     """Say what prepared data hold."""
-    for line in lines(data):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    _say(lines(data), console)
+
+
+def introduce_threads(chosen: int | None, console: Console) -> None:
+    """Say how many threads compute, and why so many.
+
+    Args:
+        chosen: what the setting `threads` says.
+        console: where to say it.
+    """
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    cores = Cores(allowed, os.cpu_count() or allowed, load)
+    _say([threads_line(torch.get_num_threads(), chosen, cores, os.environ)], console)
+
+
+def introduce_model(description: Description, method: str, data: Data | None, console: Console) -> None:
+    """Say what a stored model predicts, and for what it is asked now.
+
+    Args:
+        description: of the model.
+        method: what tables call it.
+        data: prepared; None where only files of the user are read.
+        console: where to say it.
+    """
+    trained_on = shown(description.config["data"]["name"]) + " (synthetic)" * description.synthetic
+    said = [f"model: {shown(method)}, trained on {trained_on}", f"predicts {predicted(description.target)}"]
+    _say([*said, *([] if data is None else _samples(data)), *description.remarks], console)
 
 
 def lines(data: Data) -> list[str]:
@@ -23,18 +55,47 @@ def lines(data: Data) -> list[str]:
     read = (
         _listed(data.columns) if data.columns else f"inputs of shape {'×'.join(map(str, data.input_shape))}"
     )
-    sizes = [
-        f"{name} {len(part)}"
-        for name, part in zip(Splits._fields, data.splits(), strict=True)
-        if isinstance(part, Sized)
-    ]
-    skipped = f", {data.skipped} left out" if data.skipped else ""
-    return [
-        f"reads {read}",
-        f"predicts {predicted(data.target)}",
-        f"samples: {', '.join(sizes)}{skipped}",
-        *(shown(remark, 1000) for remark in data.remarks),
-    ]
+    return [f"reads {read}", f"predicts {predicted(data.target)}", *_samples(data)]
+
+
+class Cores(NamedTuple):
+    """The processor cores of a machine.
+
+    Attributes:
+        allowed: number that this process may use.
+        all: number that the machine has.
+        load: processes that ran, or waited for a core, on average during the last minute.
+    """
+
+    allowed: int
+    all: int
+    load: float
+
+
+def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Mapping[str, str]) -> str:
+    """Return how many threads compute, and why so many.
+
+    Args:
+        threads: number that PyTorch uses.
+        chosen: what the setting `threads` says.
+        cores: of this machine.
+        environment: variables of this process.
+    """
+    of = "1 core" if cores.allowed == 1 else f"{cores.allowed} cores"
+    limited = f" that this process may use of the machine's {cores.all}" * (cores.allowed < cores.all)
+    names = [name for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if environment.get(name)]
+    if chosen is not None:
+        why = f"as threads={chosen} says"
+    elif names:
+        why = (
+            f"as {names[0]}={shown(environment[names[0]], 20)} says, which a sweep sets for each of its jobs"
+        )
+    else:
+        why = "one for each core; threads=1 sets another number"
+    busy = f"; other work came before or runs beside it: a load of {cores.load:.1f} in the last minute" * (
+        cores.load >= BUSY
+    )
+    return f"threads: {threads} on {of}{limited}, {why}{busy}"
 
 
 def predicted(target: Target) -> str:
@@ -44,6 +105,22 @@ def predicted(target: Target) -> str:
     if target.kind == "image":
         return f"images of {'×'.join(map(str, target.size))} pixels"
     return f"{'angles' if target.kind == 'angle' else 'numbers'}: {_listed(target.names)}"
+
+
+def _samples(data: Data) -> list[str]:
+    """Return how many samples each split of prepared data has, and what is odd in the user's files."""
+    sizes = [
+        f"{name} {len(part)}"
+        for name, part in zip(Splits._fields, data.splits(), strict=True)
+        if isinstance(part, Sized)
+    ]
+    skipped = f", {data.skipped} left out" if data.skipped else ""
+    return [f"samples: {', '.join(sizes)}{skipped}", *(shown(remark, 1000) for remark in data.remarks)]
+
+
+def _say(said: Sequence[str], console: Console) -> None:
+    for line in said:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _listed(names: Sequence[str]) -> str:

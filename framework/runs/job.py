@@ -2,11 +2,13 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
-from framework.errors import DataError, quoted
+from framework.errors import ConfigError, DataError, quoted
 from framework.storage.files import write_whole
+from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_json
 
 PARENT = "FRAMEWORK_SWEEP_PARENT"
@@ -73,3 +75,19 @@ def leave_value(folder: Path, value: float) -> None:
     """Leave the number that a sweeper which optimises is to get; nothing where `folder` is of no sweep."""
     if (folder / RECORD).is_file():
         write_whole(folder / VALUE, json.dumps(value).encode())
+
+
+def refuse_idle(folder: Path, sentence: str) -> None:
+    """Refuse a setting that has no effect; in a job of a sweep, whose other jobs may read it, only say so.
+
+    Args:
+        folder: of the run.
+        sentence: about the setting (`framework.configuration.modes.sets_nothing`).
+
+    Raises:
+        ConfigError: the run is no job of a sweep.
+    """
+    if not ((folder / RECORD).is_file() or (folder.parent / _COMMAND).is_file()):
+        raise ConfigError(sentence)
+    if first_rank():
+        sys.stdout.write(f"note: {sentence}\n")

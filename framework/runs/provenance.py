@@ -16,7 +16,7 @@ def package_versions() -> dict[str, str]:
     """
     names = set(_PACKAGES)
     for group in GROUPS:
-        names |= {entry.dist.name for entry in installed(group).values() if entry.dist}
+        names |= {entry.dist.name for entry in installed(group).values() if entry.dist and entry.dist.name}
     found = {"python": platform.python_version()}
     for name in sorted(names):
         try:

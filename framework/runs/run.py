@@ -162,7 +162,13 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
     named = run_name(config.settings, _method(config) or config.mode, config.overrides)
     return MlflowTracker(
         config.folder,
-        Destination(config.settings.logger.uri, store_experiment(config.values), named, parent, run_id),
+        Destination(
+            config.settings.logger.uri,
+            store_experiment(config.values, config.trained_on),
+            named,
+            parent,
+            run_id,
+        ),
         resumed=resumed,
         wait=0.0 if parent is None else SYNCED_WITHIN,
     )
@@ -170,8 +176,8 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
 
 def _method(config: Config) -> str | None:
     """Return the head that a training without an experiment is called by; None for other runs."""
-    head = config.values.get("density_head")
-    return str(head.get("name")) if config.mode == "train" and isinstance(head, Mapping) else None
+    head = config.values.get("density_head") if config.mode == "train" else None
+    return str(head.get("name")) if isinstance(head, Mapping) else None
 
 
 def run_name(settings: Settings, method: str, overrides: Sequence[str]) -> str:

@@ -39,11 +39,14 @@ from framework.configuration.loading import (
     reader,
     weights,
 )
+from framework.configuration.modes import MODES, sets_nothing
 from framework.configuration.paths import flat, require_said, without_paths
+from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings, device_of
 from framework.data import Batch, Data
 from framework.datasets.fields import fetched
+from framework.density_head import Fitted
 from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.splits import BLOCK, numbers, on_device, require_own
@@ -51,7 +54,8 @@ from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
-from framework.runs.introduction import introduce
+from framework.runs.introduction import introduce, introduce_model, introduce_threads
+from framework.runs.job import refuse_idle
 from framework.runs.run import Run, goes_on
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
@@ -174,18 +178,31 @@ def for_training(config: Config) -> Session:
     """
     console = begin(config.settings)
     parts = config.parts
+    resumed = goes_on(config)
+    if not resumed:
+        refuse_unread_outliers(config, parts)
+        if issubclass(load("density_head", parts["density_head"]["name"]), Fitted):
+            _refuse_training(
+                config, f"density_head={parts['density_head']['name']} is fitted at once, without gradient"
+            )
     data = build_data(parts)
     started = config.settings.checkpoint is not None and not (
-        goes_on(config) and trained(config.folder / "checkpoints")
+        resumed and trained(config.folder / "checkpoints")
     )
-    if started:
-        refuse_other_model(parts, data, config.settings)
+    start = Start.of(parts, data, config.settings) if started else None
+    introduce_threads(config.settings.threads, console)
     data.prepare()
     introduce(data, console)
     objectives = build_objectives(parts)
-    predictor = build_predictor(
-        parts, data.target, data.input_shape, config.settings.seed, columns=data.columns
-    )
+    seed = config.settings.seed
+    if start is None:
+        predictor = build_predictor(parts, data.target, data.input_shape, seed, columns=data.columns)
+    else:
+        predictor = start.predictor_for(data, parts, seed)
+        said = "a run that was stopped goes on with resume=<its folder>"
+        console.print(f"starting anew from the weights of {start.path} ({said})", soft_wrap=True)
+    if not learns(predictor) and not resumed:
+        _refuse_training(config, "nothing in this model learns by gradient")
     if objectives and not learns(predictor):
         raise ConfigError(
             f"density_head={parts['density_head']['name']} is fitted at once and has no gradient, which objectives "
@@ -193,8 +210,6 @@ def for_training(config: Config) -> Session:
             if fitted_models(predictor)
             else "Nothing in this model learns by gradient, which objectives work by. Leave objective out."
         )
-    if started:
-        start_from(predictor, config.settings, console)
     device = torch.device("cpu")
     method = method_of(config, parts)
     session = Session(config, parts, method, data.target, data, predictor, device, console, objectives)
@@ -204,40 +219,82 @@ def for_training(config: Config) -> Session:
     return session
 
 
-def start_from(predictor: Predictor, settings: Settings, console: Console) -> None:
-    """Fill an untrained predictor with the weights of an earlier run, from which training then starts.
+def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
+    """Refuse outliers that the command chooses and no metric reads.
 
     Raises:
-        CheckpointError: there is none, or it is another model's.
+        ConfigError: that is so.
     """
-    path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
-    fill(predictor, weights(read(path)), str(path))
-    said = "a run that was stopped goes on with resume=<its folder>"
-    console.print(f"starting anew from the weights of {path} ({said})", soft_wrap=True)
+    given = config.given("outliers")
+    if given and not reading_outliers(parts):
+        refuse_idle(config.folder, sets_nothing(given, "no metric of this run reads outliers"))
 
 
-def refuse_other_model(parts: Resolved, data: Data, settings: Settings) -> None:
-    """Compare the model with the one whose weights it starts from, before data is read or generated.
-
-    It is built for the target and the inputs that the checkpoint describes, unless the data set knows its own target
-    already; `start_from` compares it with the data as they are.
+def _refuse_training(config: Config, why: str) -> None:
+    """Refuse what the command says of training by gradient, where there is none.
 
     Raises:
-        CheckpointError: the checkpoint is another model's.
+        ConfigError: it says something.
     """
-    path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
-    content = read(path)
-    described = content.get("framework")
-    if not isinstance(described, Mapping):  # `start_from` says what is wrong with the weights
-        return
-    stored, shape, columns = interface(described, path)
-    target = getattr(data, "target", None) or stored
-    try:
-        fill(build_predictor(parts, target, shape, settings.seed, columns), weights(content), str(path))
-    except ConfigError as error:
-        raise CheckpointError(
-            f"{path} belongs to another model: {error} Use the config it was trained with, or another checkpoint."
-        ) from error
+    for group in ("optimizer", "trainer"):
+        given = config.given(group)
+        if given:
+            refuse_idle(config.folder, sets_nothing(given, why))
+
+
+@dataclass(frozen=True)
+class Start:
+    """The weights of an earlier run, from which training starts.
+
+    Attributes:
+        path: of the checkpoint.
+        state: its weights.
+        predictor: a model with these weights; None where the checkpoint describes none.
+        about: target, shape of an input and its columns, for which that was built.
+    """
+
+    path: Path
+    state: Mapping[str, torch.Tensor]
+    predictor: Predictor | None = None
+    about: tuple[Target, tuple[int, ...], tuple[str, ...]] | None = None
+
+    @classmethod
+    def of(cls, parts: Resolved, data: Data, settings: Settings) -> "Start":
+        """Compare the model with the one whose weights it starts from, before data is read or generated.
+
+        It is built for the target and the inputs that the checkpoint describes, unless the data set knows its own
+        target already; `predictor_for` compares it with the data as they are.
+
+        Raises:
+            CheckpointError: there is no checkpoint, or it is another model's.
+        """
+        path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
+        content = read(path)
+        state, described = weights(content), content.get("framework")
+        if not isinstance(described, Mapping):  # `predictor_for` says what is wrong with the weights
+            return cls(path, state)
+        stored, shape, columns = interface(described, path)
+        target = getattr(data, "target", None) or stored
+        try:
+            predictor = build_predictor(parts, target, shape, settings.seed, columns)
+        except ConfigError as error:
+            raise CheckpointError(
+                f"{path} belongs to another model: {error} Use the config it was trained with, or another checkpoint."
+            ) from error
+        fill(predictor, state, str(path))
+        return cls(path, state, predictor, (target, shape, columns))
+
+    def predictor_for(self, data: Data, parts: Resolved, seed: int) -> Predictor:
+        """Return the predictor with the weights; the one that was built where prepared data are as was described.
+
+        Raises:
+            CheckpointError: the weights are another model's.
+        """
+        if self.predictor is not None and self.about == (data.target, data.input_shape, data.columns):
+            return self.predictor
+        predictor = build_predictor(parts, data.target, data.input_shape, seed, columns=data.columns)
+        fill(predictor, self.state, str(self.path))
+        return predictor
 
 
 def method_of(config: Config, parts: Resolved) -> str:
@@ -356,9 +413,13 @@ def around(
     Raises:
         ConfigError: `prepare`, and a path of the stored data, outliers or metrics is not said again.
     """
-    device = device_of(config.settings.trainer.get("accelerator"))
+    reads = MODES[config.mode].reads
+    chosen_device = config.settings.trainer.get("accelerator") if "trainer.accelerator" in reads else "cpu"
+    device = device_of(chosen_device)
     parts: Resolved = {**description.config}
-    chosen = {group for group in ("data", "outliers", "metric") if config.values.get(group)}
+    chosen = {
+        group for group in ("data", "outliers", "metric") if group in reads and config.values.get(group)
+    }
     used = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
     again = {
         key: value for key, value in flat(config.settings.stored).items() if key.partition(".")[0] in used
@@ -368,28 +429,28 @@ def around(
     dropped |= {
         key: value for key, value in description.dropped.items() if key.partition(".")[0] not in chosen
     }
-    config = inherited(config, description)
-    for group in ("data", "outliers"):
-        if config.values.get(group):
-            parts[group] = resolve("data", config.values[group], group)
-    if config.values.get("metric"):
-        chosen = config.values["metric"]
-        parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in chosen.items()]
+    config = replace(inherited(config, description), trained_on=str(parts["data"]["name"]))
+    for group in chosen - {"metric"}:
+        parts[group] = resolve("data", config.values[group], group)
+    if "metric" in chosen:
+        metrics = config.values["metric"]
+        parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in metrics.items()]
+    if "outliers" in reads and not goes_on(config):
+        refuse_unread_outliers(config, parts)
     if prepare:
-        tests = config.mode != "predict"  # which reads no metrics
-        outliers = tests and "outliers" not in chosen and bool(reading_outliers(parts))
-        require_said(dropped, ["data", *["metric"] * tests, *["outliers"] * outliers], description.path)
+        outliers = "outliers" in {*reads} - chosen and bool(reading_outliers(parts))
+        groups = ["data", *["metric"] * ("metric" in reads), *["outliers"] * outliers]
+        require_said(dropped, groups, description.path)
         if "data" in chosen:
             require_target(getattr(build_data(parts), "target", None), description)
     data = reader(replace(description, config=parts, dropped=dropped))
     if prepare:
         data.prepare()
         require_fit(data, description)
-    elif "data" in chosen:
+    elif "data" in chosen or "data" in config.settings.stored:
         data.read = partial(_reading, data.read, description)  # type: ignore[method-assign]
     method = description.method or method_of(config, parts)
-    for remark in description.remarks:
-        console.print(remark, soft_wrap=True, highlight=False, markup=False)
+    introduce_model(description, method, data if prepare else None, console)
     return Session(config, parts, method, description.target, data, predictor, device, console)
 
 

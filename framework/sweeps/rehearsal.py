@@ -10,6 +10,7 @@ from typing import Any
 
 from framework.configuration.assembly import build_data
 from framework.configuration.config import Config
+from framework.configuration.modes import require_read
 from framework.errors import ConfigError, UserError
 from framework.tracking.signals import ending_with_parent
 
@@ -31,6 +32,7 @@ def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> 
     for overrides, values in training:
         try:
             Config.of(values, Path(), overrides)  # takes no process
+            require_read("train", overrides)
         except UserError as error:
             raise ConfigError(_told(overrides, str(error))) from error
     if not training:

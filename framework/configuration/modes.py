@@ -1,0 +1,173 @@
+"""What each mode reads of a config. What a command sets and its mode does not read is refused (DESIGN, law 11)."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from framework.configuration.registry import GROUPS, MODEL
+from framework.errors import ConfigError, shown
+
+EVERYWHERE = ("mode", "seed", "threads", "logger", "hydra")
+"""Keys that mean something to any command, and that scripts therefore give to all of theirs."""
+BUNDLES = ("experiment", "preset", "debug")
+"""Groups whose configs set keys of several others; a mode takes from them what it reads."""
+_RUN = ("resume", "experiment_name")
+_TEST = ("batch_size", "workers", "samples", "pictures")
+_STORED = (*_RUN, *_TEST, *BUNDLES, "trainer.accelerator", "data", "metric")
+
+
+@dataclass(frozen=True)
+class Mode:
+    """What a mode reads of what a command sets.
+
+    Attributes:
+        reads: keys; where one is read, all keys below it are.
+        stored: groups of the stored model's config of which a command may say a key again: `data.root=...`.
+    """
+
+    reads: tuple[str, ...] = ()
+    stored: tuple[str, ...] = ()
+
+
+MODES: Mapping[str, Mode] = {
+    "train": Mode(
+        (
+            *(*_RUN, *_TEST, *BUNDLES, "checkpoint", "data", "outliers", "encoder", "density_head"),
+            *("uncertainty", "objective", "metric", "optimizer", "trainer"),
+        )
+    ),
+    "test": Mode((*_STORED, "checkpoint", "outliers"), ("data", "outliers", "metric", *MODEL)),
+    "calibrate": Mode(
+        (*_STORED, "checkpoint", "outliers", "uncertainty"), ("data", "outliers", "metric", *MODEL)
+    ),
+    "combine": Mode((*_STORED, "outliers", "uncertainty"), ("data", "outliers", "metric", *MODEL)),
+    "predict": Mode((*_RUN, *BUNDLES, "workers", "samples", "checkpoint", "data"), ("data", *MODEL)),
+    "encode": Mode((*_RUN, *BUNDLES, "batch_size", "workers", "data", "encoder")),
+    "work_precision": Mode((*_STORED, "checkpoint"), ("data", "metric", *MODEL)),
+    "check": Mode((*BUNDLES, *GROUPS)),
+    "plugins": Mode(),
+    "sync": Mode(),
+}
+"""By the name of each mode."""
+
+UNUSED_BY_TRAINING = {
+    "limit_test_batches": "the test always covers its whole split",
+    "limit_predict_batches": "training predicts nothing; mode=predict does",
+    "inference_mode": "Lightning reads it in its own tests alone, which are not used here",
+    "log_every_n_steps": "metrics go to the run's journal; trainer.log_every_steps says how often",
+    "enable_autolog_hparams": "parameters go to the run's store, which logger chooses",
+    "model_registry": "the model goes to the run's store, which logger chooses",
+}
+"""Keys of `trainer` that Lightning takes and that change nothing of a training here, with what does instead."""
+
+
+@dataclass(frozen=True)
+class _Condition:
+    """When a setting is read: its key, whether a config lets it be read, and why another does not."""
+
+    key: str
+    holds: Callable[[Mapping[str, Any]], bool]
+    why: str
+
+
+def _setting(values: Mapping[str, Any], group: str, key: str) -> Any:
+    return (values.get(group) or {}).get(key)
+
+
+def _scheduled(*names: str) -> Callable[[Mapping[str, Any]], bool]:
+    return lambda values: _setting(values, "optimizer", "schedule") in names
+
+
+def _has_store(values: Mapping[str, Any]) -> bool:
+    return _setting(values, "logger", "name") != "none"
+
+
+def _chooses_data(values: Mapping[str, Any]) -> bool:
+    mode = MODES.get(str(_setting(values, "mode", "name")), Mode())
+    return not mode.stored or bool(values.get("data"))
+
+
+_CONDITIONS = (
+    _Condition(
+        "optimizer.factor", _scheduled("step", "plateau"), "only the schedules step and plateau read it"
+    ),
+    _Condition("optimizer.patience", _scheduled("plateau"), "only the schedule plateau reads it"),
+    _Condition(
+        "trainer.gradient_clip_algorithm",
+        lambda values: bool(_setting(values, "trainer", "gradient_clip_val")),
+        "trainer.gradient_clip_val=null clips nothing",
+    ),
+    *(_Condition(f"logger.{key}", _has_store, "logger=none has no store") for key in ("uri", "experiment")),
+    *(_Condition(f"trainer.{key}", lambda values: False, why) for key, why in UNUSED_BY_TRAINING.items()),
+    *(
+        _Condition(
+            key,
+            _chooses_data,
+            "the model and its data are the stored ones, and this changes those of a command",
+        )
+        for key in ("preset", "debug")
+    ),
+)
+"""Conditions that a composed config tells; others are known once the parts are built (`runs.session.refuse_idle`)."""
+
+
+def require_read(mode: str, overrides: Sequence[str]) -> None:
+    """Refuse what a command sets and its mode never reads.
+
+    Args:
+        mode: one of MODES.
+        overrides: what the command line changed.
+
+    Raises:
+        ConfigError: names the first such setting, and the modes that read it.
+    """
+    for override in overrides:
+        key = key_of(override)
+        name = key.removeprefix("stored.")
+        read = MODES[mode].stored if key != name else (*MODES[mode].reads, *EVERYWHERE)
+        if not is_below(name, read):
+            root = name.partition(".")[0]
+            root = shown(name if any(one.startswith(f"{root}.") for one in read) else root)
+            raise ConfigError(
+                f"{_written(override)}: mode={mode} reads no {root}{_readers(name)}. Leave it out."
+            )
+
+
+def idle(values: Mapping[str, Any], overrides: Sequence[str]) -> Iterator[str]:
+    """Yield a sentence about each setting of a command that its mode reads, but not beside the other settings.
+
+    Args:
+        values: the composed config.
+        overrides: what the command line changed.
+    """
+    for override in overrides:
+        for condition in _CONDITIONS:
+            if key_of(override) == condition.key and not condition.holds(values):
+                yield sets_nothing(override, condition.why)
+
+
+def sets_nothing(override: str, why: str) -> str:
+    """Return the sentence about a setting that has no effect."""
+    return f"{_written(override)} sets nothing: {why}. Leave it out."
+
+
+def key_of(override: str) -> str:
+    """Return the dotted key that an override sets: `outliers` of `data@outliers=...`."""
+    group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
+    return (package or group).replace("/", ".")
+
+
+def is_below(key: str, roots: Sequence[str]) -> bool:
+    """Return whether a dotted key is one of `roots`, or stands below one."""
+    return any(key == root or key.startswith(f"{root}.") for root in roots)
+
+
+def _written(override: str) -> str:
+    """Return an override as the user wrote it: `stored` is our word for what stands beside a checkpoint."""
+    return shown(override.removeprefix("+stored."))
+
+
+def _readers(key: str) -> str:
+    """Say which modes read a key; nothing where none does."""
+    names = [name for name, mode in MODES.items() if is_below(key, mode.reads)]
+    return f", {', '.join(names)} {'do' if len(names) > 1 else 'does'}" if names else ""
