@@ -9,8 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
-from framework.heads.least_squares import least_squares
-from framework.heads.least_squares_solution import Status
+from framework.least_squares.solution import Status
+from framework.least_squares.solver import least_squares
 
 TIMES = torch.linspace(0, 4, 40, dtype=torch.float64)
 INFINITE = torch.tensor(math.inf, dtype=torch.float64)

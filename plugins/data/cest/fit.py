@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from framework.heads.least_squares import least_squares
-from framework.heads.least_squares_solution import Solution, Status
+from framework.least_squares.solution import Solution, Status
+from framework.least_squares.solver import least_squares
 from plugins.data.cest.spectrum import COUNT, Misfit, Parameters
 
 CUT = 10.0
@@ -27,7 +27,7 @@ class Fit(NamedTuple):
     parameters: (spectrum, p), all that were fitted.
     root: (spectrum, p, p), lower Cholesky factor of their covariance.
     cost: (spectrum,), half the sum of squared residuals.
-    status: (spectrum,), of framework.heads.least_squares.Status.
+    status: (spectrum,), of framework.least_squares.solution.Status.
     """
 
     parameters: Float[Tensor, "spectrum p"]

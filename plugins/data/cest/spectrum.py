@@ -91,7 +91,7 @@ def spectrum(
 
 
 class Misfit:
-    """The residuals of many spectra, Z(parameters) - measured, for framework.heads.least_squares.
+    """The residuals of many spectra, Z(parameters) - measured, for framework.least_squares.solver.
 
     Args:
         measured: (spectrum, offset) float64, NaN where nothing was measured.

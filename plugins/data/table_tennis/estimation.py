@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from framework.heads.least_squares import least_squares
+from framework.least_squares.solver import least_squares
 from plugins.data.table_tennis.flying import flown_with_slopes
 from plugins.data.table_tennis.physics import Constants
 

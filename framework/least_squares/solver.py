@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.heads import least_squares_compiled as compiled
-from framework.heads.least_squares_compiled import CLIPS, EPSILON, GOES_ON, SINGULAR
-from framework.heads.least_squares_solution import Solution, Status
+from framework.least_squares import compiled
+from framework.least_squares.compiled import CLIPS, EPSILON, GOES_ON, SINGULAR
+from framework.least_squares.solution import Solution, Status
 
 ILL_CONDITIONED = EPSILON**0.5
 """Least singular value, columns of the Jacobian scaled to unit length, that counts towards its rank."""

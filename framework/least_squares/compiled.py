@@ -1,6 +1,6 @@
 """One step of many small least-squares problems, on one CPU core; compiled functions on NumPy arrays.
 
-What numbers mean is said in framework.heads.least_squares, whose rules these are. Arrays' first dimension is the
+What numbers mean is said in framework.least_squares.solver, whose rules these are. Arrays' first dimension is the
 problem; those of a few names are shared by all functions:
     at, lower, upper, gradient, scale, move: (problem, p) float64.
     gram, curve: (problem, p, p) float64.
@@ -31,7 +31,7 @@ CLIPS = 3
 NEAR = 0.1
 """Share of the cost that a step may save at most where the minimum is near."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
-"""In place of a status, and some of framework.heads.least_squares_solution.Status."""
+"""In place of a status, and some of framework.least_squares.solution.Status."""
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""What framework.heads.least_squares answers."""
+"""What framework.least_squares.solver answers."""
 
 from enum import IntEnum
 from typing import NamedTuple

@@ -1,0 +1,1 @@
+"""Bounded nonlinear least squares of many small problems at once."""
