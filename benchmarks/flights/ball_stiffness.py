@@ -12,8 +12,9 @@ import numpy as np
 
 from benchmarks.machine import machine
 from framework.figures.style import COLOURS, MARKERS, titled_figure
+from framework.flights.physics import Constants
 from plugins.data.table_tennis.closed_form import landing
-from plugins.data.table_tennis.physics import Constants, Spring
+from plugins.data.table_tennis.contact import Spring
 from plugins.data.table_tennis.solvers import EXPLICIT, METHODS, SolverGaveUp, flight
 
 HERE = Path(__file__)

@@ -30,11 +30,12 @@ from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
 from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
+from framework.flights.frames import PARTS
 from framework.prediction import Prediction
 from framework.reports.table import Row, csv
-from plugins.data.table_tennis.flight_error import DRAWS, FlightError, Shown
-from plugins.data.table_tennis.flight_picture import bundle, landing_places
-from plugins.data.table_tennis.windows import PARTS
+from plugins.metric.flight_error.figure import bundle, landing_places
+from plugins.metric.flight_error.landing import Shown
+from plugins.metric.flight_error.metric import DRAWS, FlightError
 
 HERE = Path(__file__).resolve()
 RUNS = ROOT / "outputs" / "ball_flights"

@@ -1,1 +1,1 @@
-"""Flights of a table-tennis ball: their physics, their recordings, and heads that know the physics."""
+"""Flights of a table-tennis ball: recorded and simulated."""

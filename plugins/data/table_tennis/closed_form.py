@@ -9,7 +9,8 @@ from typing import Any
 
 import mpmath
 
-from plugins.data.table_tennis.physics import Constants, Spring
+from framework.flights.physics import Constants
+from plugins.data.table_tennis.contact import Spring
 
 DIGITS = 50
 Motion = Callable[[Any], tuple[Any, Any]]

@@ -16,11 +16,12 @@ from framework.data import Batch, Data, Splits
 from framework.datasets.csv_columns import Writing
 from framework.datasets.fields import Fields
 from framework.errors import DataError, shown
+from framework.flights.frames import PARTS
+from framework.flights.physics import Constants
 from framework.geometry.meshes import stream
 from framework.storage.arrays import real
 from framework.storage.generated import read_mark
 from framework.target import Target
-from plugins.data.table_tennis.physics import Constants
 from plugins.data.table_tennis.picture import side_view
 from plugins.data.table_tennis.recordings import (
     SUFFIXES,
@@ -33,7 +34,7 @@ from plugins.data.table_tennis.recordings import (
     other_columns,
 )
 from plugins.data.table_tennis.simulator import Simulation, simulated
-from plugins.data.table_tennis.windows import CITED, PARTS, Grid, Window, prefix, windows
+from plugins.data.table_tennis.windows import Grid, Window, prefix, windows
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
@@ -61,7 +62,15 @@ class TableTennis(Data):
         constants: of the ball and the table that are simulated.
     """
 
-    bibtex = CITED
+    bibtex = """@article{gomez2020real,
+  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
+  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
+  journal = {IEEE Robotics and Automation Letters},
+  volume  = {5},
+  number  = {2},
+  pages   = {970--976},
+  year    = {2020}
+}"""
     groups = ("table_tennis",)
     suffixes = SUFFIXES
 

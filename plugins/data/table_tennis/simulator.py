@@ -10,11 +10,12 @@ from jaxtyping import Float
 from pydantic import Field
 
 from framework.errors import DataError
+from framework.flights.physics import Constants, Positive
+from framework.flights.trajectories import flown
 from framework.geometry.meshes import stream
 from framework.storage import cache
 from framework.storage.generated import draw_all, generated
-from plugins.data.table_tennis.flying import flown
-from plugins.data.table_tennis.physics import Constants, Positive, Spring
+from plugins.data.table_tennis.contact import Spring
 from plugins.data.table_tennis.recordings import COLUMNS, TRUE
 from plugins.data.table_tennis.solvers import SolverGaveUp, flight
 

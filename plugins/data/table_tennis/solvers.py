@@ -10,7 +10,8 @@ from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 from scipy.optimize import brentq
 
 from framework.errors import UserError
-from plugins.data.table_tennis.physics import Constants, Spring, acceleration, bounced, pressed, push
+from framework.flights.physics import Constants, acceleration, bounced
+from plugins.data.table_tennis.contact import Spring, pressed, push
 
 Method = Literal["RK45", "DOP853", "LSODA", "BDF", "Radau"]
 METHODS: dict[str, Callable[..., OdeSolver]] = {

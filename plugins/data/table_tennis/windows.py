@@ -7,21 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field
 
+from framework.flights.frames import GRAVITY, PARTS, future_names
 from plugins.data.table_tennis.recordings import Flight
-
-CITED = """@article{gomez2020real,
-  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
-  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
-  journal = {IEEE Robotics and Automation Letters},
-  volume  = {5},
-  number  = {2},
-  pages   = {970--976},
-  year    = {2020}
-}"""
-PARTS = ("time", "x", "y", "z", "seen")
-"""What is read of each frame: seconds from now (not above 0), metres, and 1 where there is a frame, 0 where it misses;
-the other numbers of a missing one are 0."""
-GRAVITY = 9.81
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +36,8 @@ class Grid:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers that are predicted, frame by frame: "x_16ms", in metres."""
-        moments = [f"{1000 * self.step * frame:g}ms" for frame in range(1, self.future + 1)]
-        return tuple(f"{axis}_{moment}" for moment in moments for axis in "xyz")
+        """Names of the numbers that are predicted."""
+        return future_names(self.future, self.step)
 
 
 class Window(NamedTuple):

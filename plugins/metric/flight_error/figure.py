@@ -1,7 +1,7 @@
-"""Pictures of predicted flights: how the error grows, bundles of flights in space, and where they land."""
+"""Figures of predicted flights: how the error grows, bundles of flights in space, and where they land."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,9 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from framework.figures.style import BLUE, COLOURS, GREY, RED, titled_figure
-
-if TYPE_CHECKING:
-    from plugins.data.table_tennis.flight_error import Shown
+from plugins.metric.flight_error.landing import Shown, crossing
 
 BUNDLE = 30
 """Flights of a bundle that are drawn."""
@@ -20,7 +18,7 @@ BUNDLE = 30
 def flights(
     moments: Sequence[float],
     growth: np.ndarray,
-    shown: "Sequence[Shown]",
+    shown: Sequence[Shown],
     height: float,
     title: str,
     *,
@@ -54,7 +52,7 @@ def flights(
     return figure
 
 
-def bundle(axes: Any, one: "Shown", color: str) -> None:
+def bundle(axes: Any, one: Shown, color: str) -> None:
     """One prediction in space."""
     axes.plot(*one.read.numpy().T, linestyle="", marker="o", markersize=2.5, color=GREY)
     for draw in one.draws[:BUNDLE].numpy():
@@ -62,10 +60,8 @@ def bundle(axes: Any, one: "Shown", color: str) -> None:
     axes.plot(*one.future.numpy().T, color="black", linewidth=1.4)
 
 
-def landing_places(axes: Any, shown: "Sequence[Shown]", height: float) -> None:
+def landing_places(axes: Any, shown: Sequence[Shown], height: float) -> None:
     """Seen from above: the true places as crosses, those of the draws as dots with the ellipse that holds 90 %."""
-    from plugins.data.table_tennis.flight_error import crossing
-
     some = False
     for number, one in enumerate(shown):
         last = one.read[-1:]

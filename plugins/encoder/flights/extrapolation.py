@@ -11,9 +11,9 @@ from torch import Tensor
 
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from plugins.data.table_tennis.estimation import Seen, seen_of
-from plugins.data.table_tennis.parabolas_compiled import described
-from plugins.data.table_tennis.windows import GRAVITY, PARTS
+from framework.flights.estimation import Seen, seen_of
+from framework.flights.frames import GRAVITY, PARTS
+from plugins.encoder.flights.parabolas_compiled import described
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
 """Shares of the frames that a parabola is laid through: the longest that it fits counts, a bounce is left behind."""

@@ -12,10 +12,9 @@ from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.normals import IndependentNormals
+from framework.flights.frames import PARTS, future_frames
 from framework.heads.parameters import require_finite
 from framework.target import Target
-from plugins.data.table_tennis.ballistic import future_of
-from plugins.data.table_tennis.windows import PARTS
 
 FARTHEST = 100.0
 """Metres, or seconds; numbers that are read are cut off here."""
@@ -55,7 +54,8 @@ class LSTMHead(DensityHead):
         hidden: Annotated[int, Field(ge=1)] = 64,
     ) -> None:
         super().__init__()
-        self.future = future_of(target, "density_head lstm")
+        target.require("real", by="density_head lstm")
+        self.future = future_frames(target.names, by="density_head lstm")
         self.observed = observed
         self.size = observed * len(PARTS)
         self.cell = nn.LSTMCell(7, hidden)  # place, last move, and whether it was seen

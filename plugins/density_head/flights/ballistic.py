@@ -13,15 +13,15 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals, JointNormal
-from framework.errors import ConfigError, NonFiniteAnswer
+from framework.errors import NonFiniteAnswer
+from framework.flights.estimation import Estimate, Prior, Seen, estimated, root, seen_of
+from framework.flights.frames import PARTS, future_frames
+from framework.flights.physics import Constants
+from framework.flights.trajectories import flown, flown_with_slopes
 from framework.heads.parameters import require_finite
 from framework.storage.weights import require_state
 from framework.target import Target
-from plugins.data.table_tennis.estimation import Estimate, Prior, Seen, estimated, root, seen_of
-from plugins.data.table_tennis.flying import flown, flown_with_slopes
-from plugins.data.table_tennis.identification import bounds_of, found_of, identified, with_found
-from plugins.data.table_tennis.physics import Constants
-from plugins.data.table_tennis.windows import PARTS
+from plugins.density_head.flights.identification import bounds_of, found_of, identified, with_found
 
 WINDOWS = 32
 """From which `fit` finds the constants at most, evenly chosen."""
@@ -84,7 +84,8 @@ class BallisticHead(DensityHead, Fitted):
         constants: Constants,
     ) -> None:
         super().__init__()
-        self.future = future_of(target, "density_head ballistic")
+        target.require("real", by="density_head ballistic")
+        self.future = future_frames(target.names, by="density_head ballistic")
         self.observed, self.step = observed, step
         self.density: Literal["linearised", "sampled"] = density
         self.samples = samples
@@ -216,19 +217,3 @@ class BallisticHead(DensityHead, Fitted):
         scale = (float(self.noise) * self.spread).to(raw).expand_as(mean)
         weights = torch.zeros(shape, dtype=raw.dtype, device=raw.device)
         return Mixture(weights, IndependentNormals(mean, scale))
-
-
-def future_of(target: Target, by: str) -> int:
-    """How many frames are to be predicted.
-
-    Raises:
-        ConfigError: the target is not x, y and z at several times.
-    """
-    target.require("real", by=by)
-    axes = [name.partition("_")[0] for name in target.names]
-    if not axes or axes != list("xyz") * (len(axes) // 3):
-        raise ConfigError(
-            f"{by} predicts x, y and z at one time after the other, but the target is {target.told}. Choose "
-            "data=table_tennis."
-        )
-    return len(axes) // 3

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from plugins.data.table_tennis.estimation import Prior, Seen, cauchy
-from plugins.data.table_tennis.flying import flown, flown_with_slopes
-from plugins.data.table_tennis.physics import Constants
+from framework.flights.estimation import Prior, Seen, cauchy
+from framework.flights.physics import Constants
+from framework.flights.trajectories import flown, flown_with_slopes
 
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
 """Constants that are found."""

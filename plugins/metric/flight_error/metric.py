@@ -1,17 +1,17 @@
 """How far predicted flights are from where the ball went, frame by frame, and where it lands."""
 
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from framework.flights.frames import PARTS, future_frames
 from framework.metric import Metric, Pictured
 from framework.prediction import Prediction
 from framework.target import Target
-from plugins.data.table_tennis.ballistic import future_of
-from plugins.data.table_tennis.windows import CITED, PARTS
+from plugins.metric.flight_error.landing import Shown, from_start, landings, last_seen
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,14 +20,6 @@ DRAWS = 199
 """Of each density; the truth's rank among them is one of 200, of which the middle 180 are 90 %."""
 SHOWN = 8
 """Predictions that the picture shows at most."""
-
-
-class Shown(NamedTuple):
-    """What the picture says of one prediction, metres: frames read and seen (frame, 3), future (time, 3), draws."""
-
-    read: Float[Tensor, "frame 3"]
-    future: Float[Tensor, "time 3"]
-    draws: Float[Tensor, "draw time 3"]
 
 
 class FlightError(Metric, Pictured):
@@ -45,7 +37,15 @@ class FlightError(Metric, Pictured):
         height: of that plane, m: somewhat above the table, so that no bounce is between two frames.
     """
 
-    bibtex = CITED
+    bibtex = """@article{gomez2020real,
+  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
+  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
+  journal = {IEEE Robotics and Automation Letters},
+  volume  = {5},
+  number  = {2},
+  pages   = {970--976},
+  year    = {2020}
+}"""
     columns: ClassVar[dict[str, str]] = {
         "error_cm": "error cm",
         "error_far_cm": "error at the end cm",
@@ -67,7 +67,8 @@ class FlightError(Metric, Pictured):
         self, target: Target, *, height: Annotated[float, Field(allow_inf_nan=False)] = -0.85
     ) -> None:
         super().__init__()
-        self.future = future_of(target, "metric flight_error")
+        target.require("real", by="metric flight_error")
+        self.future = future_frames(target.names, by="metric flight_error")
         self.moments = [float(name.partition("_")[2].removesuffix("ms")) for name in target.names[::3]]
         self.height = height
         zero = torch.zeros((), dtype=torch.float64)
@@ -121,7 +122,7 @@ class FlightError(Metric, Pictured):
         self.shown = []
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
-        from plugins.data.table_tennis.flight_picture import flights
+        from plugins.metric.flight_error.figure import flights
 
         return flights(
             self.moments, self.growth.cpu().numpy(), self.shown, self.height, title, synthetic=synthetic
@@ -141,70 +142,3 @@ class FlightError(Metric, Pictured):
             frames = inputs[row].double().unflatten(-1, (-1, len(PARTS)))
             read = frames[frames[:, 4] > 0.5][:, 1:4]
             self.shown.append(Shown(read.cpu(), truth[row].cpu(), draws[:, row].cpu()))
-
-
-def last_seen(inputs: Tensor | None, truth: Float[Tensor, "batch time 3"]) -> Float[Tensor, "batch 3"]:
-    """Where inputs of `PARTS` saw the ball last; NaN where they are others, or saw it never."""
-    nowhere = torch.full_like(truth[:, 0], torch.nan)
-    if inputs is None or inputs.dim() != 2 or inputs.shape[1] % len(PARTS):
-        return nowhere
-    frames = inputs.to(truth).unflatten(-1, (-1, len(PARTS)))
-    seen = frames[..., 4] > 0.5
-    latest = frames[..., 0].where(seen, -torch.inf).argmax(-1)
-    places = frames[torch.arange(len(frames), device=frames.device), latest, 1:4]
-    return places.where(seen.any(-1, keepdim=True), nowhere)
-
-
-def from_start(start: Float[Tensor, "batch 3"], path: Float[Tensor, "*draw batch time 3"]) -> Tensor:
-    """The path with one place more before it."""
-    first = start.expand(*path.shape[:-3], -1, -1).unsqueeze(-2)
-    return torch.cat([first.to(path), path], -2)
-
-
-def crossing(
-    path: Float[Tensor, "*batch time 3"], height: float
-) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-    """x and y where a path first comes down through a plane, straight between two frames; and whether it does."""
-    z = path[..., 2]
-    down = (z[..., :-1] > height) & (z[..., 1:] <= height)
-    first = down.double().argmax(-1, keepdim=True)
-    above, below = z[..., :-1].gather(-1, first), z[..., 1:].gather(-1, first)
-    share = ((above - height) / (above - below)).clamp(0, 1).nan_to_num(0.0)
-    index = first.unsqueeze(-1).expand(*first.shape, 2)
-    here, there = (
-        path[..., :-1, :2].gather(-2, index).squeeze(-2),
-        path[..., 1:, :2].gather(-2, index).squeeze(-2),
-    )
-    return here + share * (there - here), down.any(-1)
-
-
-def landings(
-    draws: Float[Tensor, "draw batch time 3"], truth: Float[Tensor, "batch time 3"], height: float
-) -> Float[Tensor, "4"]:
-    """Over the windows whose truth lands: how many, sum of CRPS (m), how many are in the ellipse, and shares missed.
-
-    CRPS of draws x_i: mean |x_i - y| - 1/2 mean |x_i - x_j|, i ≠ j (Gneiting & Raftery 2007, eq. 21). The ellipse is
-    that of a normal's 90 %, (y - m)ᵀ C⁻¹ (y - m) ≤ χ²(0.9) = 4.605 with mean and covariance of the draws.
-    """
-    place, lands = crossing(truth, height)
-    drawn, there = crossing(draws, height)
-    enough = lands & (there.sum(0) >= 10)
-    found = truth.new_zeros(4, dtype=torch.float64)
-    found[0] = lands.sum()
-    for row in lands.nonzero()[:, 0].tolist():
-        found[3] += 1 - there[:, row].double().mean()
-        if not enough[row]:
-            # nobody draws it there: as far off as the draws' last places are
-            found[1] += (draws[:, row, -1, :2] - place[row]).abs().mean()
-            continue
-        points = drawn[there[:, row], row]
-        count = len(points)
-        ordered = points.sort(0).values
-        weights = 2 * torch.arange(1, count + 1, dtype=torch.float64, device=points.device) - count - 1
-        between = (weights.unsqueeze(-1) * ordered).sum(0) / (count * (count - 1))
-        found[1] += ((points - place[row]).abs().mean(0) - between).mean()
-        middle = points.mean(0)
-        covariance = torch.cov(points.T) + 1e-12 * torch.eye(2, dtype=points.dtype, device=points.device)
-        apart = place[row] - middle
-        found[2] += (apart @ torch.linalg.solve(covariance, apart) <= 4.605).double()
-    return found

@@ -1,9 +1,8 @@
-"""The physics of a table-tennis ball: flight with drag, Magnus force and spin decay, and its contact with the table.
+"""The physics of a table-tennis ball: flight with drag, Magnus force and spin decay, and its bounce.
 
 Formulas are written over single components with arithmetic alone, so that they serve plain floats (SciPy's solvers
 call them a hundred thousand times, too often for the type checks that tests switch on) and batches of tensors (the
-estimation) alike. Units: metres, seconds, rad/s; z is
-up; y runs along the table.
+estimation) alike. Units: metres, seconds, rad/s; z is up; y runs along the table.
 """
 
 from dataclasses import dataclass
@@ -77,9 +76,6 @@ def bounced(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vecto
 
     The table's friction stops the slip where it can: an impulse of 2/5 of the slip a unit of mass does. It can give no
     more than μ times the impulse upwards, (1 + e) |w|; then the ball goes on sliding.
-
-    Args:
-        least: of two numbers the smaller; of tensors torch.minimum.
     """
     u, v, w = velocity
     along, across = slip(velocity, spin, constants.radius)
@@ -91,45 +87,3 @@ def bounced(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vecto
     turn = 1.5 / constants.radius
     after = (u + push, v + pull, constants.restitution * abs(w))
     return after, (spin[0] + turn * pull, spin[1] - turn * push, spin[2])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spring:
-    """The table as a spring and a damper: contact in a short time, not in none.
-
-    The ball is pushed up while it is inside the table and the push is upwards: N = max(0, Ω² p + 2 ζ Ω p'), where p is
-    how far inside it is. While it touches, the height has the eigenvalues Ω (-ζ ± √(ζ² - 1)): with Ω of 1e8/s
-    the contact is 1e8 times as fast as a flight of a second.
-
-    Attributes:
-        frequency: Ω, 1/s.
-        damping: ζ; at 1 the contact is critically damped.
-        grip: slip below which friction is less than Coulomb's, m/s, so that its sign needs no jump.
-    """
-
-    frequency: Positive = 3000.0
-    damping: NotNegative = 0.04
-    grip: Positive = 0.01
-
-
-@no_type_check
-def push(height: Any, climb: Any, spring: Spring) -> Any:
-    """Push upwards per mass of a ball that is inside the table, m/s², before it is cut at 0.
-
-    Args:
-        height: of its centre above where it touches, m; negative inside.
-        climb: its velocity upwards, m/s.
-    """
-    return -(spring.frequency**2) * height - 2 * spring.damping * spring.frequency * climb
-
-
-@no_type_check
-def pressed(
-    velocity: Vector, spin: Vector, up: Any, constants: Constants, spring: Spring
-) -> tuple[Vector, Vector]:
-    """Change of velocity and of spin, per second, by a push upwards and the friction that comes with it."""
-    along, across = slip(velocity, spin, constants.radius)
-    share = constants.friction * up / (along * along + across * across + spring.grip**2) ** 0.5
-    push_x, push_y = -share * along, -share * across
-    turn = 1.5 / constants.radius
-    return (push_x, push_y, up), (turn * push_y, -turn * push_x, 0.0)

@@ -1,4 +1,4 @@
-"""Physics that a network corrects: an encoder that flies the ball, and a head about where it arrives."""
+"""A density about a mean that an encoder gives, such as that of a physical model: a network says what it looks like."""
 
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
@@ -11,73 +11,13 @@ from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.moved import Moved
-from framework.encoder import Encoder
 from framework.heads.parameters import require_finite, require_trained
 from framework.heads.unit import Unit
 from framework.target import Target
-from plugins.data.table_tennis.ballistic import BallisticHead
-from plugins.data.table_tennis.estimation import Prior, estimated, root, seen_of
-from plugins.data.table_tennis.extrapolation import frames_of
-from plugins.data.table_tennis.flying import flown_with_slopes
-from plugins.data.table_tennis.physics import Constants
-from plugins.data.table_tennis.windows import PARTS
 
 LARGEST = 1e4
-"""Features are cut off here."""
+"""Bound on the magnitude of the features; larger ones are cut off."""
 LARGEST_LOG_UNIT = 20.0
-
-
-class BallisticEncoder(Encoder):
-    """The flight by its differential equation as features.
-
-    Metres: x, y and z at each future frame, the logarithms of their standard deviations, and what was read (frame by
-    frame as `PARTS`).
-
-    The constants are those of the config, or those that a run of `density_head=ballistic` found. Nothing is learnt.
-
-    Args:
-        future, step: of the data.
-        spin: standard deviation believed of each component of the spin, rad/s.
-        noise: of a coordinate, m.
-        constants: of the ball and the table.
-
-    Raises:
-        ConfigError: inputs are no frames of `PARTS`, flattened.
-    """
-
-    bibtex = BallisticHead.bibtex
-    fixed = True
-
-    def __init__(
-        self,
-        input_shape: tuple[int, ...],
-        *,
-        future: Annotated[int, Field(ge=1, le=1000)] = 35,
-        step: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.016,
-        spin: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 60.0,
-        noise: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.003,
-        constants: Constants,
-    ) -> None:
-        super().__init__()
-        length = len(PARTS) * frames_of(input_shape, "encoder ballistic")
-        self.future, self.step, self.noise = future, step, noise
-        self.prior = Prior(spin=spin)
-        self.constants = constants
-        self.output_shape = (6 * future + length,)
-
-    @torch.no_grad()
-    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
-        dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
-        frames = inputs.double().clamp(-LARGEST, LARGEST).cpu()
-        seen = seen_of(frames.unflatten(-1, (-1, len(PARTS))), self.step)
-        estimate = estimated(seen, self.constants, self.noise, self.prior)
-        moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
-        times = torch.cat([seen.times, moments.expand(len(frames), -1)], 1)
-        places, slopes = flown_with_slopes(estimate.state, times, self.constants)
-        spread = (slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)).square().sum(-1)
-        spread = (spread + self.noise**2).log() / 2
-        found = torch.cat([places[:, -self.future :].flatten(1), spread, frames], 1)
-        return found.clamp(-LARGEST, LARGEST).to(inputs.device, dtype)
 
 
 class HybridHead(DensityHead):

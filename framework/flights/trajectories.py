@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from plugins.data.table_tennis.physics import Constants, bounced
+from framework.flights.physics import Constants, bounced
 
 NEWTON = 4
 """Steps to the time of a bounce; from a parabola's root the error falls below rounding in three."""
@@ -18,8 +18,9 @@ def free(
 ) -> Float[Tensor, "flight 9"]:
     """The state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
 
-    Of 16 ms at 6 m/s its error is below 1e-8 m (test_physics.py). Spin decays whatever the ball does, so only the
-    velocity has stages: those of the place are the velocity's own, and those of the spin are powers of the decay.
+    Of 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). Spin decays whatever the ball does, so
+    only the velocity has stages: those of the place are the velocity's own, and those of the spin are powers of the
+    decay.
     """
     h = time.unsqueeze(-1)
     place, velocity, spin = state[:, :3], state[:, 3:6], state[:, 6:]
@@ -94,8 +95,9 @@ def flown_with_slopes(
 ) -> tuple[Float[Tensor, "flight time 3"], Float[Tensor, "flight time 3 9"]]:
     """Positions, and their derivatives by the state at the start.
 
-    By central differences, all states at once: of float64 they have nine digits (test_physics.py), and take a hundredth
-    of the time that torch's forward mode takes to interpret each of some ten thousand small operations.
+    By central differences, all states at once: of float64 they have nine digits (tests/test_flight_physics.py), and
+    take a hundredth of the time that torch's forward mode takes to interpret each of some ten thousand small
+    operations.
     """
     flights, time = times.shape
     shift = torch.diag(start.new_tensor([1e-5] * 6 + [1e-3] * 3))

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from framework.flights.physics import Constants
+from framework.flights.trajectories import flown_with_slopes
 from framework.least_squares.solver import least_squares
-from plugins.data.table_tennis.flying import flown_with_slopes
-from plugins.data.table_tennis.physics import Constants
 
 BELIEVED = 50.0
 """Metres from the origin; a frame beyond them counts as missing."""
@@ -58,7 +58,7 @@ class Prior(NamedTuple):
 
 
 def seen_of(frames: Float[Tensor, "flight frame 5"], step: float) -> Seen:
-    """From what a model reads (plugins.data.table_tennis.windows.PARTS), in double precision."""
+    """From what a model reads (framework.flights.frames.PARTS), in double precision."""
     frames = frames.double()
     count = frames.shape[1]
     slots = step * (torch.arange(count, dtype=torch.float64, device=frames.device) - (count - 1))

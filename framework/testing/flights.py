@@ -1,0 +1,50 @@
+"""Flights for the checks of whatever reads or predicts them: what is seen of thrown balls, and where they go."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.flights.frames import future_names
+from framework.flights.physics import Constants
+from framework.flights.trajectories import flown
+from framework.target import Target
+
+STEP = 0.016
+"""Seconds from frame to frame."""
+SIGMA = 0.003
+"""Standard deviation of the noise of `windows_of`, metres."""
+START = np.array([0.8, -4.1, -0.62, -0.6, 6.2, 1.6, 20.0, -30.0, 10.0])
+"""Position, velocity and spin at the first frame of a ball that lands on the table."""
+TWO_FRAMES = Target("real", future_names(2, STEP))
+"""Target of a ball's places at the next two frames."""
+
+
+def thrown(count: int) -> Float[Tensor, "flight number"]:
+    """Return what is read of six frames of balls that fall."""
+    since = STEP * torch.arange(-5.0, 1.0).expand(count, -1)
+    height = torch.linspace(-0.2, 0.2, count).unsqueeze(-1) - 4.9 * since.square()
+    frames = [since, 0.5 * since, 5 * since - 3, height, torch.ones_like(since)]
+    return torch.stack(frames, -1).flatten(1)
+
+
+def windows_of(
+    count: int, outliers: bool = False
+) -> tuple[Float[Tensor, "flight 20 5"], Float[Tensor, "flight 35 3"], Float[Tensor, "flight 9"]]:
+    """Return frames read of flights that begin near `START`, the future without noise, and the states at the first.
+
+    Args:
+        outliers: whether a tenth of the frames is 0.4 m off.
+    """
+    random = np.random.default_rng(0)
+    states = torch.from_numpy(
+        START + random.normal(size=(count, 9)) * [0.1, 0.05, 0.05, 0.3, 0.3, 0.2, 40, 40, 40]
+    )
+    times = STEP * torch.arange(55, dtype=torch.float64).expand(count, -1)
+    places = flown(states, times, Constants())[..., :3]
+    seen = places[:, :20] + SIGMA * torch.from_numpy(random.normal(size=(count, 20, 3)))
+    there = torch.from_numpy(random.random((count, 20, 1)) > 0.1)
+    if outliers:
+        seen = seen + (torch.from_numpy(random.random((count, 20, 1))) < 0.1) * 0.4
+    frames = torch.cat([times[:, :20, None] - times[:, 19:20, None], seen, torch.ones(count, 20, 1)], -1)
+    return frames * there, places[:, 20:], states

@@ -1,0 +1,89 @@
+"""Heads that predict flights: coverage of simulated ones, constants that are found, and what is refused."""
+
+from dataclasses import fields
+from typing import Literal
+
+import pytest
+import torch
+
+from framework.configuration.schema import build, resolve
+from framework.errors import ConfigError, NonFiniteAnswer
+from framework.flights.frames import future_names
+from framework.flights.physics import Constants
+from framework.model import Model
+from framework.target import Target
+from framework.testing.flights import SIGMA, STEP, TWO_FRAMES, thrown, windows_of
+from plugins.density_head.flights.ballistic import BallisticHead
+from plugins.density_head.flights.identification import FITTED, HIGH, LOW
+
+
+@pytest.mark.parametrize("density", ["linearised", "sampled"])
+def test_the_physics_covers_what_it_simulated(density: str) -> None:
+    frames, future, _ = windows_of(60)
+    target = Target("real", future_names(35, STEP))
+    config = {"name": "ballistic", "density": density, "identify": False, "samples": 60}
+    head = build("density_head", resolve("density_head", config), target=target).eval()
+    torch.manual_seed(0)
+    found = head(frames.flatten(1)).sample((199,))
+    noisy = future.flatten(1) + SIGMA * torch.randn(future.flatten(1).shape)
+    rank = (found < noisy).sum(0)
+    assert ((rank >= 10) & (rank < 190)).double().mean().item() == pytest.approx(0.9, abs=0.05)
+
+
+def test_heads_refuse_what_is_no_flight() -> None:
+    target = Target("real", ("x", "y"))
+    for name in ("ballistic", "lstm"):
+        with pytest.raises(ConfigError, match="predicts x, y and z at one time after the other"):
+            build("density_head", resolve("density_head", name), target=target)
+
+
+@pytest.mark.parametrize("nonsense", [False, True])
+def test_constants_are_found_and_of_nonsense_stay_within_their_bounds(nonsense: bool) -> None:
+    frames, future, _ = windows_of(12)
+    target = Target("real", future_names(35, STEP))
+    wrong = {"drag": 0.1, "lift": 0.001, "restitution": 0.8, "friction": 0.2, "surface": -0.93}
+    head = build("density_head", resolve("density_head", {"name": "ballistic", **wrong}), target=target)
+    torch.manual_seed(0)
+    if nonsense:
+        frames, future = torch.randn_like(frames)[:2], torch.randn_like(future)[:2]
+    head.fit(frames.flatten(1), future.flatten(1) + SIGMA * torch.randn(future.flatten(1).shape), 0)
+    found = head.constants
+    for name, low, high in zip(FITTED, LOW, HIGH, strict=True):
+        middle = wrong["surface"] if name == "surface" else 0.0
+        assert middle + low <= getattr(found, name) <= middle + high
+        if not nonsense:
+            near = {"lift": 1e-3, "restitution": 0.02, "surface": 0.003}.get(name, 0.01)
+            assert getattr(found, name) == pytest.approx(getattr(Constants(), name), abs=near), name
+    if not nonsense:
+        assert head.noise.item() == pytest.approx(SIGMA, rel=0.1)
+
+
+@pytest.mark.parametrize("density", ["linearised", "sampled"])
+@pytest.mark.parametrize("value", [1e-30, 1e3, 1e30])
+@pytest.mark.parametrize("name", ["step", *(field.name for field in fields(Constants))])
+def test_physics_far_from_any_ball_give_a_density_or_a_sentence(
+    name: str, value: float, density: Literal["linearised", "sampled"]
+) -> None:
+    step, constants = (value, Constants()) if name == "step" else (0.016, Constants(**{name: value}))
+    head = BallisticHead(
+        TWO_FRAMES,
+        observed=6,
+        step=step,
+        density=density,
+        samples=3,
+        steps=5,
+        identify=False,
+        constants=constants,
+    )
+    try:
+        log_prob = head(thrown(2)).log_prob(torch.zeros(2, 6))
+    except NonFiniteAnswer as error:
+        assert "in batch row 0" in str(error)
+    else:
+        assert log_prob.isfinite().all()
+
+
+def test_a_window_of_another_length_than_the_head_reads_is_refused() -> None:
+    head = BallisticHead(TWO_FRAMES, observed=7, constants=Constants())
+    with pytest.raises(ConfigError, match="BallisticHead reads 35 numbers a sample, but gets 30"):
+        Model([], head, (30,))

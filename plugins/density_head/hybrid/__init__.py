@@ -1,0 +1,1 @@
+"""A learned density about a mean that the encoder gives."""

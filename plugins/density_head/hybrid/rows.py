@@ -1,0 +1,30 @@
+"""Rows of the contract: a Gaussian, and a CVAE over the numbers of two frames, about the mean that comes."""
+
+from collections.abc import Mapping
+
+from framework.target import Target
+from framework.testing.flights import TWO_FRAMES
+from framework.testing.rows import HeadRow
+
+THREE = Target("real", ("x", "y", "z"))
+TVAE = {
+    "name": "cvae", "latent": 2, "hidden": 8, "training_samples": 1, "samples": 10, "component": {"name": "gaussian"},
+}  # fmt: skip
+BOUND: Mapping[str, str] = dict.fromkeys(
+    ("integral", "samples follow log_prob", "entropy", "mode"),
+    "log_prob is the importance-weighted bound (eq. 3.19), the rest is of the mixture drawn from the prior",
+)
+DEEP = {"float32 against float64": 256.0}
+"""Of seven layers one behind the other, the last of which multiplies numbers of the one before with a latent vector."""
+ROWS = {
+    "hybrid": (
+        HeadRow("three numbers", THREE, {"further": 4, "hidden": 8}),
+        HeadRow(
+            "a CVAE over two frames",
+            TWO_FRAMES,
+            {"further": 4, "hidden": 8, "component": TVAE},
+            limits=DEEP,
+            leave_out=BOUND,
+        ),
+    ),
+}

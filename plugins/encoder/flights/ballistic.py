@@ -1,0 +1,79 @@
+"""A flight by the physics as features: where the ball arrives by its differential equation, and how sure that is."""
+
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.encoder import Encoder
+from framework.flights.estimation import Prior, estimated, root, seen_of
+from framework.flights.frames import PARTS
+from framework.flights.physics import Constants
+from framework.flights.trajectories import flown_with_slopes
+from plugins.encoder.flights.extrapolation import frames_of
+
+LARGEST = 1e4
+"""Bound on the magnitude of inputs and features; larger ones are cut off."""
+
+
+class BallisticEncoder(Encoder):
+    """The flight by its differential equation as features.
+
+    Metres: x, y and z at each future frame, the logarithms of their standard deviations, and what was read (frame by
+    frame as `PARTS`).
+
+    The constants are those of the config, or those that a run of `density_head=ballistic` found. Nothing is learnt.
+
+    Args:
+        future, step: of the data.
+        spin: standard deviation believed of each component of the spin, rad/s.
+        noise: of a coordinate, m.
+        constants: of the ball and the table.
+
+    Raises:
+        ConfigError: inputs are no frames of `PARTS`, flattened.
+    """
+
+    bibtex = """@article{mulling2011biomimetic,
+  author  = {M{\\"u}lling, Katharina and Kober, Jens and Peters, Jan},
+  title   = {A Biomimetic Approach to Robot Table Tennis},
+  journal = {Adaptive Behavior},
+  volume  = {19},
+  number  = {5},
+  pages   = {359--376},
+  year    = {2011}
+}"""
+    fixed = True
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        *,
+        future: Annotated[int, Field(ge=1, le=1000)] = 35,
+        step: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.016,
+        spin: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 60.0,
+        noise: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.003,
+        constants: Constants,
+    ) -> None:
+        super().__init__()
+        length = len(PARTS) * frames_of(input_shape, "encoder ballistic")
+        self.future, self.step, self.noise = future, step, noise
+        self.prior = Prior(spin=spin)
+        self.constants = constants
+        self.output_shape = (6 * future + length,)
+
+    @torch.no_grad()
+    def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
+        frames = inputs.double().clamp(-LARGEST, LARGEST).cpu()
+        seen = seen_of(frames.unflatten(-1, (-1, len(PARTS))), self.step)
+        estimate = estimated(seen, self.constants, self.noise, self.prior)
+        moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
+        times = torch.cat([seen.times, moments.expand(len(frames), -1)], 1)
+        places, slopes = flown_with_slopes(estimate.state, times, self.constants)
+        spread = (slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)).square().sum(-1)
+        spread = (spread + self.noise**2).log() / 2
+        found = torch.cat([places[:, -self.future :].flatten(1), spread, frames], 1)
+        return found.clamp(-LARGEST, LARGEST).to(inputs.device, dtype)

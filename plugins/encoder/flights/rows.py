@@ -1,0 +1,9 @@
+"""Rows of the contract: what is seen of thrown balls."""
+
+from framework.testing.flights import thrown
+from framework.testing.rows import EncoderRow
+
+ROWS = {
+    name: (EncoderRow("a thrown ball", (30,), {"future": 3}, inputs=thrown),)
+    for name in ("ballistic", "extrapolation")
+}

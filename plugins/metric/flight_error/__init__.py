@@ -1,0 +1,1 @@
+"""How far predicted flights are from where the ball went, and where they land."""
