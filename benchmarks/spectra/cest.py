@@ -29,16 +29,16 @@ from framework.distributions.protocol import marginal
 from framework.figures.style import BLUE, GREEN, GREY, RED, saved, titled_figure
 from framework.model import Predictor
 from framework.reports.table import Row, csv, markdown
+from framework.spectra.fit import fit
+from framework.spectra.spectrum import COUNT, spectrum
 from framework.target import Target
 from plugins.data.cest.data import CEST
-from plugins.data.cest.fit import fit
-from plugins.data.cest.head import LorentzianHead
 from plugins.data.cest.maps import maps_of, slice_of
 from plugins.data.cest.maps_picture import pictured
-from plugins.data.cest.refined import Refined
-from plugins.data.cest.spectrum import COUNT, spectrum
 from plugins.data.cest.volumes import read_volume
+from plugins.density_head.lorentzian.head import LorentzianHead
 from plugins.uncertainty.conformal.wrapper import Conformal
+from plugins.uncertainty.refined.wrapper import Refined
 
 HERE = Path(__file__).with_suffix("")
 STEPS = (1, 2, 3, 4, 5, 6, 8, 12, 300)

@@ -11,8 +11,8 @@ from scipy import optimize
 from torch import Tensor
 
 from benchmarks.rounds import ROUNDS, Rounds
-from plugins.data.cest.fit import Fit, fit
-from plugins.data.cest.spectrum import CENTRES, COUNT, PRESETS, Misfit, Parameters
+from framework.spectra.fit import Fit, fit
+from framework.spectra.spectrum import CENTRES, COUNT, PRESETS, Misfit, Parameters
 from plugins.data.cest.volumes import read_volume
 
 TIGHT, ORDINARY = 1e-14, 1e-8

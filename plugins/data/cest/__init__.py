@@ -1,1 +1,1 @@
-"""CEST brain imaging: Z-spectra, fitted by sums of Lorentzian lines or predicted by networks."""
+"""CEST brain imaging: Z-spectra of volumes, measured and generated."""

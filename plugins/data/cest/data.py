@@ -20,14 +20,15 @@ from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Mapped, Splits
 from framework.datasets.fields import Fields
 from framework.errors import DataError
+from framework.spectra.fit import fit
+from framework.spectra.offsets import offsets_of
+from framework.spectra.spectrum import COUNT, Parameters, Preset, spectrum
 from framework.storage.arrays import archive
 from framework.storage.cache import folder
 from framework.storage.files import write_whole
 from framework.storage.generated import generated, read_mark
 from framework.target import Target
-from plugins.data.cest.fit import fit
-from plugins.data.cest.protocol import offsets_of, resampled
-from plugins.data.cest.spectrum import COUNT, Parameters, Preset, spectrum
+from plugins.data.cest.resampling import resampled
 from plugins.data.cest.spectrum_picture import curve
 from plugins.data.cest.volumes import SUFFIXES, Volume, read_volume
 
@@ -66,7 +67,8 @@ class CEST(Data, Mapped):
     Args:
         root: a file, see volumes.py, or a folder with brain.npz; None: a slice is generated.
         preset: ten numbers, amplitude and width of five pools, or fifteen, with their centres.
-        offsets: at which the model reads spectra, ppm, ascending; None: protocol.OFFSETS. Others are resampled.
+        offsets: at which the model reads spectra, ppm, ascending; None: `framework.spectra.offsets.OFFSETS`. Others are
+            resampled.
         band: rows.
         noise: greatest standard deviation of what is added to a training spectrum, drawn anew for each.
         shift: greatest shift of a training spectrum's lines, ppm; a fitted centre of water moves with it.

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
-from plugins.data.cest.protocol import OFFSETS
-from plugins.data.cest.spectrum import CENTRES, spectrum
+from framework.spectra.offsets import OFFSETS
+from framework.spectra.spectrum import CENTRES, spectrum
 
 # amplitudes and widths (ppm) of water, amide, NOE, MT, amine
 TISSUES = np.array(

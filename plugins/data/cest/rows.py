@@ -1,4 +1,4 @@
-"""Rows of the contract: a small slice, generated and in MATLAB's and NumPy's files; fits of both presets."""
+"""Rows of the contract: a small slice, generated and in MATLAB's and NumPy's files."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,14 +6,9 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from framework.target import Target
-from framework.testing.rows import DAMAGES, DataRow, HeadRow, WrapperRow
+from framework.spectra.offsets import OFFSETS
+from framework.testing.rows import DAMAGES, DataRow
 from plugins.data.cest.generator import write_slice
-from plugins.data.cest.protocol import OFFSETS
-from plugins.data.cest.spectrum import PRESETS
-
-TEN, FIFTEEN = (Target("real", PRESETS[preset].target) for preset in ("ten", "fifteen"))
-FEW = [-20.0, -5.0, -3.5, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0, 3.5, 5.0, 20.0]
 
 
 def slice_of(folder: Path, data_seed: int = 0) -> dict[str, np.ndarray]:
@@ -45,9 +40,6 @@ def files(folder: Path) -> Sequence[Path]:
     return [folder / "mine_1.npz", folder / "mine_2.mat"]
 
 
-NO_GRADIENT = {"loss gradient": "a fit claims no gradient in its spectrum"}
-BY_DRAWS = "of ten numbers; the head's rows integrate them by draws"
-TEN_NUMBERS = {"integral": BY_DRAWS, "samples follow log_prob": BY_DRAWS}
 SMALL = {"band": 3, "side": 32}
 ROWS = {
     "cest": (
@@ -58,15 +50,5 @@ ROWS = {
             "NumPy's file", SMALL, as_numpy, False, files, fragile={"brain.npz": DAMAGES}, changes={"band": 4}
         ),
         DataRow("MATLAB's file", SMALL, as_matlab, False, files, fragile={"brain.mat": DAMAGES}),
-    ),
-    "lorentzian": (
-        HeadRow("ten", TEN, {"offsets": FEW, "steps": 3}, leave_out=NO_GRADIENT),
-        HeadRow("fifteen", FIFTEEN, {"offsets": FEW, "steps": 3}, leave_out=NO_GRADIENT),
-    ),
-    "refined": (
-        WrapperRow(
-            "no step", TEN, {"steps": 0, "offsets": FEW[3:9]}, identity={"steps": 0}, leave_out=TEN_NUMBERS
-        ),
-        WrapperRow("a fit", TEN, {"steps": 10, "offsets": FEW[3:9]}, leave_out=TEN_NUMBERS),
     ),
 }

@@ -10,17 +10,16 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead, Fitted
-from framework.distributions.normals import JointNormal
 from framework.errors import ConfigError
 from framework.heads.parameters import require_finite
+from framework.spectra.fit import density, fit
+from framework.spectra.offsets import offsets_of
+from framework.spectra.spectrum import PRESETS, Parameters
 from framework.target import Target
-from plugins.data.cest.fit import Fit, fit
-from plugins.data.cest.protocol import offsets_of
-from plugins.data.cest.spectrum import PRESETS, Parameters
 
 
 class LorentzianHead(DensityHead, Fitted):
-    """Least squares of each spectrum (plugins.data.cest.fit), with the covariance of its Jacobian.
+    """Least squares of each spectrum (`framework.spectra.fit`), with the covariance of its Jacobian.
 
     Reads spectra of `data=cest` as they are, without an encoder, and needs no training: what the target asks for says
     which preset is fitted. The density's gradient in the spectrum is said to be 0.
@@ -94,10 +93,3 @@ def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
         f"{by} fits Lorentzian lines, {known} numbers such as {', '.join(PRESETS['ten'].target[:2])}; the data's are "
         f"{', '.join(names[:10])}. Choose data=cest."
     )
-
-
-def density(found: Fit, told: int, shape: torch.Size | tuple[int, ...], zero: Tensor) -> Distribution:
-    """The Gaussian over the first `told` parameters, of the type of `zero` (*shape, 1), which is added to its mean: of
-    a lower Cholesky factor the first rows are their marginal's."""
-    mean = found.parameters[:, :told].reshape(*shape, told).to(zero) + zero
-    return JointNormal(mean, found.root[:, :told, :told].reshape(*shape, told, told).to(zero))

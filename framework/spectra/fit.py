@@ -5,10 +5,12 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.distributions import Distribution
 
+from framework.distributions.normals import JointNormal
 from framework.least_squares.solution import Solution, Status
 from framework.least_squares.solver import least_squares
-from plugins.data.cest.spectrum import COUNT, Misfit, Parameters
+from framework.spectra.spectrum import COUNT, Misfit, Parameters
 
 CUT = 10.0
 """Beyond this a measured number is no Z, which lies between 0 and about 1, and is cut off."""
@@ -139,3 +141,10 @@ def _careful_root(
     inverse = torch.linalg.solve_triangular(triangle, identity.expand_as(triangle), upper=True)
     lower = torch.linalg.qr(inverse.mT, mode="r").R.mT * variance.sqrt()[:, None, None]
     return lower * lower.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)
+
+
+def density(found: Fit, told: int, shape: torch.Size | tuple[int, ...], zero: Tensor) -> Distribution:
+    """The Gaussian over the first `told` parameters, of the type of `zero` (*shape, 1), which is added to its mean: of
+    a lower Cholesky factor the first rows are their marginal's."""
+    mean = found.parameters[:, :told].reshape(*shape, told).to(zero) + zero
+    return JointNormal(mean, found.root[:, :told, :told].reshape(*shape, told, told).to(zero))

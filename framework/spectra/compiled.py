@@ -16,7 +16,7 @@ import numpy as np
 from framework.storage.kernels import compiler, kept_in
 
 # sums in any order, in which several numbers are added at once
-compiled = compiler(kept_in("cest", [Path(__file__)]), fastmath={"reassoc", "contract", "arcp"})
+compiled = compiler(kept_in("spectra", [Path(__file__)]), fastmath={"reassoc", "contract", "arcp"})
 
 
 @compiled

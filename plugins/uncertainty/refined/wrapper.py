@@ -13,11 +13,10 @@ from framework.data import Batch
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.model import Predictor
+from framework.spectra.fit import density, fit
+from framework.spectra.offsets import offsets_of
+from framework.spectra.spectrum import PRESETS
 from framework.uncertainty import Uncertainty
-from plugins.data.cest.fit import fit
-from plugins.data.cest.head import density
-from plugins.data.cest.protocol import offsets_of
-from plugins.data.cest.spectrum import PRESETS
 
 DRAWS = 100
 """For the point of a density that does not know it."""
@@ -26,7 +25,7 @@ DRAWS = 100
 class Refined(Uncertainty):
     """Fits Lorentzian lines to each spectrum from where the wrapped model says they are (the neural start).
 
-    The density is that of the fit (plugins.data.cest.fit), where the wrapped model's own only says where to begin. A
+    The density is that of the fit (`framework.spectra.fit`), where the wrapped model's own only says where to begin. A
     wrapper, since a network and a fit are both wanted in one experiment: it is trained, stored and compared as any
     model, and wraps any, an ensemble too. With `steps=0` it is what it wraps.
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from plugins.data.cest import compiled
+from framework.spectra import compiled
 
 POOLS = ("water", "amide", "noe", "mt", "amine")
 COUNT = len(POOLS)

@@ -1,0 +1,1 @@
+"""Lorentzian lines fitted to each Z-spectrum."""
