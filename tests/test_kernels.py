@@ -10,8 +10,8 @@ import pytest
 
 from framework.geometry.nearest import compiled
 from framework.storage.kernels import kept_in
+from plugins.encoder.projection import compiled as projecting
 from plugins.renderer.rasterizer import raster
-from plugins.renderer.smplpix import compiled as projecting
 
 TOP = Path(__file__).parent.parent
 

@@ -26,7 +26,7 @@ from framework.reports.table import Row, csv
 from plugins.data.bodies.human_scans import in_front
 from plugins.data.bodies.people import chosen_body
 from plugins.data.bodies.topologies import Name, sheet, topology
-from plugins.renderer.smplpix.canvas import fast_bfloat16
+from plugins.encoder.unets.canvas import fast_bfloat16
 
 SIZE = (410, 308)
 TOPOLOGIES: tuple[Name, ...] = ("7k", "27k", "110k")

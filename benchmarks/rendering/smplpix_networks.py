@@ -28,7 +28,7 @@ from framework.configuration.loading import load_with_description, reader
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
 from framework.geometry.camera import look_from
-from plugins.renderer.smplpix.canvas import fast_bfloat16
+from plugins.encoder.unets.canvas import fast_bfloat16
 
 HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/smplpix_networks"

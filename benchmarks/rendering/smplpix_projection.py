@@ -16,7 +16,7 @@ from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figu
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
-from plugins.renderer.smplpix.projection import Projection, gathered, project, seen_in_torch
+from plugins.encoder.projection.encoder import Projection, gathered, project, seen_in_torch
 
 RINGS = ((82, 84), (165, 168), (328, 336), (1000, 1000))
 """Bodies of 6,890, 27,722, 110,210 and 1,000,002 points; the thesis has 6,890 and 27,578."""

@@ -1,1 +1,1 @@
-"""People rendered by neural pixels: what a body's points show, and the networks that paint a picture of it."""
+"""People rendered by neural pixels: a trained network paints the picture of a body's points."""

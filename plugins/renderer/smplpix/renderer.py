@@ -14,11 +14,12 @@ from framework.configuration.paths import FilePath, flat
 from framework.distributions.protocol import images
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.geometry.light import encoded
+from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.model import Predictor
 from framework.renderer import Renderer, Scene
-from plugins.renderer.smplpix.canvas import Precision
-from plugins.renderer.smplpix.projection import COLUMNS, Projection
 
+COLUMNS = (*XYZ, *COLOURS)
+"""Columns of the points that a run must have been trained on."""
 SIZES_KEPT = 4
 """Networks of so many image sizes are kept ready."""
 
@@ -39,7 +40,7 @@ class SMPLpix(Renderer):
         checkpoint: folder of a run, its model.ckpt, or an MLflow run id.
         paths: files and folders of that run's config, which are used only where they are said again:
             `renderer.paths={encoder: {rasterised: {body: ...}}}`.
-        precision: of evaluation, as of `unet.UNet`; "trained": as the run's config says.
+        precision: of evaluation, as of `encoder=unet`; "trained": as the run's config says.
         crop: margin around the subject's box, pixels, that is computed; "whole": all is; "trained" likewise.
 
     Raises:
@@ -49,14 +50,20 @@ class SMPLpix(Renderer):
 
     channels = frozenset({"color"})
     background = 1.0
-    bibtex = Projection.bibtex
+    bibtex = """@inproceedings{prokudin2021smplpix,
+  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
+  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
+  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
+  pages = {1810--1819},
+  year = {2021}
+}"""
 
     def __init__(
         self,
         *,
         checkpoint: FilePath | None = None,
         paths: dict[str, Any] | None = None,
-        precision: Precision | Literal["trained"] = "trained",
+        precision: Literal["trained", "auto", "float32", "bfloat16"] = "trained",
         crop: Annotated[int, Field(ge=0)] | Literal["trained", "whole"] = "trained",
     ) -> None:
         if checkpoint is None:

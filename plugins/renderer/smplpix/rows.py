@@ -1,4 +1,4 @@
-"""Rows of the contract: one level and several, sizes even and odd, every normalisation, with and without crop."""
+"""Rows of the contract: runs with drawn weights, of points, of splats, and of other sizes than are drawn."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,16 +13,14 @@ from framework.configuration.loading import PREFIX
 from framework.configuration.schema import resolve
 from framework.storage import checkpoints
 from framework.target import Target
-from framework.testing.rows import CloudRow, EncoderRow, RendererRow
-from plugins.renderer.smplpix.projection import COLUMNS
+from framework.testing.rows import RendererRow
+from plugins.renderer.smplpix.renderer import COLUMNS
 
 FOLDER = TemporaryDirectory()
 
 NEAR: dict[str, Any] = {"nearest": 0.1, "farthest": 20.0}
 UNET = {"width": 6, "levels": 3}
 SLIM = {"widths": [8, 12, 16]}
-LESS_PRECISE = {"rows of a batch apart": 1e-2}  # as far as two bfloat16 are apart
-AT_FIRST = {"gradients reach every parameter": "the last layer's weights are 0 until the first step"}
 
 
 def seeing(size: tuple[int, int], name: str = "projection", **config: Any) -> dict[str, Any]:
@@ -88,41 +86,6 @@ ROWS = {
             {"checkpoint": UNET_RUN, "precision": "bfloat16", "crop": "whole"},
             WHITE,
             POINTS_ARE_DRAWN,
-        ),
-    ),
-    "projection": (
-        CloudRow("the thesis's size", (40, 6), config=NEAR),
-        CloudRow("four levels", (300, 8), config={**NEAR, "height": 21, "width": 34, "levels": 4}),
-        CloudRow(
-            "named columns, one pixel",
-            (40, 7),
-            columns=("x", "y", "z", "red", "green", "blue", "part"),
-            config={**NEAR, "height": 1, "width": 1, "levels": 2},
-        ),
-        CloudRow("one point", (1, 6), config={**NEAR, "height": 12, "width": 9}),
-        CloudRow(
-            "splats, two levels", (40, 6), config={**NEAR, "height": 21, "width": 16, "levels": 2, "splat": 4}
-        ),
-    ),
-    "unet": (
-        EncoderRow("odd size", (4, 13, 10), UNET),
-        EncoderRow(
-            "batch norm, scales, whole frame",
-            (3, 8, 9),
-            {**UNET, "normalisation": "batch", "scales": 3, "crop": None},
-        ),
-        EncoderRow("over its input", (5, 10, 9), {**UNET, "residual": True, "scales": 1}, leave_out=AT_FIRST),
-        EncoderRow("group norm", (4, 9, 8), {**UNET, "normalisation": "group", "crop": None}),
-    ),
-    "slim": (
-        EncoderRow("odd size", (4, 13, 10), SLIM),
-        EncoderRow("over its input", (3, 11, 6), {**SLIM, "residual": True}, leave_out=AT_FIRST),
-        EncoderRow("a scale, squares of 4", (3, 17, 20), {**SLIM, "unshuffle": 4, "scales": 1}),
-        EncoderRow(
-            "bfloat16, whole frame",
-            (4, 9, 8),
-            {**SLIM, "precision": "bfloat16", "crop": None},
-            limits=LESS_PRECISE,
         ),
     ),
 }

@@ -15,7 +15,7 @@ from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
 from framework.geometry.clouds import pad
 from framework.geometry.rotation import viewpoint_rotation
-from plugins.renderer.smplpix.projection import View, gathered, project, seen_in_torch
+from plugins.encoder.projection.encoder import View, gathered, project, seen_in_torch
 
 LIMITS = (1.0, 5.0)
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.errors import ConfigError
-from plugins.renderer.smplpix.layers import Layer, Step, convolved
+from plugins.encoder.unets.layers import Layer, Step, convolved
 
 Precision = Literal["auto", "float32", "bfloat16"]
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
-from plugins.renderer.smplpix.canvas import Canvas, Precision, Report, head, require_pictures
-from plugins.renderer.smplpix.layers import Layer, Normalisation, Step
+from plugins.encoder.unets.canvas import Canvas, Precision, Report, head, require_pictures
+from plugins.encoder.unets.layers import Layer, Normalisation, Step
 
 Channels = Annotated[int, Field(gt=0)]
 

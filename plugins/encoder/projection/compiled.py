@@ -16,7 +16,7 @@ from framework.storage.kernels import compiler, kept_in
 
 KERNELS = ("compiled",)
 """Files whose functions call each other."""
-compiled = compiler(kept_in("smplpix", [Path(__file__)]))
+compiled = compiler(kept_in("projection", [Path(__file__)]))
 
 
 @compiled
@@ -24,7 +24,7 @@ compiled = compiler(kept_in("smplpix", [Path(__file__)]))
 def project(cloud, focal, middle, nearest, farthest, depth, index, picture):
     """Fill `depth`, and `index` or `picture`; the other is None, and compiled away.
 
-    All decisions are those of `projection.project`, made in float64; a number that is NaN fails every comparison.
+    All decisions are those of `encoder.project`, made in float64; a number that is NaN fails every comparison.
 
     Args:
         focal, middle: pixels; `middle` is (column, row) of the principal point from the image's upper left corner,

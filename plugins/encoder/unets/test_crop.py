@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from plugins.renderer.smplpix.canvas import Box, Canvas, subject
-from plugins.renderer.smplpix.test_networks import SMALL, network, pictures
+from plugins.encoder.unets.canvas import Box, Canvas, subject
+from plugins.encoder.unets.test_networks import SMALL, network, pictures
 
 SHAPE = (4, 203, 150)
 SUBJECTS = {

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
-from plugins.renderer.smplpix.splats import closing, in_torch, splatted
+from plugins.encoder.projection.splats import closing, in_torch, splatted
 
 LIMITS = (1.0, 5.0)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.storage.threads import POOL
-from plugins.renderer.smplpix import compiled
+from plugins.encoder.projection import compiled
 
 CHANNELS = 5
 """Red, green, blue and depth of the surface, and how far the nearest point is."""
@@ -48,7 +48,7 @@ def closing(radius: int) -> int:
 def splatted(
     pictures: Float[Tensor, "batch 4 height width"], limits: tuple[float, float], focal: float, radius: int
 ) -> Float[Tensor, "batch 5 height width"]:
-    """The surface through the points that pictures of `projection.project` show.
+    """The surface through the points that pictures of `encoder.project` show.
 
     A cone about each point, whose depth grows by a pixel's width with each pixel, hides what is behind it; the first
     cone that a pixel meets says how near the surface is, and how far the nearest of its points, in shares of radius + 1

@@ -4,8 +4,8 @@ from torch.nn import functional
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from plugins.renderer.smplpix.canvas import EMPTY_LOG_SCALE, fast_bfloat16
-from plugins.renderer.smplpix.layers import EPSILON, Layer
+from plugins.encoder.unets.canvas import EMPTY_LOG_SCALE, fast_bfloat16
+from plugins.encoder.unets.layers import EPSILON, Layer
 
 SMALL = {"unet": {"width": 4, "levels": 3}, "slim": {"widths": [6, 8, 10]}}
 STRIDE = {"unet": 4, "slim": 8}

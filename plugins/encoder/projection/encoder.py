@@ -14,10 +14,11 @@ from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
 from framework.geometry.clouds import sizes
+from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.storage.threads import POOL
-from plugins.renderer.smplpix import compiled, splats
+from plugins.encoder.projection import compiled, splats
 
-COLUMNS = ("x", "y", "z", "red", "green", "blue")
+COLUMNS = (*XYZ, *COLOURS)
 CHANNELS = 4
 BACKGROUND = 1.0
 NOTHING = torch.iinfo(torch.int64).max

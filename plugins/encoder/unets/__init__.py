@@ -1,0 +1,1 @@
+"""U-Nets that fill pictures of projected points or rasterised meshes."""
