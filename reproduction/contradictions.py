@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.jobs import record
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import record
 from framework.errors import DataError
 from framework.reports.table import Row, aggregate, markdown
 from plugins.data.head_pose.idiap import Idiap
@@ -256,7 +256,7 @@ def main() -> None:
         + "\n".join(section(part) for part in PARTS)
         + f"\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 

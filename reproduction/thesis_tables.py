@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.jobs import by_the_clock, processor_seconds, record
-from benchmarks.machine import machine
+from benchmarks.pages import machine
+from benchmarks.sweeps import by_the_clock, processor_seconds, record
 from framework.reports.table import NOT_AVAILABLE, format_number
 
 HERE = Path(__file__).resolve()

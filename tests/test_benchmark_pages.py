@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.rounds import Rounds, in_turn, others_use, replace_section
+from benchmarks.pages import replace_section
+from benchmarks.timing import Rounds, in_turn, others_use
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
@@ -39,7 +40,7 @@ WITHOUT_SPREAD = {
     "smplpix_work_precision.md",
     "sweep_start.md",
 }
-"""Pages from before `benchmarks.rounds`; whoever measures one again takes it out of this list."""
+"""Pages from before `benchmarks.timing`; whoever measures one again takes it out of this list."""
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -91,3 +92,33 @@ def test_a_process_of_others_is_seen() -> None:
     finally:
         busy.kill()
         busy.wait()
+
+
+def test_every_command_names_a_script_that_is_there() -> None:
+    """In pages, scripts and READMEs."""
+    documents = [
+        path
+        for pattern in (
+            "*.md",
+            "*/*.md",
+            "benchmarks/**/*.*",
+            "reproduction/**/*.*",
+            "tests/**/*.*",
+            "plugins/*/*/*.*",
+        )
+        for path in ROOT.glob(pattern)
+        if path.suffix in (".md", ".py")
+    ]
+    commands = {
+        (path, module)
+        for path in documents
+        for module in re.findall(
+            r"python -m ((?:benchmarks|reproduction|tests\.fuzz)[.\w]*\w)", path.read_text(encoding="utf-8")
+        )
+    }
+    assert len(commands) > 100
+    assert not [
+        (str(path.relative_to(ROOT)), module)
+        for path, module in commands
+        if not (ROOT / f"{module.replace('.', '/')}.py").is_file()
+    ]

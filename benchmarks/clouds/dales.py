@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.reports.table import markdown
 
 COLUMNS = {"fold": "fold", "accuracy": "accuracy", "nll": "NLL (nats)", "ece": "ECE"}
@@ -35,7 +35,7 @@ def main() -> None:
         f"{accuracy.std(ddof=1):.4f}). ± is the standard error over the objects of a fold. Commands in `dales.py`.\n\n"
         f"{markdown(rows, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

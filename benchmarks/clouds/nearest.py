@@ -26,7 +26,8 @@ from pykdtree.kdtree import KDTree  # pyright: ignore[reportMissingImports]
 from scipy.spatial import cKDTree  # type: ignore[reportAttributeAccessIssue]
 from sklearn.neighbors import NearestNeighbors
 
-from benchmarks.machine import first_calls, machine
+from benchmarks.pages import machine, write_page
+from benchmarks.timing import first_calls
 from framework.geometry.nearest import Queries, nearest, prepare
 from framework.geometry.nearest.streamed import Middle, Reach, Stream, normal
 
@@ -333,8 +334,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stream", action="store_true", help="1e8 points in chunks; takes some minutes")
     if parser.parse_args().stream:
-        text, name = streaming(), "nearest_stream.md"
+        text, name = streaming(), "nearest_stream"
     else:
-        text, name = report(), "nearest.md"
-    Path(__file__).with_name(name).write_text(text, encoding="utf-8")
+        text, name = report(), "nearest"
+    write_page(__file__, text, name)
     sys.stdout.write(text)

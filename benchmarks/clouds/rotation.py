@@ -6,14 +6,13 @@ Writes rotation.md beside this file. Shapes are the generated CAD models of data
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.geometry.meshes import Mesh, sample
 from framework.reports.table import markdown
 from plugins.data.labelled_clouds.shapes.generator import CLASSES, model
@@ -87,7 +86,7 @@ def main() -> None:
         f"of those shapes two samples of one surface are more than {LIMIT:g} apart.\n\n"
         f"{markdown(rows, columns)}\n{machine('torch', 'numba')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -17,7 +17,7 @@ from matplotlib import colormaps
 from matplotlib.patches import Patch
 from torch import Tensor, nn
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.clouds import sizes
@@ -192,7 +192,7 @@ def main() -> None:
         f"{markdown(rows, columns, better={'accuracy': 'higher', 'overlap': 'higher', 'ms': 'lower'})}"
         f"\n![Five scans](segmentation.png)\n\n{machine('torch', 'numba')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.encoder import Encoder
 from plugins.encoder.point_sets import pooled
 from plugins.encoder.point_sets.deepsets import DeepSets
@@ -146,7 +146,7 @@ rounding alone.
 
 {machine("torch")}
 """
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 

@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.reports.table import aggregate, markdown
 
 COLUMNS = {
@@ -46,7 +46,7 @@ def main() -> None:
         "nearer to one another than neighbouring ones are (`plugins/data/coil20`). Commands in `coil20.py`.\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -10,7 +10,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from sklearn.datasets import make_moons
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.schema import build, resolve
 from framework.data import Batch
 from framework.model import Predictor
@@ -167,7 +166,7 @@ def main() -> None:
         "|---|---|---|---|---:|---:|---:|---:|---:|\n" + "\n".join(rows) + "\n\n"
         f"{machine('torch', 'scikit-learn')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

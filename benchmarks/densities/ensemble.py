@@ -12,7 +12,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytorch_lightning as pl
@@ -20,7 +19,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.assembly import build_predictor, resolve_all
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
@@ -198,7 +197,7 @@ def main() -> None:
         "Members have orders of their own (eq. 2.17: independently trained).\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -6,13 +6,13 @@ Writes evaluation_time.md beside this file; some minutes on one core.
 import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch.distributions import Distribution
 
-from benchmarks.machine import machine, milliseconds
+from benchmarks.pages import machine, write_page
+from benchmarks.timing import milliseconds
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import marginal
@@ -149,7 +149,7 @@ def main() -> None:
             "",
         ]
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -21,9 +21,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from torch import Tensor, nn
 
-from benchmarks import committed
 from benchmarks.densities.latent_points import sequences
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.protocol import estimate
@@ -362,12 +361,12 @@ def main() -> None:
         f"{table.markdown(gains, {key: key for key in gains[0]})}\n\n"
         f"{machine('torch')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        picture(committed.rows(HERE.with_suffix(".csv")))
+        picture(read_rows(HERE.with_suffix(".csv")))
     else:
         main()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yaml
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.reports.table import markdown
 
 COLUMNS = {
@@ -49,7 +49,7 @@ def main() -> None:
         f"{markdown(rows, COLUMNS, better={'log_likelihood': 'higher', 'auroc': 'higher', 'fpr95': 'lower'})}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

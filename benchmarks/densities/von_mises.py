@@ -19,8 +19,8 @@ import torch
 from scipy import special, stats
 from torch import Tensor
 
-from benchmarks.machine import machine
-from benchmarks.rounds import ROUNDS, in_turn, median_and_range, replace_section, require_idle
+from benchmarks.pages import machine, replace_section, write_page
+from benchmarks.timing import ROUNDS, in_turn, median_and_range, require_idle
 from framework.distributions.circular import circular_median, wrap
 from framework.distributions.density import Mixture
 from plugins.density_head.von_mises import functions, integrals
@@ -328,6 +328,6 @@ if __name__ == "__main__":
     page = Path(__file__).with_suffix(".md")
     sections = times()  # first: it ends where the machine is not idle
     if sys.argv[1:] != ["--only", "times"]:
-        page.write_text(report(), encoding="utf-8")
+        write_page(__file__, report())
     for heading, section in sections.items():
         replace_section(page, heading, section)

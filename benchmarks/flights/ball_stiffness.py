@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.figures.style import COLOURS, MARKERS, titled_figure
-from framework.flights.physics import Constants
 from plugins.data.table_tennis.closed_form import landing
+from framework.flights.physics import Constants
 from plugins.data.table_tennis.contact import Spring
 from plugins.data.table_tennis.solvers import EXPLICIT, METHODS, SolverGaveUp, flight
 
@@ -99,7 +99,7 @@ def main() -> None:
         f"{machine('scipy', 'numpy')} One thread. Command: `python -m benchmarks.flights.ball_stiffness`.",
         "",
     ]
-    HERE.with_suffix(".md").write_text("\n".join(text))
+    write_page(HERE, text)
     drawn(found)
 
 

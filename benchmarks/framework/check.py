@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.registry import installed
 from framework.testing import finding
 from framework.testing.contract import contract
@@ -77,7 +77,7 @@ and of {others} rows of right heads that are not shipped (tests/right_heads.py).
 
 {chr(10).join(told)}
 """
-    PAGE.write_text(text.rstrip() + "\n", encoding="utf-8")
+    write_page(__file__, text)
 
 
 def written() -> tuple[list[str], int, dict[str, list[int]], float]:

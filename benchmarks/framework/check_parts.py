@@ -12,11 +12,10 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import torch
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.registry import installed
 from framework.testing import finding
 from framework.testing.contract import contract
@@ -155,7 +154,8 @@ def write(
         f"| {name} | {statistics.median(each):.2f} | {min(each):.2f} to {max(each):.2f} |"
         for name, each in sorted(seconds.items(), key=lambda item: -statistics.median(item[1]))
     ]
-    Path(__file__).with_name(f"check_{group}.md").write_text(
+    write_page(
+        __file__,
         f"""# What `mode=check` finds in parts of the group {group}
 
 `python -m benchmarks.framework.check_parts {group}`: {machine("torch")}
@@ -178,7 +178,7 @@ Processor seconds of a part with all its rows, one thread, beside other work: me
 | --- | --- | --- |
 {chr(10).join(costs)}
 """.replace("\n\n\n\n", "\n\n"),
-        encoding="utf-8",
+        f"check_{group}",
     )
 
 

@@ -16,12 +16,11 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
 from framework.deployment.frozen import frozen
@@ -138,7 +137,7 @@ def main() -> None:
         + f"\n\nFreezing takes {freezing:.1f} s: the exporter's import, and compiled functions from their cache.\n\n"
         f"{machine('torch', 'numpy', 'numba')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 from mlflow.pyfunc.scoring_server import get_cmd
 
 from benchmarks.commands import carry_out
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 
 STARTS, LATER = 5, 10
 QUICK = (
@@ -129,7 +129,7 @@ def main() -> None:
         "| data | s until it listens | first, ms | later, ms | ratio |\n|---|---|---|---|---|\n"
     )
     text = f"{head}{chr(10).join(lines)}\n\n{machine('torch', 'mlflow', 'uvicorn')}\n"
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
 
 
 if __name__ == "__main__":

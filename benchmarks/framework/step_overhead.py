@@ -18,8 +18,8 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
-from benchmarks.machine import machine
-from benchmarks.rounds import Rounds, require_idle
+from benchmarks.pages import machine, write_page
+from benchmarks.timing import Rounds, require_idle
 from framework.configuration.assembly import build_predictor, resolve_all
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
@@ -234,7 +234,7 @@ def main() -> None:
             "",
         ]
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 
 ROOT = Path(__file__).resolve().parents[2]
 JOBS, ROUNDS, AT_ONCE = 8, 3, 2
@@ -67,27 +67,23 @@ def main() -> None:
         for fork in names
     ]
     ratios = [median[False][column] / median[True][column] for column in (0, 1)]
-    page = Path(__file__).with_suffix(".md")
-    page.write_text(
-        "\n".join(
-            [
-                "# The start of a sweep's jobs",
-                "",
-                f"`python -m benchmarks.framework.sweep_start`: {JOBS} jobs, {AT_ONCE} at once, `{' '.join(RUNS)}`; "
-                "medians of "
-                f"{ROUNDS} sweeps, in turns. On Linux jobs are forks of a process that has imported torch and "
-                "Lightning (`hydra.launcher.fork`); a job's own seconds leave that process out, the command's do not.",
-                "",
-                "| jobs are | command, s | processors, s | a job, processor s |",
-                "|---|---:|---:|---:|",
-                *lines,
-                f"| ratio | {ratios[0]:.2f} | {ratios[1]:.2f} | {of_job[False] / of_job[True]:.2f} |",
-                "",
-                machine("torch", "pytorch-lightning", "hydra-core"),
-                "",
-            ]
-        ),
-        encoding="utf-8",
+    write_page(
+        __file__,
+        [
+            "# The start of a sweep's jobs",
+            "",
+            f"`python -m benchmarks.framework.sweep_start`: {JOBS} jobs, {AT_ONCE} at once, `{' '.join(RUNS)}`; "
+            "medians of "
+            f"{ROUNDS} sweeps, in turns. On Linux jobs are forks of a process that has imported torch and "
+            "Lightning (`hydra.launcher.fork`); a job's own seconds leave that process out, the command's do not.",
+            "",
+            "| jobs are | command, s | processors, s | a job, processor s |",
+            "|---|---:|---:|---:|",
+            *lines,
+            f"| ratio | {ratios[0]:.2f} | {ratios[1]:.2f} | {of_job[False] / of_job[True]:.2f} |",
+            "",
+            machine("torch", "pytorch-lightning", "hydra-core"),
+        ],
     )
 
 

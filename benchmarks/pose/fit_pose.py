@@ -17,7 +17,7 @@ import torch
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, GREY, titled_figure
 from framework.geometry.light import eight_bit
@@ -201,7 +201,7 @@ def report() -> None:
         f"{machine('torch', 'numba', 'numpy')} Command: `python -m benchmarks.pose.fit_pose`.",
         "",
     ]
-    HERE.with_suffix(".md").write_text("\n".join(text))
+    write_page(HERE, text)
     picture(results, typical)
 
 

@@ -5,14 +5,13 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.random import Generator
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from plugins.data.bodies import poses
 from plugins.data.bodies.body import BodyModel
 from plugins.data.bodies.dressed import Wardrobe
@@ -182,7 +181,7 @@ that pose or shape. Two numbers are the median and the 95 % quantile of distance
 
 {machine("torch", "numpy")} Command: `python -m benchmarks.pose.reposing`.
 """
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

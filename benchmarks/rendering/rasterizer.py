@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.machine import first_calls, machine, milliseconds
+from benchmarks.pages import machine, write_page
 from benchmarks.rendering import rasterizer_growth, rasterizer_peers
+from benchmarks.timing import first_calls, milliseconds
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene, joined
@@ -270,4 +271,4 @@ def report() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).with_suffix(".md").write_text(report())
+    write_page(__file__, report())

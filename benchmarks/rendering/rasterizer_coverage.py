@@ -5,12 +5,11 @@ python -m benchmarks.rendering.rasterizer_coverage
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import binary_erosion, binary_fill_holes
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure, scene, subdivided
 from framework.geometry.camera import look_from
 from plugins.renderer.rasterizer.renderer import Rasterizer
@@ -79,4 +78,4 @@ def report() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).with_suffix(".md").write_text(report(), encoding="utf-8")
+    write_page(__file__, report())

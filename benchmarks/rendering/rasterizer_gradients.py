@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.machine import machine, milliseconds
+from benchmarks.pages import machine, write_page
 from benchmarks.rendering.rasterizer import DISTANCE, HEIGHT, WIDTH, figure
 from benchmarks.rendering.rasterizer import scene as figure_scene
+from benchmarks.timing import milliseconds
 from framework.configuration.schema import build, resolve
 from framework.renderer import Renderer
 from framework.reports.tradeoff_picture import error_against_run_time
@@ -172,7 +173,7 @@ def main() -> None:
         f"{told} Command: `python -m benchmarks.rendering.rasterizer_gradients`.",
         "",
     ]
-    HERE.with_suffix(".md").write_text("\n".join(text))
+    write_page(HERE, text)
     labels = {"angle": "angle to the differences (degrees)", "error": "error over length of the differences"}
     picture = error_against_run_time(
         rows,

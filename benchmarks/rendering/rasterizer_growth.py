@@ -16,7 +16,7 @@ from statistics import median
 
 import numpy as np
 
-from benchmarks import committed
+from benchmarks.pages import read_rows
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
 from framework.geometry.camera import look_from
@@ -101,4 +101,4 @@ if __name__ == "__main__":
     if sys.argv[1:] != ["--draw"]:
         sys.exit("Wanted --draw; benchmarks/rendering/rasterizer.py measures.")
     own = Path(__file__).resolve()
-    drawn(committed.rows(own.with_suffix(".csv")), own.with_suffix(".png"))
+    drawn(read_rows(own.with_suffix(".csv")), own.with_suffix(".png"))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.commands import ROOT
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from benchmarks.rendering.rasterizer import DISTANCE, HEIGHT, WIDTH, figure, scene, subdivided
 from framework.renderer import Scene
 from plugins.renderer.rasterizer.drawing import Gradient
@@ -90,4 +90,4 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         sys.stdout.write(measured(sys.argv[1]))  # type: ignore[arg-type]
     else:
-        Path(__file__).with_suffix(".md").write_text(report(), encoding="utf-8")
+        write_page(__file__, report())

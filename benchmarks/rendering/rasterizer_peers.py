@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.machine import milliseconds
+from benchmarks.timing import milliseconds
 from framework.renderer import Scene
 
 ELSEWHERE = {

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import framework
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.loading import find_checkpoint, stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
@@ -218,4 +218,4 @@ def report(run: str, file: Path) -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).with_suffix(".md").write_text(report(sys.argv[1], Path(sys.argv[2])))
+    write_page(__file__, report(sys.argv[1], Path(sys.argv[2])))

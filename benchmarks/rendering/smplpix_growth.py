@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks import committed
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows, write_page
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
@@ -149,8 +148,8 @@ def drawn(rows: Sequence[Row], picture: Path) -> None:
 if __name__ == "__main__":
     place = Path(__file__).resolve().with_suffix(".md")
     if sys.argv[1:] == ["--draw"]:
-        drawn(committed.rows(place.with_suffix(".csv")), place.with_suffix(".png"))
+        drawn(read_rows(place.with_suffix(".csv")), place.with_suffix(".png"))
     else:
         text = report(place.with_suffix(".png"))
-        place.write_text(text + "\n", encoding="utf-8")
+        write_page(__file__, text)
         sys.stdout.write(text + "\n")

@@ -21,9 +21,9 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.machine import machine, milliseconds
+from benchmarks.pages import machine, replace_section, write_page
 from benchmarks.rendering.rasterizer import figure
-from benchmarks.rounds import ROUNDS, Rounds, in_turn, replace_section, require_idle
+from benchmarks.timing import ROUNDS, Rounds, in_turn, milliseconds, require_idle
 from framework.configuration.loading import load_with_description, reader
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
@@ -308,5 +308,5 @@ def report() -> str:
 if __name__ == "__main__":
     section = of_frames()  # first: it ends where the machine is not idle
     if sys.argv[1:] != ["--only", "frames"]:
-        HERE.with_suffix(".md").write_text(report(), encoding="utf-8")
+        write_page(HERE, report())
     replace_section(HERE.with_suffix(".md"), FRAMES, section)

@@ -6,12 +6,11 @@ import os
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
@@ -130,4 +129,4 @@ def report() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).with_suffix(".md").write_text(report())
+    write_page(__file__, report())

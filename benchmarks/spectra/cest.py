@@ -19,26 +19,25 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks import committed
-from benchmarks.machine import machine
-from benchmarks.rounds import ROUNDS, replace_section, require_idle
+from benchmarks.pages import machine, read_rows, replace_section, write_page
 from benchmarks.spectra.cest_scipy import AGREEMENT, TIGHT, agreement, scipys, timed
+from benchmarks.timing import ROUNDS, require_idle
 from framework.configuration.loading import load_with_description
 from framework.data import Batch
 from framework.distributions.protocol import marginal
 from framework.figures.style import BLUE, GREEN, GREY, RED, saved, titled_figure
 from framework.model import Predictor
 from framework.reports.table import Row, csv, markdown
-from framework.spectra.fit import fit
-from framework.spectra.spectrum import COUNT, spectrum
 from framework.target import Target
 from plugins.data.cest.data import CEST
+from framework.spectra.fit import fit
+from plugins.density_head.lorentzian.head import LorentzianHead
 from plugins.data.cest.maps import maps_of, slice_of
 from plugins.data.cest.maps_picture import pictured
-from plugins.data.cest.volumes import read_volume
-from plugins.density_head.lorentzian.head import LorentzianHead
-from plugins.uncertainty.conformal.wrapper import Conformal
 from plugins.uncertainty.refined.wrapper import Refined
+from framework.spectra.spectrum import COUNT, spectrum
+from plugins.data.cest.volumes import read_volume
+from plugins.uncertainty.conformal.wrapper import Conformal
 
 HERE = Path(__file__).with_suffix("")
 STEPS = (1, 2, 3, 4, 5, 6, 8, 12, 300)
@@ -342,13 +341,13 @@ the test split, the other half of which is judged.
 
 {machine("torch", "scipy", "numpy")}
 """
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(committed.rows(HERE.with_suffix(".csv")))
+        drawn(read_rows(HERE.with_suffix(".csv")))
     elif sys.argv[1:3] == ["--only", "speed"]:
         torch.set_num_threads(1)
         require_idle()

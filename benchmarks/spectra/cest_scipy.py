@@ -10,7 +10,7 @@ import torch
 from scipy import optimize
 from torch import Tensor
 
-from benchmarks.rounds import ROUNDS, Rounds
+from benchmarks.timing import ROUNDS, Rounds
 from framework.spectra.fit import Fit, fit
 from framework.spectra.spectrum import CENTRES, COUNT, PRESETS, Misfit, Parameters
 from plugins.data.cest.volumes import read_volume

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 import framework
-from benchmarks.jobs import processor_seconds, record
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.evaluation.splits import cost, evaluate
@@ -290,7 +290,7 @@ def main() -> None:
         "![landscapes](moons_landscapes.png)\n\n![reliability](moons_reliability.png)\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    (HERE / "moons.md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

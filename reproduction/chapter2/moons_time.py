@@ -17,8 +17,7 @@ from pathlib import Path
 import torch
 
 import framework
-from benchmarks import committed
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import as_batch
 from framework.evaluation.tradeoff import rows, tradeoff
@@ -86,6 +85,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(committed.rows(HERE / "moons_time.csv"))
+        drawn(read_rows(HERE / "moons_time.csv"))
     else:
         main()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 import framework
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.distributions.class_probabilities import class_probabilities
 from framework.reports.table import aggregate, markdown
 
@@ -149,7 +149,7 @@ def main() -> None:
         f"logarithms {np.mean(errors):.3f} ± {np.std(errors, ddof=1):.3f}.\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 

@@ -22,8 +22,8 @@ from scipy.stats import rankdata
 from torch import Tensor
 from torch.distributions import Distribution
 
-from benchmarks.jobs import processor_seconds, record
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.assembly import build_data
 from framework.configuration.loading import load_with_description
 from framework.distributions.circular import angular_distance, grid
@@ -176,7 +176,7 @@ def main() -> None:
         "45° of the point.\n\n" + "\n".join(lines) + "\n\n"
         f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

@@ -19,8 +19,7 @@ import torch
 import yaml
 from matplotlib.axes import Axes
 
-from benchmarks import committed
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build
 from framework.datasets.images import blurred, picture
@@ -215,7 +214,7 @@ def main(sweeps: list[Path], root: str | None) -> None:
         f"`blur.png` (Figure 3.7) and `blur_strip.png` (Figure 3.8).\n\n{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 
@@ -228,6 +227,6 @@ if __name__ == "__main__":
     arguments.add_argument("--draw", action="store_true", help="draw blur.png anew from blur.csv")
     given = arguments.parse_args()
     if given.draw:
-        curves(committed.rows(HERE.with_suffix(".csv")), HERE.with_suffix(".png"))
+        curves(read_rows(HERE.with_suffix(".csv")), HERE.with_suffix(".png"))
     else:
         main(given.sweeps, given.root)

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.jobs import processor_seconds, record, settings
-from benchmarks.machine import machine
-from benchmarks.speed import milliseconds
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import milliseconds_per_sample, processor_seconds, record, settings
 from framework.reports.table import Better, aggregate, markdown
 from framework.training.batches import Batches
 
@@ -75,7 +74,7 @@ def results(folders: list[Path]) -> list[dict[str, Any]]:
         angles = [word for word in job["overrides"] if word.startswith("data.angles=")]
         angle = angles[0].partition("=")[2].strip("[]") if angles else "pan"
         taken = {
-            "milliseconds_per_sample": milliseconds(path.parent, loaders),
+            "milliseconds_per_sample": milliseconds_per_sample(path.parent, loaders),
             "minutes": processor_seconds(job) / 60,
         }
         rows.append(found | {"data": data, "angle": angle, "method": method} | taken)
@@ -136,7 +135,7 @@ def main() -> None:
         "Differences on the same data and seed, ± standard error over seeds where there are several.\n\n"
         f"{differences(rows)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 

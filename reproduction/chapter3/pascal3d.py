@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.jobs import settings
-from benchmarks.machine import machine
-from benchmarks.speed import milliseconds
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import milliseconds_per_sample, settings
 from framework.reports.table import aggregate, markdown
 from framework.training.batches import Batches
 
@@ -98,7 +97,9 @@ def main() -> None:
     for path in paths:
         row = json.loads(path.read_text(encoding="utf-8"))
         name = row["data"].removeprefix("pascal3d ")
-        rows.append({**row, "data": name, "milliseconds_per_sample": milliseconds(path.parent, loaders)})
+        rows.append(
+            {**row, "data": name, "milliseconds_per_sample": milliseconds_per_sample(path.parent, loaders)}
+        )
     rows.sort(key=lambda row: (row["data"], METHODS.index(row["method"]), row["seed"]))
     compared = aggregate(rows, by=["data", "method"])
     threads = " or ".join(
@@ -113,7 +114,7 @@ def main() -> None:
         f"{markdown(compared, COLUMNS)}\n\n{over_classes(rows)}\n\n"
         f"{len(rows)} runs, {threads} each. {machine('torch', 'pytorch-lightning')}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

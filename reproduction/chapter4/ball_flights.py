@@ -23,19 +23,18 @@ import numpy as np
 import torch
 
 import framework
-from benchmarks import committed
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
 from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
-from framework.flights.frames import PARTS
 from framework.prediction import Prediction
 from framework.reports.table import Row, csv
-from plugins.metric.flight_error.figure import bundle, landing_places
 from plugins.metric.flight_error.landing import Shown
 from plugins.metric.flight_error.metric import DRAWS, FlightError
+from plugins.metric.flight_error.figure import bundle, landing_places
+from framework.flights.frames import PARTS
 
 HERE = Path(__file__).resolve()
 RUNS = ROOT / "outputs" / "ball_flights"
@@ -329,7 +328,7 @@ def write(
         "| method | frozen | in torch | apart |", "|---|---|---|---|", *latencies, "",
         f"{machine('torch', 'numpy')} One thread. Command: `python -m reproduction.chapter4.ball_flights <folder>`.",
     ]  # fmt: skip
-    HERE.with_suffix(".md").write_text("\n".join(text) + "\n", encoding="utf-8")
+    write_page(HERE, text)
     rows = [
         row
         for kind, found in (
@@ -353,6 +352,6 @@ def ratios(found: dict[str, list[Measured]], method: str) -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(committed.rows(HERE.with_suffix(".csv")))
+        drawn(read_rows(HERE.with_suffix(".csv")))
     else:
         main(sys.argv[1] if len(sys.argv) > 1 else None)

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.geometry.clouds import Normalisation
 from framework.reports.table import markdown
 from plugins.encoder.bps.basis import basis
@@ -174,7 +174,7 @@ def main() -> None:
         f"{markdown(stray(clouds), disturbed)}\n\n"
         f"{machine('torch', 'numba')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 

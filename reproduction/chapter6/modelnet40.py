@@ -31,8 +31,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 import framework
-from benchmarks.jobs import processor_seconds, record
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.errors import DataError
@@ -385,7 +385,7 @@ def main() -> None:
         f"{len(rows)} runs took {sum(row['seconds'] for row in rows) / 3600:.1f} hours of one core. "
         f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *boosting)}\n"
     )
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
     sys.stdout.write(text)
 
 

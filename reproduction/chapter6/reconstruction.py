@@ -24,8 +24,7 @@ from matplotlib.ticker import NullFormatter
 from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
-from benchmarks import committed
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
 from framework.geometry.clouds import Normalised, normalised, sizes
@@ -280,12 +279,12 @@ def main() -> None:
         f"{markdown(wide, {'method': 'method', **{f'n{size}': f'n = {size}' for size in CLOUD_SIZES}})}\n\n"
         f"{machine('torch', 'numba', 'scikit-learn')}\n"
     )
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
     sys.stdout.write(text)
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        pictured(*(committed.rows(HERE.with_name(f"reconstruction{part}.csv")) for part in ("", "_time")))
+        pictured(*(read_rows(HERE.with_name(f"reconstruction{part}.csv")) for part in ("", "_time")))
     else:
         main()

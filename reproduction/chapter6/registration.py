@@ -24,8 +24,9 @@ import torch
 from jaxtyping import Float
 
 import framework
-from benchmarks.jobs import by_the_clock, record, settings
-from benchmarks.machine import machine, milliseconds
+from benchmarks.pages import machine, write_page
+from benchmarks.sweeps import by_the_clock, record, settings
+from benchmarks.timing import milliseconds
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.reports.table import format_number
@@ -135,7 +136,7 @@ def main(runs: list[Path], scan: Path | None) -> None:
             picture(runs[0], scan)
             lines += ["", "![A real scan and the mesh registered to it](registration.png)"]
         lines += ["", *table_64(runs)]
-    (HERE / "registration.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_page(__file__, lines)
 
 
 def trained(run: Path, split) -> list[str]:

@@ -17,7 +17,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from benchmarks.rendering.smplpix_flicker import rendered, training
 from framework.configuration.loading import stored
 from framework.configuration.schema import build, resolve
@@ -114,7 +114,7 @@ def main(runs: Sequence[str]) -> None:
         told,
         "",
     ]
-    HERE.with_suffix(".md").write_text("\n".join(text), encoding="utf-8")
+    write_page(HERE, text)
 
 
 def seen_from(people: Sequence[Generated], azimuth: float, size: tuple[int, int]) -> Iterator[Shot]:

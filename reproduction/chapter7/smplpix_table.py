@@ -22,7 +22,8 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.machine import machine, milliseconds
+from benchmarks.pages import machine, write_page
+from benchmarks.timing import milliseconds
 from framework.configuration.loading import load_with_description, reader
 from framework.configuration.schema import build, resolve
 from framework.data import Batch, Data
@@ -140,7 +141,7 @@ def main() -> None:
         carry_out(command)
     torch.set_num_threads(1)
     text = report(given.folders or [FOLDER / name for name in SWEEPS], given.lpips)
-    HERE.with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(HERE, text)
 
 
 def report(folders: Sequence[Path], lpips: str | None) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from framework.configuration.loading import load, load_with_description, reader
 from framework.figures.style import GREEN, GREY, RED, titled_figure
 from reproduction.chapter7 import smplpix_table as table
@@ -204,7 +204,7 @@ def main() -> None:
     record(found)
     draw(found, HERE.with_suffix(".png"))
     sheet(HERE.with_name(HERE.stem + "_people.png"))
-    HERE.with_suffix(".md").write_text(report(found), encoding="utf-8")
+    write_page(HERE, report(found))
 
 
 def report(rows: Record) -> str:

@@ -15,8 +15,7 @@ from typing import Any
 
 import torch
 
-from benchmarks import committed
-from benchmarks.machine import machine
+from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.assembly import build_predictor
 from framework.configuration.description import Description
 from framework.configuration.loading import rebuilt, stored
@@ -155,7 +154,7 @@ def main(runs: list[str]) -> None:
         f"{'; '.join(trained(run) for run in runs)}.",
         "",
     ]
-    HERE.with_suffix(".md").write_text("\n".join(text), encoding="utf-8")
+    write_page(HERE, text)
 
 
 def drawn(rows: Sequence[Row]) -> None:
@@ -180,6 +179,6 @@ def trained(run: str) -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(committed.rows(HERE.with_suffix(".csv")))
+        drawn(read_rows(HERE.with_suffix(".csv")))
     else:
         main(sys.argv[1:])

@@ -26,7 +26,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # before anything starts threads: readers r
 
 import torch
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 from tests.fuzz.damage import Reader, Tally, fuzz, outcome_of, replay, scratch
 from tests.fuzz.damaged_readers import readers
 
@@ -130,7 +130,7 @@ inception_resnet_v2 (218 MB) are left out, since they are read as the weights of
 
 {minutes:.0f} minutes on {machine("numpy", "pillow", "h5py", "torch")}
 """
-    Path(__file__).with_suffix(".md").write_text(text, encoding="utf-8")
+    write_page(__file__, text)
 
 
 if __name__ == "__main__":

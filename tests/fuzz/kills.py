@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.machine import machine
+from benchmarks.pages import machine, write_page
 
 ROOT = Path(__file__).resolve().parents[2]
 ALLOWED = 10.0
@@ -318,7 +318,7 @@ def main() -> None:
             lines += measure(kind, given.kills * len(kind.numbers), draw, Path(folder) / str(index))
             sys.stdout.write("\n".join(lines) + "\n")
             sys.stdout.flush()
-    Path(__file__).with_suffix(".md").write_text(page(lines, given.kills, given.seed), encoding="utf-8")
+    write_page(__file__, page(lines, given.kills, given.seed))
 
 
 def page(lines: Sequence[str], kills: int, seed: int) -> str:

@@ -1,12 +1,16 @@
-"""Times several ways of doing one thing in turn, so that all meet the same machine, and says how far rounds differ."""
+"""Timing: several ways in turn, so that all meet the same machine, how far rounds differ, single calls, first calls."""
 
 import os
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+
+from benchmarks.commands import ROOT
 
 ROUNDS = 5
 BUSY = 0.25
@@ -15,7 +19,7 @@ BUSY = 0.25
 
 @dataclass(frozen=True)
 class Rounds:
-    """Milliseconds of one way, or a ratio of two, a number a round."""
+    """Milliseconds of one way, or ratios of two ways, one number for each round."""
 
     milliseconds: tuple[float, ...]
 
@@ -98,30 +102,43 @@ def others_use(seconds: float = 2.0) -> float:
     return max(0.0, (_busy() - before - (time.process_time() - own)) / seconds)
 
 
-def replace_section(page: Path, heading: str, text: str) -> None:
-    """Replace what stands under a heading of a page, up to the next heading of its level or above.
+def first_calls(script: str, **elsewhere: str) -> tuple[float, float]:
+    """Return the seconds that a script prints in a fresh process: with nothing compiled, and with a full cache.
 
-    Raises:
-        ValueError: the page has no such heading, or several.
+    Args:
+        elsewhere: further environment; the cache of compiled code is in the folder {} of a value.
     """
-    lines = page.read_text(encoding="utf-8").splitlines()
-    places = [number for number, line in enumerate(lines) if line == heading]
-    if len(places) != 1:
-        raise ValueError(f"{page} has {len(places)} lines {heading!r}; wanted one.")
-    level = len(heading) - len(heading.lstrip("#"))
-    first = places[0] + 1
-    ends = (
-        number
-        for number in range(first, len(lines))
-        if lines[number].startswith("#") and len(lines[number].split(" ")[0]) <= level
-    )
-    last = next(ends, len(lines))
-    written = [*lines[:first], "", *text.strip().splitlines(), "", *lines[last:]]
-    page.write_text("\n".join(written).rstrip() + "\n", encoding="utf-8")
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, **{name: value.format(folder) for name, value in elsewhere.items()}}
+        cold, warm = (
+            subprocess.run(
+                [sys.executable, "-c", script],
+                env=environment, cwd=ROOT, check=True, capture_output=True, text=True,
+            ).stdout
+            for _ in range(2)
+        )  # fmt: skip
+    return float(cold), float(warm)
+
+
+def milliseconds(
+    call: Callable[[], object],
+    repeats: int = 300,
+    clock: Callable[[], float] = time.thread_time,
+    warm_up: int = 10,
+) -> float:
+    """Return the median milliseconds of a call after calls to warm up; by default the thread's processor time."""
+    for _ in range(warm_up):
+        call()
+    times = []
+    for _ in range(repeats):
+        start = clock()
+        call()
+        times.append(clock() - start)
+    return 1e3 * median(times)
 
 
 def _busy() -> float:
-    """Seconds of processor time that all processes have had since the machine started."""
+    """Return the processor seconds that all processes have had since the machine started."""
     user, nice, system, *_ = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
     return (int(user) + int(nice) + int(system)) / os.sysconf("SC_CLK_TCK")
 
