@@ -6,11 +6,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from plugins.encoder.bps.symmetric import EQUAL, symmetric_frame
+
 WITHIN = 1 + 1e-6
 """Norm up to which a point of a normalised cloud counts, to rounding: not what a robust normalisation left outside."""
 APART = 1e-9
 """Eigenvalues that differ by less, in units of the largest, are equal: their axes have no derivative. One that is less
 is 0: what is thinner than 3e-5 of its length is flat."""
+
+SKEWED = 1e-6
+"""Skewness from which a third moment tells a direction, of the longest axis; of a shorter one as many times more, since
+coordinates are rounded in units of the longest."""
 
 
 def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> Float[Tensor, "batch 3 3"]:
@@ -18,9 +24,10 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
 
     Axes are the eigenvectors of the second moments about the origin, the longest first. An axis points to where the
     third moment along it is positive; the axis of least skewness, which a mirror plane makes 0, is the one that
-    completes a right-handed frame, so that a cloud with mirror planes has its frame up to its own symmetries. Not
-    determined where two moments are (nearly) equal, as of a cylinder or a cube. Differentiable in the clouds to any
-    order, equal eigenvalues apart.
+    completes a right-handed frame, so that a cloud with mirror planes has its frame up to its own symmetries. Where two
+    moments are equal to rounding, as of a cube, or fewer than two axes are skewed, as where x → -x changes nothing,
+    `symmetric_frame` chooses. Where two moments are nearly equal, as of points drawn on a cylinder, a small change of
+    the cloud turns its axes far. Differentiable in the clouds to any order, equal eigenvalues apart.
 
     Args:
         coordinates: about the origin; rows of NaN are padding.
@@ -44,6 +51,13 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
     weakest = skewness.abs().argmin(-1, keepdim=True)
     handedness = torch.linalg.det(axes).sign()[:, None]
     axes = axes * torch.ones_like(direction).scatter(-1, weakest, handedness)[:, None]
+    tiny = torch.finfo(torch.float64).tiny
+    skewed = skewness.abs() > SKEWED * (values[:, :1] / values.clamp(min=tiny)).sqrt()
+    equal = values[:, :-1] - values[:, 1:] <= EQUAL * values[:, :1]
+    equal &= values[:, 1:] > APART * values[:, :1]
+    for number in ((skewed.sum(1) < 2) | equal.any(1)).nonzero()[:, 0].tolist():
+        cloud = points[number].detach()[inside[number, :, 0]]
+        axes[number] = symmetric_frame(cloud, axes[number], skewed[number], equal[number])
     if not second.requires_grad:
         return axes
     return Axes.apply(second, values, axes)[1]  # type: ignore[index]

@@ -387,6 +387,59 @@ def test_no_rotation_of_any_shape_changes_its_code(name, seed, dtype):
     torch.testing.assert_close(found, found[:1].expand_as(found), rtol=0, atol=limit)
 
 
+def copies(group, count, stretch=(1.0, 1.0, 1.0), mirrored=False):
+    """Points that nothing distinguishes but for a symmetry group of rotations, and x → -x where that is asked for."""
+    points = (numbers(count, 3).abs() - 0.3) * torch.tensor(stretch, dtype=torch.float64)
+    turns = torch.from_numpy(Rotation.create_group(group).as_matrix())
+    cloud = torch.cat([points @ turn.T for turn in turns])
+    return torch.cat([cloud, -cloud]) if mirrored else cloud
+
+
+def lattice(stretch):
+    """A ball of lattice points, stretched to an ellipsoid."""
+    axis = torch.linspace(-1, 1, 9, dtype=torch.float64)
+    points = torch.cartesian_prod(axis, axis, axis)
+    return points[points.norm(dim=1) <= 1 + 1e-9] * torch.tensor(stretch, dtype=torch.float64)
+
+
+CORNERS = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+SYMMETRIC = {
+    "cube": CORNERS,
+    "lattice in a cube": torch.cartesian_prod(*[torch.linspace(-1, 1, 6, dtype=torch.float64)] * 3),
+    "octahedron": torch.cat([torch.eye(3), -torch.eye(3)]).double(),
+    "tetrahedron": CORNERS[CORNERS.prod(1) > 0],
+    "square": CORNERS[CORNERS[:, 2] > 0] * torch.tensor([1.0, 1, 0]).double(),
+    "ball": lattice((1, 1, 1)),
+    "spheroid": lattice((2, 1, 1)),
+    "flat spheroid": lattice((2, 2, 1)),
+    "ellipsoid": lattice((3, 2, 1)),
+    "x → -x": copies("C1", 100, (3, 2, 1), mirrored=True),
+    "a half turn": copies("C2", 20, (1, 2, 3)),
+    "a third of a turn": copies("C3", 20, (1, 1, 3)),
+    "a dihedral group": copies("D4", 20),
+    "turns of a tetrahedron": copies("T", 5),
+    "turns of a cube": copies("O", 7),
+    "turns of a cube, x → -x": copies("O", 7, mirrored=True),
+    "turns of an icosahedron": copies("I", 4),
+}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", SYMMETRIC)
+def test_symmetric_clouds_have_one_code_whatever_their_rotation(name, dtype):
+    """Where second or third moments determine no axes; and whatever the order of the points."""
+    cloud = SYMMETRIC[name]
+    turned = torch.cat([cloud[None], cloud @ rotations(30, 1)]).to(dtype)
+    order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))
+    made = prepared(basis("ball_uniform", 64, 1.0, 13).to(dtype))
+    found = encode(torch.cat([turned, turned[:, order]]), made, rotation_invariant=True)
+    assert found.frame is not None
+    torch.testing.assert_close(torch.linalg.det(found.frame), torch.ones(62).double())
+    distance = found.features["distance"]
+    limit = 1e-5 if dtype == torch.float32 else 1e-12
+    torch.testing.assert_close(distance, distance[:1].expand_as(distance), rtol=0, atol=limit)
+
+
 @pytest.mark.parametrize("name", FLAT + EVEN + THICK)
 def test_a_mirror_image_is_another_shape_where_no_rotation_leads_to_it(name):
     cloud = shape(name)
