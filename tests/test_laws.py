@@ -3,8 +3,12 @@
 import ast
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parent.parent
 CORE = sorted((ROOT / "framework").rglob("*.py"))
@@ -78,6 +82,79 @@ def test_imports_are_written_in_full() -> None:
                 yield node.lineno
 
     assert not faults(CORE + PLUGINS, relative)
+
+
+CIRCLES = {
+    frozenset({"framework.testing.calibration", "framework.testing.wrappers"}),
+    frozenset(f"framework.testing.{name}" for name in ("gradients", "heads", "precision", "units")),
+    frozenset(f"plugins.data.bodies.{name}" for name in ("pose_error", "pose_picture")),
+}
+"""Modules that still import each other. A circle that is opened is taken out here; none may be added."""
+
+
+def modules_of(folder: Path) -> dict[str, Path]:
+    """Return the files below `folder` by the names of their modules."""
+    files: dict[str, Path] = {}
+    for top in ("framework", "plugins", "hydra_plugins"):
+        for path in sorted((folder / top).rglob("*.py")):
+            parts = path.relative_to(folder).with_suffix("").parts
+            files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return files
+
+
+def imported(path: Path, modules: Collection[str]) -> Iterator[str]:
+    """Yield the modules that a file imports, also within functions; not what only type checkers import."""
+    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            waiting += node.orelse
+            continue
+        waiting += ast.iter_child_nodes(node)
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules)
+        elif isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                if full in modules or node.module in modules:
+                    yield full if full in modules else str(node.module)
+
+
+def circles(folder: Path) -> set[frozenset[str]]:
+    """Return the largest groups of modules each of which leads to each other by imports."""
+    modules = modules_of(folder)
+    number = {name: index for index, name in enumerate(modules)}
+    pairs = [
+        (number[name], number[other]) for name, path in modules.items() for other in imported(path, modules)
+    ]
+    start, end = np.array(pairs, int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(pairs)), (start, end)), shape=(len(number),) * 2)
+    groups = connected_components(graph, connection="strong")[1]
+    found = (
+        frozenset(name for name, index in number.items() if groups[index] == group) for group in set(groups)
+    )
+    return {names for names in found if len(names) > 1}
+
+
+def test_modules_import_each_other_in_no_circle() -> None:
+    assert circles(ROOT) == CIRCLES
+
+
+def test_a_circle_is_found_wherever_the_import_stands(tmp_path: Path) -> None:
+    room = tmp_path / "framework" / "room"
+    room.mkdir(parents=True)
+    (tmp_path / "framework/__init__.py").touch()
+    (room / "__init__.py").write_text("def late():\n    from framework.room import first\n")
+    (room / "first.py").write_text("from framework.room.second import some\n")
+    (room / "second.py").write_text("import framework.room.first\nfrom framework.room.third import some\n")
+    (room / "third.py").write_text(
+        "from typing import TYPE_CHECKING\n\nif TYPE_CHECKING:\n    from framework.room.first import some\n"
+    )
+    assert circles(tmp_path) == {frozenset({"framework.room.first", "framework.room.second"})}
+    (room / "third.py").write_text("def late():\n    from framework.room import some\n")
+    assert circles(tmp_path) == {
+        frozenset({"framework.room", *(f"framework.room.{name}" for name in ("first", "second", "third"))})
+    }
 
 
 def test_the_contracts_checks_are_for_rows_and_tests() -> None:

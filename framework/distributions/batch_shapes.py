@@ -23,7 +23,6 @@ from framework.distributions.protocol import (
     median,
     normals,
     peaks,
-    pick,
     scales,
     slope,
     tempered,
@@ -349,21 +348,3 @@ def _stacked(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:
 
 def _folded(found: Tensor | None, shape: torch.Size) -> Tensor | None:
     return None if found is None else found.reshape(shape)
-
-
-@pick.register
-def _(density: Reshaped, index: Tensor) -> Distribution:
-    """The same items of the inner density, whose batch is one line of them then: nothing is drawn and thrown away."""
-    from framework.distributions.density import Mixture  # which stands above
-
-    inner = density.density
-    # a mixture draws of all its items to pick from each, which here would be those of the whole batch every time
-    if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
-        return pick.dispatch(Distribution)(density, index)
-    # items in the order of (*batch, K): the item of batch place b and component k is b·K + k
-    lead = index.shape[: index.dim() - len(density.batch_shape) + 1]
-    count = density.batch_shape[-1]
-    first = torch.arange(density.batch_shape[:-1].numel(), device=index.device) * count
-    items = first.reshape(density.batch_shape[:-1]) + index
-    # `pick` reads the last batch dimension as the components: one line of them has no other dimension
-    return Reshaped(pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, circular, grid
 from framework.distributions.description import one_line
 from framework.distributions.highest import crossings, highest
@@ -325,6 +326,22 @@ def _(density: Mixture, value: Tensor) -> Slope | None:
 @pick.register
 def _(density: Mixture, index: Tensor) -> Distribution:
     return PickedMixture(density.log_weights, density.components, index, density.rows)
+
+
+@pick.register
+def _(density: Reshaped, index: Tensor) -> Distribution:
+    """The same items of the inner density, whose batch is one line of them then: nothing is drawn and thrown away."""
+    inner = density.density
+    # a mixture draws of all its items to pick from each, which here would be those of the whole batch every time
+    if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
+        return pick.dispatch(Distribution)(density, index)
+    # items in the order of (*batch, K): the item of batch place b and component k is b·K + k
+    lead = index.shape[: index.dim() - len(density.batch_shape) + 1]
+    count = density.batch_shape[-1]
+    first = torch.arange(density.batch_shape[:-1].numel(), device=index.device) * count
+    items = first.reshape(density.batch_shape[:-1]) + index
+    # `pick` reads the last batch dimension as the components: one line of them has no other dimension
+    return Reshaped(pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))
 
 
 @peaks.register

@@ -15,11 +15,10 @@ from torch import Tensor
 
 from framework.errors import DataError
 from framework.geometry.clouds import filled
+from framework.geometry.nearest.exponents import MOST
 
 OFTEN = 2**16
 """Queries up to which packing them well takes less than a second."""
-MOST = {torch.float32: 126, torch.float64: 1000}
-"""Exponents of two up to which a power is finite, and its inverse too."""
 
 
 class Nearest(NamedTuple):

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.geometry.clouds import filled
-from framework.geometry.nearest import MOST
+from framework.geometry.nearest.exponents import MOST
 
 PAIRS = 2**24
 """Squared distances held at a time: three arrays of this size, 192 MiB in float32."""
