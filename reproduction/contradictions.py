@@ -1,4 +1,4 @@
-"""Why our figures contradict some of the thesis's claims: what is suspected is changed, and the runs are made again.
+"""Remove the suspected cause of each contradicted claim and run its models again.
 
     python -m reproduction.thesis_tables            (first: it is compared with their runs)
     python -m reproduction.contradictions
@@ -250,7 +250,7 @@ def main() -> None:
         told = [sys.executable, "-m", "framework", "-m", *part.words, *COMMON]
         carry_out([*told, "hydra.launcher.jobs=2", f"hydra.sweep.dir={FOLDER / part.sweep}"])
     text = (
-        "# What contradicts the thesis, with the suspected cause changed (synthetic data)\n\n"
+        "# Contradicted claims, with the suspected cause removed (synthetic data)\n\n"
         "`python -m reproduction.contradictions`. Numbers of the claims in [claims.md](claims.md), which draws the "
         "conclusions; rows without a change are the runs of [its tables](thesis_tables.md).\n\n"
         + "\n".join(section(part) for part in PARTS)

@@ -1,4 +1,4 @@
-"""Tables 2.1, 3.1 to 3.3, 6.1 to 6.4 and Figures 3.7, 3.8 of the thesis from one command, as pages in this folder:
+"""Make Tables 2.1, 3.1 to 3.3, 6.1 to 6.4 and Figures 3.7 and 3.8 of the thesis with one command.
 
     python -m reproduction.thesis_tables [2.1 3.3 ...] [--seeds 5] [--jobs 2] [--bfloat16]
 

@@ -1,4 +1,4 @@
-"""Objects of airborne laser scans (DALES, real data): five-fold cross-validation of BPS-MLP.
+"""Classify objects of airborne laser scans (DALES, real data): five-fold cross-validation of BPS-MLP.
 
     python -m framework -m experiment=dales/bps_mlp data.root=/path/to/dales500.npz data.fold=0,1,2,3,4 \\
         pictures=false logger=none hydra.sweep.dir=outputs/sweeps/dales

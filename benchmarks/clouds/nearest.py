@@ -1,4 +1,6 @@
-"""Nearest neighbours of a basis in clouds, against public libraries, on one core: python -m benchmarks.clouds.nearest
+"""Time exact nearest neighbours of a basis in clouds against public libraries, on one core.
+
+    python -m benchmarks.clouds.nearest [--stream]
 
 Writes nearest.md beside this file. Clouds are synthetic but for `scan`, points of a real scan drawn again with jitter
 (REAL_DATA_ROOT/clouds/demo_scan.ply; left out where that is missing). Every method builds its structure for each cloud
@@ -322,10 +324,10 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
     times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
     return (
         f"# A cloud of {total:,} points in chunks of {size:,}\n\n`python -m benchmarks.clouds.nearest --stream`: a "
-        "synthetic "
-        f"torus, {basis_points:,} basis points, one core. Processor time: {times}. Peak memory {peak / 2**10:.0f} MiB, "
-        f"of which {base / 2**10:.0f} MiB before the first chunk was read (libraries and one chunk); all points would "
-        f"be {12 * total / 2**20:.0f} MiB. Centre {[round(x, 4) for x in middle.mean.tolist()]}, largest norm "
+        f"synthetic torus, {basis_points:,} basis points, one core. Processor time: {times}. Peak memory "
+        f"{peak / 2**10:.0f} MiB, of which {base / 2**10:.0f} MiB before the first chunk was read (libraries and one "
+        f"chunk); all points would be {12 * total / 2**20:.0f} MiB. Centre "
+        f"{[round(x, 4) for x in middle.mean.tolist()]}, largest norm "
         f"{reach.norm:.4f}, mean distance {float(found.distance.mean()):.6f}.\n\n{machine('numba', 'torch')}\n"
     )
 

@@ -1,4 +1,4 @@
-"""How far the codes of one shape are apart, with and without `rotation_invariant`.
+"""Measure how far encodings of one shape are apart, with and without `rotation_invariant`.
 
     python -m benchmarks.clouds.rotation
 
@@ -80,10 +80,10 @@ def main() -> None:
         "other": "median: nearest other shape",
     }
     text = (
-        f"# How far codes are apart\n\n{len(CLASSES) * MODELS} generated shapes (synthetic data), {BASIS} basis "
-        "points, float32; root mean square difference of the distances (eq. 6.4) of two clouds, in units of the "
-        "normalised cloud. Axes are not determined where two moments are nearly equal, as of round or square things: "
-        f"of those shapes two samples of one surface are more than {LIMIT:g} apart.\n\n"
+        f"# Distances between encodings of one shape\n\n{len(CLASSES) * MODELS} generated shapes (synthetic data), "
+        f"{BASIS} basis points, float32; root mean square difference of the distances (eq. 6.4) of two clouds, in "
+        "units of the normalised cloud. Axes are not determined where two moments are nearly equal, as of round or "
+        f"square things: of those shapes two samples of one surface are more than {LIMIT:g} apart.\n\n"
         f"{markdown(rows, columns)}\n{machine('torch', 'numba')}\n"
     )
     write_page(__file__, text)

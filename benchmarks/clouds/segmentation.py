@@ -1,4 +1,4 @@
-"""Parts of bodies, point by point, from the code of the whole cloud (thesis §8.2).
+"""Recognise body parts, point by point, from the encoding of the whole cloud (thesis §8.2).
 
     python -m benchmarks.clouds.segmentation
 

@@ -1,4 +1,4 @@
-"""A training step of networks for sets: through the points that attain a maximum, and through every point.
+"""Time a training step of networks for sets, with the points that attain a maximum and with every point.
 
     python -m benchmarks.clouds.set_steps
 

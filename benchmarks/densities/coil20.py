@@ -1,4 +1,4 @@
-"""Real objects on a turntable, learnt every 20° and tested in between, as a committed table.
+"""Predict angles of real objects on a turntable, trained on views every 20° and tested in between.
 
     python -m framework -m experiment=coil20/von_mises,coil20/mixture data.root=/path/to/COIL20 seed=0,1,2 threads=1 \\
         hydra.sweep.dir=outputs/sweeps/coil20
@@ -39,7 +39,7 @@ def main() -> None:
     rows.sort(key=lambda row: (order.index(row["objects"]), row["method"] != "von_mises", row["seed"]))
     compared = aggregate(rows, by=["objects", "method"])
     text = (
-        "# COIL-20: real views between those learnt\n\n"
+        "# COIL-20: real views between the training views\n\n"
         "20 objects, 18 training views each (every 20°), 36 test views each, 5° from the nearest learnt one; "
         "32 × 32 pixels, `biternion_vgg`, 200 epochs on views interpolated by a periodic cubic spline. ± is the "
         "standard deviation over seeds. `look-alikes` are the 8 objects whose training views half a turn apart are "

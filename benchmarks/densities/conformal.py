@@ -1,4 +1,6 @@
-"""What prediction sets cover and how large they are: python -m benchmarks.densities.conformal
+"""Measure coverage and size of conformal prediction sets.
+
+    python -m benchmarks.densities.conformal
 
 Every figure is a mean over 200 random splits of one pool of 2000 samples, half of it for validation, from which the
 wrapper leaves half to what it wraps. The models are fixed and badly calibrated on purpose: a classifier of two moons
@@ -157,11 +159,10 @@ def main() -> None:
     text = (
         "# Conformal prediction sets: coverage and size\n\n"
         f"`python -m benchmarks.densities.conformal`: means over {SPLITS} random splits of {POOL} samples (half "
-        "validation, of "
-        "which the wrapper's own half gives the threshold); fixed models, badly calibrated on purpose; size over the "
-        "first 10 splits. `spread` is the standard deviation over splits, about 1.6 % where 500 scores and 1000 "
-        "targets are drawn at 90 %. `model's own` is the coverage of the model's region of that mass without any "
-        "calibration. Synthetic data.\n\n"
+        "validation, of which the wrapper's own half gives the threshold); fixed models, badly calibrated on "
+        "purpose; size over the first 10 splits. `spread` is the standard deviation over splits, about 1.6 % where "
+        "500 scores and 1000 targets are drawn at 90 %. `model's own` is the coverage of the model's region of that "
+        "mass without any calibration. Synthetic data.\n\n"
         "| data, unit of size | model | wrappers | score | promised | covered | spread | model's own | mean size |\n"
         "|---|---|---|---|---:|---:|---:|---:|---:|\n" + "\n".join(rows) + "\n\n"
         f"{machine('torch', 'scikit-learn')}\n"

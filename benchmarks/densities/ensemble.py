@@ -1,4 +1,6 @@
-"""Ten small networks trained side by side against one after the other: python -m benchmarks.densities.ensemble
+"""Time ten small networks that are trained side by side and one after the other.
+
+    python -m benchmarks.densities.ensemble
 
 On the two moons (synthetic), two threads. Times of whole trainings, alternating in one process, as a bare PyTorch loop
 and through the framework's Trainer; then whether members become what they become alone, and whether their test NLLs
@@ -184,8 +186,8 @@ def main() -> None:
     text = (
         "# Ensembles: ten networks side by side against one after the other (synthetic data)\n\n"
         f"`python -m benchmarks.densities.ensemble`: `mlp` + `bernoulli` on `moons` ({len(fields['target'])} training "
-        "points), "
-        f"Adam, batches of {BATCH}, {EPOCHS} epochs, two threads; seconds of a whole training of {MEMBERS} networks, "
+        f"points), Adam, batches of {BATCH}, {EPOCHS} epochs, two threads; seconds of a whole training of {MEMBERS} "
+        "networks, "
         f"median of {ROUNDS} alternating rounds.\n\n" + "\n".join(lines) + "\n\n"
         "**The same for given seeds.** Largest difference of p(y|x) on 5000 test points between a member (128-128) and "
         "the same network trained alone from the same start on the same batches, after the training: "

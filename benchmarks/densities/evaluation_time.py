@@ -1,4 +1,6 @@
-"""What judging a prediction costs, by kind of density: `python -m benchmarks.densities.evaluation_time`.
+"""Time every metric on every kind of density.
+
+    python -m benchmarks.densities.evaluation_time
 
 Writes evaluation_time.md beside this file; some minutes on one core.
 """
@@ -124,7 +126,7 @@ def main() -> None:
     torch.set_num_threads(1)
     text = "\n".join(
         [
-            "# What judging a prediction costs",
+            "# Run time of metrics, by kind of density",
             "",
             f"Milliseconds a sample in batches of {BATCH}, float32, one thread, median of seven calls (of one that "
             "takes half a second); densities of drawn raw numbers, targets drawn from them.",

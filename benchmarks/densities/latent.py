@@ -1,4 +1,4 @@
-"""Work-precision curves of log-likelihoods that are integrals over a latent variable, on a toy known by quadrature.
+"""Measure error against run time of log-likelihoods that are integrals over a latent variable.
 
     python -m benchmarks.densities.latent
     python -m benchmarks.densities.latent --draw
@@ -348,10 +348,9 @@ def main() -> None:
     text = (
         "# Log-likelihoods that are integrals over a latent variable\n\n"
         "`python -m benchmarks.densities.latent`: heads trained briefly (same MLP encoder) on a synthetic toy, two "
-        "von Mises "
-        f"whose modes, widths and weights move with x; {ITEMS} test samples, {SEEDS} seeds, one thread. Errors are "
-        "root mean squares against the head's own integral by quadrature; the last error is the mean negative "
-        "log-likelihood above that of the truth, on the same samples. `lattice`: randomised "
+        f"von Mises whose modes, widths and weights move with x; {ITEMS} test samples, {SEEDS} seeds, one thread. "
+        "Errors are root mean squares against the head's own integral by quadrature; the last error is the mean "
+        "negative log-likelihood above that of the truth, on the same samples. `lattice`: randomised "
         "quasi-Monte-Carlo points of the framework; `independent`: plain Monte Carlo. "
         "All values: `latent.csv`; picture: `latent.png`.\n\n"
         f"{table.markdown(shown, COLUMNS)}\n\n"

@@ -1,4 +1,4 @@
-"""How much less than independent points three sequences scatter, for benchmarks/densities/latent.py."""
+"""Variance of three quasi-random sequences relative to independent points, for `latent.py`."""
 
 from collections.abc import Callable
 

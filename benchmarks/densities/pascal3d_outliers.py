@@ -1,4 +1,4 @@
-"""Uncertainty wrappers on viewpoints, and how well they tell another object class from the one trained on (synthetic).
+"""Compare how well uncertainty wrappers on viewpoints recognise objects of another class (synthetic).
 
     python -m framework -m trainer.max_epochs=20 threads=1 hydra.sweep.dir=outputs/sweeps/outliers \\
         experiment=pascal3d_outliers/plain,...   (all of conf/experiment/pascal3d_outliers but base)
@@ -41,7 +41,7 @@ def main() -> None:
             kept["method"] = f"outlier_exposure, λ = {weight:g}"
         rows.append({**kept, "synthetic": found["synthetic"]})
     text = (
-        "# Viewpoints of cars, and bottles that are none (synthetic data)\n\n"
+        "# Viewpoints of cars, with bottles as outliers (synthetic data)\n\n"
         "Mixtures of von Mises densities, `biternion_vgg`, 20 epochs, one seed: small differences mean nothing. "
         "Trained on cars; outliers of the test are bottles, those of `outlier_exposure`'s training sofas. AUROC by the "
         "entropy of the joint density of three angles. ± is the standard error over test images. Commands in "

@@ -1,4 +1,4 @@
-"""Accuracy and speed of the von Mises functions, written beside this file.
+"""Measure accuracy and speed of the von Mises functions.
 
 python -m benchmarks.densities.von_mises
 """

@@ -1,4 +1,4 @@
-"""SciPy's solvers on a ball that lands on an ever harder table, against 50 digits: error, evaluations and time.
+"""Compare SciPy's solvers on a ball that lands on ever harder tables: error against 50 digits, evaluations and time.
 
     python -m benchmarks.flights.ball_stiffness
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks.pages import machine, write_page
 from framework.figures.style import COLOURS, MARKERS, titled_figure
-from plugins.data.table_tennis.closed_form import landing
 from framework.flights.physics import Constants
+from plugins.data.table_tennis.closed_form import landing
 from plugins.data.table_tennis.contact import Spring
 from plugins.data.table_tennis.solvers import EXPLICIT, METHODS, SolverGaveUp, flight
 

@@ -1,4 +1,6 @@
-"""What the contract of density heads is worth: python -m benchmarks.framework.check [seeds, 50 by default] [more]
+"""Count the planted faults that the contract of density heads finds, and its false alarms.
+
+    python -m benchmarks.framework.check [seeds, 50 by default] [more]
 
 Finds the planted faults of tests/planted_faults.py and tests/planted_questions.py, and counts false alarms: every row
 of every head that is shipped, and the right heads of tests/right_heads.py, over seeds of everything that is drawn.

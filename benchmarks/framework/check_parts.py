@@ -1,4 +1,4 @@
-"""What contracts of other parts are worth.
+"""Count the planted faults that contracts of other parts find, and their false alarms.
 
     python -m benchmarks.framework.check_parts GROUP [seeds, 20 by default] [names ...]
 

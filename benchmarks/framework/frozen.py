@@ -1,4 +1,6 @@
-"""What freezing a trained model gains on one core: python -m benchmarks.framework.frozen
+"""Time frozen models against eager ones on one core.
+
+    python -m benchmarks.framework.frozen
 
 The thesis's classifier of basis point sets (512-400-400-40, batch norm, dropout), alone and with its encoder on clouds
 of 2048 points: the predictor in torch without gradient, other ways to deploy it, and deployment.frozen, one after the
@@ -129,9 +131,9 @@ def main() -> None:
     text = (
         "# Frozen models: eager against deployable, one core\n\n"
         "`python -m benchmarks.framework.frozen`: 512-400-400-40 with batch norm and dropout, 40 classes; clouds of "
-        "2048 points, "
-        f"512 basis points. Least processor time of a call in each of {ROUNDS} rounds, their median; ratios to the "
-        "first line of each block. Frozen probabilities are the predictor's to 1e-6, checked in the run.\n\n"
+        f"2048 points, 512 basis points. Least processor time of a call in each of {ROUNDS} rounds, their median; "
+        "ratios to the first line of each block. Frozen probabilities are the predictor's to 1e-6, checked in the "
+        "run.\n\n"
         "| what | batch | how | ms / call | ms / sample | times as fast |\n|---|---|---|---|---|---|\n"
         + "\n".join(lines)
         + f"\n\nFreezing takes {freezing:.1f} s: the exporter's import, and compiled functions from their cache.\n\n"

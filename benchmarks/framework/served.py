@@ -1,4 +1,6 @@
-"""How long the first request to a served model takes: python -m benchmarks.framework.served
+"""Time the first and later requests to a served model.
+
+    python -m benchmarks.framework.served
 
 Starts the server that `mlflow models serve` runs, asks it once and ten times more, and ends it; several starts of each
 model, which are trained here first on small generated data. Writes served.md beside this file.
@@ -123,9 +125,7 @@ def main() -> None:
     head = (
         "# Served models: the first request against later ones\n\n"
         f"`python -m benchmarks.framework.served`: one file a request; medians of {STARTS} starts of the server, of "
-        "later "
-        f"requests "
-        f"the median of {LATER} in each.\n\n"
+        f"later requests the median of {LATER} in each.\n\n"
         "| data | s until it listens | first, ms | later, ms | ratio |\n|---|---|---|---|---|\n"
     )
     text = f"{head}{chr(10).join(lines)}\n\n{machine('torch', 'mlflow', 'uvicorn')}\n"

@@ -1,4 +1,6 @@
-"""What a training step costs above bare PyTorch loops: python -m benchmarks.framework.step_overhead
+"""Time a training step against bare PyTorch loops.
+
+    python -m benchmarks.framework.step_overhead
 
 All loops run the same batches, fused optimiser and gradient clipping, in turn in one process. One bare loop trains this
 framework's model, the other the same network and loss written in plain torch. Writes step_overhead.md beside this file.

@@ -1,4 +1,6 @@
-"""What the start of a job costs a sweep: python -m benchmarks.framework.sweep_start
+"""Time the start of a sweep's jobs, as forks and as fresh processes.
+
+    python -m benchmarks.framework.sweep_start
 
 The same sweep of runs as short as can be, each job a fork of one process or a process of its own, in turns. Processor
 time is of the whole command, all processes. Writes sweep_start.md beside this file.
@@ -73,8 +75,7 @@ def main() -> None:
             "# The start of a sweep's jobs",
             "",
             f"`python -m benchmarks.framework.sweep_start`: {JOBS} jobs, {AT_ONCE} at once, `{' '.join(RUNS)}`; "
-            "medians of "
-            f"{ROUNDS} sweeps, in turns. On Linux jobs are forks of a process that has imported torch and "
+            f"medians of {ROUNDS} sweeps, in turns. On Linux jobs are forks of a process that has imported torch and "
             "Lightning (`hydra.launcher.fork`); a job's own seconds leave that process out, the command's do not.",
             "",
             "| jobs are | command, s | processors, s | a job, processor s |",

@@ -1,4 +1,4 @@
-"""A body's pose from a picture, by descent through the rasteriser's three gradients: 100 starts each.
+"""Fit a body's pose to an image by gradient descent through the rasteriser, with three gradients and 100 starts each.
 
     OMP_NUM_THREADS=1 python -m benchmarks.pose.fit_pose                 # all three, some 50 minutes
     OMP_NUM_THREADS=1 python -m benchmarks.pose.fit_pose measure soft    # one of them; what is done is kept in outputs/

@@ -170,7 +170,7 @@ def report(tables: Mapping[Name, dict[str, Tensor]]) -> str:
 def main() -> None:
     truth = Truth()
     tables: dict[Name, dict[str, Tensor]] = {name: measured(truth, name) for name in TOPOLOGIES}
-    text = f"""# Registered people, posed and shaped anew
+    text = f"""# Registered people in new poses and shapes
 
 {PEOPLE} synthetic people of random shape in an A-pose, registered as `human_scans` has them; pose and shape are found
 from the vertices alone. Each is then posed in {POSES} random poses, and shaped by two standard deviations along the

@@ -1,4 +1,4 @@
-"""Whether each pixel is covered once, written beside this file.
+"""Count pixels of a surface that are covered by no triangle or by several.
 
 python -m benchmarks.rendering.rasterizer_coverage
 """

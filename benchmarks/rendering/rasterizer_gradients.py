@@ -1,4 +1,4 @@
-"""The rasteriser's four gradients against differences of a supersampled picture, and what they cost.
+"""Compare the rasteriser's four gradients with differences of a supersampled image, and time them.
 
     python -m benchmarks.rendering.rasterizer_gradients
 

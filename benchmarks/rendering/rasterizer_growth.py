@@ -1,4 +1,4 @@
-"""How a picture's time grows with faces and with pixels, for benchmarks/rendering/rasterizer.py.
+"""Time of an image against its faces and pixels, for `rasterizer.py`.
 
     python -m benchmarks.rendering.rasterizer_growth --draw
 

@@ -1,4 +1,4 @@
-"""Peak memory of a picture and its gradient, written beside this file.
+"""Measure the peak memory of an image and its gradient.
 
 python -m benchmarks.rendering.rasterizer_memory
 """

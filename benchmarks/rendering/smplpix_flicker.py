@@ -1,4 +1,4 @@
-"""How much pictures of a walking person flicker: mesh, trained network and photographs; and the network's rate.
+"""Measure the temporal stability (flicker) of images of a walking person: mesh, trained network, photographs.
 
     python -m framework experiment=smplpix/quick
     python -m benchmarks.rendering.smplpix_flicker <run> <walk.bvh>
@@ -185,7 +185,7 @@ def report(run: str, file: Path) -> str:
     rate = rates(run, scenes[0])
     return "\n".join(
         [
-            "# Flicker of a walk (synthetic people)",
+            "# Temporal stability (flicker) of a walking person (synthetic people)",
             "",
             f"The network: {training(run)}",
             "",

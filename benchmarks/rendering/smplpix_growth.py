@@ -1,4 +1,4 @@
-"""How a picture's time grows with its mesh: rasterised, and painted by networks over projected vertices.
+"""Time images against the vertices of their mesh: rasterised, and drawn by networks from projected vertices.
 
     python -m benchmarks.rendering.smplpix_growth
     python -m benchmarks.rendering.smplpix_growth --draw
@@ -104,7 +104,7 @@ def report(picture: Path) -> str:
     ]
     return "\n".join(
         [
-            "# Time of a picture against the vertices of its mesh",
+            "# Run time of an image against the vertices of its mesh",
             "",
             f"The default body (synthetic colours), {SIZE[0]} × {SIZE[1]} pixels, of which it covers {covered:.0%}; "
             f"one thread; processor time, the lowest of {ROUNDS} medians, all in turn, ms. Networks compute the "

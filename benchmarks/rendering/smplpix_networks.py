@@ -268,7 +268,7 @@ def report() -> str:
     below = networks["unet"].numbers["psnr_db"] - networks["slim"].numbers["psnr_db"]
     return "\n".join(
         [
-            "# unet and slim: milliseconds a picture (synthetic people)",
+            "# unet and slim: milliseconds an image (synthetic people)",
             "",
             FRAMES,
             "",

@@ -1,4 +1,4 @@
-"""Lorentzian lines in a real brain slice: SciPy, batched least squares, a network, and least squares from its answer.
+"""Fit Lorentzian lines in a real brain slice: SciPy, batched least squares, a network, and a fit that starts from it.
 
     for seed in 0 1 2; do python -m framework experiment=cest/mlp data.root=/path/to/brain7T.mat seed=$seed threads=1 \\
         pictures=false logger=none hydra.run.dir=outputs/cest/$seed; done
@@ -28,16 +28,16 @@ from framework.distributions.protocol import marginal
 from framework.figures.style import BLUE, GREEN, GREY, RED, saved, titled_figure
 from framework.model import Predictor
 from framework.reports.table import Row, csv, markdown
+from framework.spectra.fit import fit
+from framework.spectra.spectrum import COUNT, spectrum
 from framework.target import Target
 from plugins.data.cest.data import CEST
-from framework.spectra.fit import fit
-from plugins.density_head.lorentzian.head import LorentzianHead
 from plugins.data.cest.maps import maps_of, slice_of
 from plugins.data.cest.maps_picture import pictured
-from plugins.uncertainty.refined.wrapper import Refined
-from framework.spectra.spectrum import COUNT, spectrum
 from plugins.data.cest.volumes import read_volume
+from plugins.density_head.lorentzian.head import LorentzianHead
 from plugins.uncertainty.conformal.wrapper import Conformal
+from plugins.uncertainty.refined.wrapper import Refined
 
 HERE = Path(__file__).with_suffix("")
 STEPS = (1, 2, 3, 4, 5, 6, 8, 12, 300)

@@ -1,4 +1,4 @@
-"""SciPy's least squares of Z-spectra one after another, as fast as NumPy lets it be, against all of them at once."""
+"""SciPy's least squares of one Z-spectrum after another, in lean NumPy, against all of them at once."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Table 2.1 on the two moons (synthetic): every row with five seeds, error and run time; Figures 2.3 and 2.4.
+"""Make Table 2.1 on the two moons (synthetic), with errors and run times of five seeds, and Figures 2.3 and 2.4.
 
     python -m reproduction.thesis_tables 2.1
 
@@ -275,13 +275,12 @@ def main() -> None:
     text = (
         "# Table 2.1: uncertainty on the two moons (synthetic data)\n\n"
         f"{len(rows)} runs, {took:.0f} processor minutes: "
-        "`python -m reproduction.thesis_tables 2.1`. "
-        "A seed draws data and weights; all methods of a seed have the same data, 5000 test points. ± is the standard "
-        "deviation over seeds. Run times on one thread, in batches of 100, each "
-        "model alone. Epochs, batches and learning rate were chosen such that the two vanilla rows over-fit "
-        "as the thesis's do, the last row's settings on other draws of the generator, after a first "
-        "combination (5 networks, no dropout, λ = 1) had been short of the table's best rows on the test split by "
-        "0.0002 (Brier) and 0.002 (OOD entropy).\n\n"
+        "`python -m reproduction.thesis_tables 2.1`. A seed draws data and weights; all methods with the same seed "
+        "have the same data and 5000 test points. ± is the standard deviation over seeds. Run times are measured on "
+        "one thread, in batches of 100, each model alone. Epochs, batches and learning rate were chosen such that "
+        "the two vanilla rows overfit as in the thesis. The settings of the last row were chosen on other draws of "
+        "the generator, after a first combination (5 networks, no dropout, λ = 1) missed the best rows of the table "
+        "on the test split by 0.0002 (Brier) and 0.002 (OOD entropy).\n\n"
         f"{markdown(compared, COLUMNS, better=BETTER)}\n\n{best_possible(seeds)}\n\n"
         f"What Figure 2.3 shows, in numbers: the test points where the generator's posterior of one class is above "
         f"{SURE}, those where no class's is above {UNSURE}, and how many points are predicted with neither "

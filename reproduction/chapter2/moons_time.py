@@ -1,4 +1,4 @@
-"""NLL and ECE against run time on the two moons (synthetic): 1 to 20 networks, 1 to 100 dropout passes, temperature.
+"""Measure NLL and ECE against run time on the two moons (synthetic): networks, dropout passes, temperature.
 
     python -m framework experiment=moons/ensemble uncertainty.ensemble.members=20 hydra.run.dir=outputs/time/ensemble
     python -m framework experiment=moons/ensemble_temperature uncertainty.ensemble.members=20 \\

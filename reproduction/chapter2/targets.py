@@ -1,4 +1,4 @@
-"""What a density must know of its target: how noisy it is where, that angles have a period, how fine they are.
+"""Measure what a density gains by knowing the noise, period and resolution of its target.
 
     python -m reproduction.chapter2.targets
 
@@ -134,10 +134,9 @@ def main() -> None:
     }
     best = np.degrees(math.sqrt(2 / math.pi) * 0.05)
     text = (
-        "# What a density must know of its target (synthetic data)\n\n"
+        "# What a density gains by knowing its target's noise, period and resolution (synthetic data)\n\n"
         f"`python -m reproduction.chapter2.targets`: {ROWS} rows made by it, {SEEDS} seeds of weights, two layers of "
-        "64, 30 "
-        "epochs. ± is the standard deviation over seeds.\n\n"
+        "64, 30 epochs. ± is the standard deviation over seeds.\n\n"
         f"**Period** (§2.5) and **resolution** (§3.2). The angle of a point near the unit circle (noise 0.05 along "
         f"each axis, hence {best:.1f}° of mean error at best) from -180° to 180°: by a von Mises density, by a "
         f"Gaussian of the number of degrees, by {BINS} classes of {360 // BINS}°, whose middle is taken. 20,000 "

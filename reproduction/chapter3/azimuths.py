@@ -1,4 +1,4 @@
-"""What densities of the azimuth know of their own errors, and which point to take of them (synthetic PASCAL3D+).
+"""Measure whether azimuth densities know their own errors, and compare point predictions (synthetic PASCAL3D+).
 
     python -m reproduction.thesis_tables 3.3
     python -m reproduction.chapter3.azimuths outputs/thesis_tables/pascal3d outputs/thesis_tables/pascal3d_classes
@@ -168,12 +168,13 @@ def main() -> None:
         if each:
             lines.append(f"| {method} | {len(each)} | {cells(each)} | {mean_of(minutes[method])} |")
     text = (
-        "# What densities of the azimuth know (synthetic data)\n\n"
-        f"The models of [pascal3d.md](pascal3d.md) on the test images of the classes without symmetry; a quarter of "
-        "the images is blurred. Means over classes, each the mean of its seeds, ± the standard error over classes; "
-        f"every method has seen {', '.join(classes) or 'none of them'}. The median has the least expected deviation of "
-        f"{SAMPLES} draws (eq. 3.24). Turned round: an error above 135°; sure of it: nine tenths of the mass within "
-        "45° of the point.\n\n" + "\n".join(lines) + "\n\n"
+        "# Do azimuth densities know their own errors? (synthetic data)\n\n"
+        "The models of [pascal3d.md](pascal3d.md) predict the test images of the classes without symmetry; a quarter "
+        "of the images is blurred. Numbers are means over classes, each the mean of its seeds, ± the standard error "
+        f"over classes; classes with every method: {', '.join(classes) or 'none'}. The median is the draw of "
+        f"{SAMPLES} with "
+        'the least expected deviation (eq. 3.24). "Turned round" is an error above 135°; "sure of it" means that nine '
+        "tenths of the probability lie within 45° of the point.\n\n" + "\n".join(lines) + "\n\n"
         f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(__file__, text)

@@ -1,4 +1,4 @@
-"""What blur does to each method's log-likelihood of the pan angle (thesis Figures 3.7 and 3.8), as committed pictures.
+"""Measure each method's log-likelihood of the pan angle under blur (thesis Figures 3.7 and 3.8).
 
     python -m reproduction.thesis_tables 3.7-3.8 [--seeds 3]
     python -m reproduction.chapter3.blur <sweeps of idiap experiments> [--root <the real set>]

@@ -1,4 +1,4 @@
-"""Tables 3.1 and 3.2 on the embedded head poses (synthetic), as a committed table:
+"""Make Tables 3.1 and 3.2 on generated head poses (synthetic).
 
     python -m reproduction.thesis_tables 3.1-3.2
 

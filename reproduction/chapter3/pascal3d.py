@@ -1,4 +1,4 @@
-"""Table 3.3 and the five heads on classes of the embedded PASCAL3D+ (synthetic), as a committed table.
+"""Make Table 3.3: five density heads on the classes of a generated PASCAL3D+ (synthetic).
 
     python -m reproduction.thesis_tables 3.3
 
@@ -107,10 +107,11 @@ def main() -> None:
     )
     text = (
         "# Table 3.3: five density heads on synthetic PASCAL3D+\n\n"
-        f"Embedded default (generated objects, {size} px crops), `biternion_vgg`, {epochs} epochs, batch {batch}; the "
+        f"Generated objects in crops of {size} pixels, `biternion_vgg`, {epochs} epochs, batches of {batch}; the "
         "commands are in `pascal3d.py`. ± is the standard deviation over seeds, or the standard error over the test "
-        "set for one seed. `diningtable` looks the same after 180° (two true azimuths: the least mass a density gives "
-        "to one, within 45°), `bottle` from everywhere (the gap between its azimuth entropy and log 2π).\n\n"
+        "set where there is one seed. `diningtable` looks the same after a rotation by 180°: its column is the least "
+        "probability that a density gives to one of the two true azimuths, within 45°. `bottle` looks the same from "
+        "everywhere: its column is the gap between its azimuth entropy and log 2π.\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{over_classes(rows)}\n\n"
         f"{len(rows)} runs, {threads} each. {machine('torch', 'pytorch-lightning')}\n"
     )

@@ -1,4 +1,4 @@
-"""Where a ball will be: physics, TVAE, LSTM and hybrid on simulated and on recorded flights (thesis Figure 4.3).
+"""Compare physics, TVAE, LSTM and hybrid on simulated and recorded ball flights (thesis Figure 4.3).
 
     python -m reproduction.chapter4.ball_flights <folder of the laboratory's *.mat>
     python -m reproduction.chapter4.ball_flights --draw
@@ -29,12 +29,12 @@ from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
 from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
+from framework.flights.frames import PARTS
 from framework.prediction import Prediction
 from framework.reports.table import Row, csv
+from plugins.metric.flight_error.figure import bundle, landing_places
 from plugins.metric.flight_error.landing import Shown
 from plugins.metric.flight_error.metric import DRAWS, FlightError
-from plugins.metric.flight_error.figure import bundle, landing_places
-from framework.flights.frames import PARTS
 
 HERE = Path(__file__).resolve()
 RUNS = ROOT / "outputs" / "ball_flights"
@@ -301,11 +301,12 @@ def write(
 ) -> None:
     """The page and both pictures."""
     text = [
-        "# Where a ball will be", "",
+        "# Predicted ball flights: error against time", "",
         "![Error against time](ball_flights.png)", "",
-        "Mean distance (cm) of the point prediction from the ball, against time into the future; share (%) of recorded "
-        "coordinates within 90 % intervals, before and after calibration on the validation windows; continuous ranked "
-        "probability score of the landing place, and share of true places in the ellipse that holds 90 %.", "",
+        "The tables show the mean distance (cm) between the point prediction and the ball at several times into the "
+        "future; the share (%) of recorded coordinates within 90 % intervals, before and after calibration on the "
+        "validation windows; the continuous ranked probability score (CRPS) of the landing place; and the share (%) of "
+        "true landing places within the ellipse that holds 90 %.", "",
         f"## Simulated flights (synthetic): 4,000, one seed, {MOST:,} test windows", "", *table(simulated), "",
         "The truth is the flight without noise. Physics is the model that simulated them, its constants found from "
         "training windows. The TVAE knows no physics; it is furthest behind where the ball has just bounced.", "",

@@ -1,4 +1,4 @@
-"""How encodings of a cloud move with it, what of a grid is empty, what stray points do (thesis §6.2, §6.4.1, §6.5.2).
+"""Measure how encodings change with shift, rotation and stray points, and how much of a grid is empty (thesis Ch. 6).
 
     python -m reproduction.chapter6.cloud_encodings
 
@@ -157,10 +157,9 @@ def main() -> None:
         for share, far in STRAY
     }
     text = (
-        "# How encodings move with the cloud (synthetic data)\n\n"
+        "# How encodings change with shift, rotation and stray points (synthetic data)\n\n"
         f"`python -m reproduction.chapter6.cloud_encodings`: {len(clouds)} synthetic CAD shapes of {POINTS} points, "
-        "in the unit "
-        "ball. ± is the standard error over shapes.\n\n"
+        "in the unit ball. ± is the standard error over shapes.\n\n"
         "**Shift and turn** (§6.4.1). The change of the features as a share of the mean distance between two shapes' "
         "features, for steps of so many radii or radians, and the power of the step by which its "
         "root mean square grows over the last decade: 1 is smooth, "

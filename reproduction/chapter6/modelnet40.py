@@ -1,4 +1,4 @@
-"""Tables 6.1, 6.2 and 6.3 on the synthetic CAD set: every row, error and run time, and the thesis's claims on them.
+"""Make Tables 6.1 to 6.3 on synthetic CAD models, with errors, run times and the thesis's claims.
 
     python -m reproduction.thesis_tables 6.1-6.3          # with --tell it prints its sweeps, to run one by one
 
@@ -367,11 +367,11 @@ def main() -> None:
         "# Tables 6.1 to 6.3: classes of CAD models (synthetic data)\n\n"
         f"The generated set of `data=modelnet40` ({fingerprint['version']}): {len(data.target.names)} classes, "
         f"{fingerprint['train']} clouds for training, {fingerprint['test']} for the test, 2048 points each. The "
-        "thesis's figures are of ModelNet40 and a GPU's thousands of epochs: orderings compare, numbers do not. "
-        "Latencies on one thread, encoding included. FLOPs are those of matrix products and convolutions. Epochs are "
-        "what two cores allow; rates were chosen on the validation split of an earlier, easier generated set. "
-        "Commands in `modelnet40.py`. Of several seeds numbers are means. "
-        f"{'Not run: ' + '; '.join(missing) + '.' if missing else 'Every row was run.'}\n\n"
+        "thesis trains on ModelNet40 for thousands of epochs on a GPU, so orderings compare and absolute numbers do "
+        "not. Latencies are measured on one thread and include the encoding. FLOPs count matrix products and "
+        "convolutions. The number of epochs is what two cores allow; learning rates were chosen on the validation "
+        "split of an earlier, easier generated set. The commands are in `modelnet40.py`. Numbers are means over "
+        f"seeds. {'Not run: ' + '; '.join(missing) + '.' if missing else 'Every row was run.'}\n\n"
         f"{markdown(table, COLUMNS, better=BETTER)}\n\n"
         "± of accuracy and NLL is the standard error over new test clouds and new seeds: the variance over clouds of "
         "the mean over seeds, and the variance among seeds beyond what clouds explain over the number of seeds. The "

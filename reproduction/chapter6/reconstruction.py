@@ -1,4 +1,4 @@
-"""What an encoding keeps of a cloud, against its length (thesis Figure 6.4), and what encoding costs (Figure 6.7).
+"""Measure what an encoding keeps of a cloud (thesis Figure 6.4) and how long encoding takes (Figure 6.7).
 
     python -m reproduction.chapter6.reconstruction
     python -m reproduction.chapter6.reconstruction --draw

@@ -1,4 +1,4 @@
-"""What registration costs on one core, the rank it needs, and Table 6.4.
+"""Time registration on one core, measure the rank that it needs, and make Table 6.4.
 
     python -m reproduction.thesis_tables 6.4
     python -m reproduction.chapter6.registration [<run of registration/quick> [<run of faust/registration>]] \\
@@ -110,7 +110,7 @@ def main(runs: list[Path], scan: Path | None) -> None:
     with torch.inference_mode():
         rows, ranks = speeds(data), residuals(data)
     lines = [
-        "# Registration",
+        "# Table 6.4, and the run time of registration",
         "",
         machine("torch", "numba"),
         "",

@@ -1,4 +1,4 @@
-"""Contact sheets of people who were never seen in training, as the thesis's Figures 7.2 to 7.5 show them.
+"""Draw contact sheets of people who are not in the training data, as in the thesis's Figures 7.2 to 7.5.
 
     python -m reproduction.chapter7.smplpix_figures <run of smplpix/quick> <run of smplpix/hybrid>
 
@@ -106,7 +106,7 @@ def main(runs: Sequence[str]) -> None:
     )
     told = f"{machine('torch', 'numpy')} Command: `python -m reproduction.chapter7.smplpix_figures <runs>`."
     text = [
-        "# Neural pixels, as Figures 7.2 to 7.5 show them (synthetic people)",
+        "# Qualitative results of SMPLpix, as in Figures 7.2 to 7.5 (synthetic people)",
         "",
         f"{about} Runs: {trained}.",
         "",

@@ -1,4 +1,4 @@
-"""Table 7.1 of the thesis on generated people: every row of one sweep, with spreads over seeds and over subjects.
+"""Make Table 7.1 on generated people, with spreads over seeds and over subjects.
 
     python -m reproduction.chapter7.smplpix_table
 

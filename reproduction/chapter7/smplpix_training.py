@@ -1,4 +1,4 @@
-"""What networks of neural pixels gain with training time, against meshes; results and pictures lie beside this file.
+"""Measure what rendering networks gain with training time, against meshes.
 
     python -m reproduction.chapter7.smplpix_training [--skins <folder>]
 
@@ -250,7 +250,7 @@ def report(rows: Record) -> str:
     others = [f"{'; '.join(names)}: {one}" for one, names in machines.items() if one != usual]
     return "\n".join(
         [
-            "# Neural pixels against meshes, by training time (synthetic)",
+            "# Rendering networks against meshes, by training time (synthetic people)",
             "",
             "Generated people (`human_scans`, not real ones): 160 to train on, 96 views of 16 unseen ones, 256 × 192. "
             "Meshes are drawn with their vertices' colours, 4 × 4 samples a pixel unless said. Inside: over the "

@@ -1,4 +1,4 @@
-"""Quality of a person's picture against its milliseconds: meshes with more and fewer samples, and trained networks.
+"""Measure the quality of a person's image against its run time: meshes with several samples, and trained networks.
 
     python -m reproduction.chapter7.smplpix_work_precision <run> …
 
@@ -137,7 +137,7 @@ def main(runs: list[str]) -> None:
     csv([{**one, "synthetic": True} for one in rows], None, HERE.with_suffix(".csv"))
     drawn(rows)
     text = [
-        "# Quality of a picture against its time (synthetic people)",
+        "# Quality of an image against its run time (synthetic people)",
         "",
         f"{about} Means over subjects. Milliseconds of processor time, one picture alone on one thread: of drawing the "
         "mesh or projecting its vertices, and of the network. Networks compute the subject's box or the whole frame. "

@@ -1,4 +1,4 @@
-"""Files that were made to do harm: small ones that would take all memory, hang, read other files or run something."""
+"""Files that are made to do harm: they try to take all memory, to hang, to read other files or to run something."""
 
 import hashlib
 import io

@@ -1,4 +1,4 @@
-"""Scenes that were made to do harm: large promises, circles, and references to what is none of theirs."""
+"""Scenes that are made to do harm: sizes that are not there, circular references, references to other files."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""Damages files, has them read in processes with bounded memory and time, and counts what becomes of them."""
+"""Damage files, read them in processes with bounded memory and time, and count the outcomes."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""Checkpoints of every plugin that stores arrays, and whatever may be wrong with one of the arrays."""
+"""Checkpoints of every plugin that stores arrays, with one of the arrays damaged."""
 
 import contextlib
 import io

@@ -1,4 +1,6 @@
-"""Has every reader of files read damaged ones, in processes with bounded memory and time: python -m tests.fuzz.fuzz
+"""Give damaged files to every reader, in processes with bounded memory and time.
+
+    python -m tests.fuzz.fuzz
 
 Writes fuzz.md beside this file. A file may be read or refused with a sentence; a crash, more than two seconds of
 processor time, more than 1 GiB, another error, a message that does not name the file, drowns in damage or has control

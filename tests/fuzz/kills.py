@@ -1,4 +1,6 @@
-"""Kills ranks, sweeps and the processes that their jobs are forks of, at random moments: python -m tests.fuzz.kills
+"""Kill ranks, sweeps and fork servers at random moments, and compare what resumes.
+
+    python -m tests.fuzz.kills
 
 A run or a sweep is killed a few times, goes on after each, and ends; its checkpoints and journals are then compared, to
 the last bit, with those of one that nobody killed. Writes kills.md beside this file.
@@ -324,7 +326,7 @@ def main() -> None:
 def page(lines: Sequence[str], kills: int, seed: int) -> str:
     return "\n".join(
         [
-            "# Kills of ranks, sweeps and what their jobs are forks of",
+            "# Killed ranks, sweeps and fork servers",
             "",
             f"`python -m tests.fuzz.kills --kills {kills} --seed {seed}`: each kill comes at a random moment of the "
             "command, from its start on; after up to four the run or sweep is left to end. Ended: no process of the "
