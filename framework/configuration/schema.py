@@ -31,6 +31,10 @@ from pydantic_core import to_jsonable_python
 from framework.configuration.registry import load
 from framework.configuration.signature import arguments, parts, positional, signature
 from framework.errors import ConfigError, did_you_mean, listed, quoted, shown
+from framework.storage.plain_values import is_number
+
+WRITTEN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+"""Text that is taken for a number, as of a variable of the environment."""
 
 
 def forbid_targets(config: Any, path: str = "") -> None:
@@ -146,9 +150,31 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
         ConfigError: unknown key, missing key, or a value of wrong type or range.
     """
     try:
-        return model.model_validate(dict(values)).model_dump()
+        found = model.model_validate(dict(values)).model_dump()
     except ValidationError as error:
         raise _refusal(error, path, list(model.model_fields)) from None
+    _require_numbers(values, found, path)
+    return found
+
+
+def _require_numbers(given: Any, read: Any, where: str) -> None:
+    """Refuse what pydantic takes for a number and nobody writes for one: true, "1_0", " 1 ", "nan".
+
+    Raises:
+        ConfigError: such a value stands in `given` where a number was `read`.
+    """
+    if isinstance(given, Mapping) and isinstance(read, Mapping):
+        for key in given.keys() & read.keys():
+            _require_numbers(given[key], read[key], f"{where}.{key}" if where else str(key))
+    elif isinstance(given, list | tuple) and isinstance(read, list | tuple) and len(given) == len(read):
+        for number, (one, other) in enumerate(zip(given, read, strict=True)):
+            _require_numbers(one, other, f"{where}[{number}]")
+    elif is_number(read) and not isinstance(read, Enum) and _no_number(given):
+        raise ConfigError(f"{shown(where)} = {quoted(given)}: wanted a number. Write one, such as {read}.")
+
+
+def _no_number(given: Any) -> bool:
+    return isinstance(given, bool) or (isinstance(given, str) and not WRITTEN.fullmatch(given))
 
 
 def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
@@ -231,6 +257,7 @@ def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: boo
             read: Any = models[key].model_validate({key: value}, extra="forbid")
             # pydantic reads what is annotated as an Iterable lazily, and once
             found[key] = list(read.value) if isinstance(read.value, Iterator) else read.value
+            _require_numbers(value, found[key], f"{path}.{key}")
         except ValidationError as error:
             raise _refusal(error, path, _inner_keys(annotation)) from None
     return found

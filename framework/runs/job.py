@@ -39,7 +39,11 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     path, remedy = folder / RECORD, "Delete it, and the job runs anew."
     record = read_json(path, "the record of a job", remedy)
-    wrong = [key for key, kinds in _KINDS.items() if key in record and not isinstance(record[key], kinds)]
+    wrong = [
+        key
+        for key, kinds in _KINDS.items()
+        if key in record and (not isinstance(record[key], kinds) or isinstance(record[key], bool))
+    ]
     if "overrides" not in record or (
         not wrong and not all(isinstance(one, str) for one in record["overrides"])
     ):

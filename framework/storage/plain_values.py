@@ -2,20 +2,37 @@
 
 import json
 import pickletools
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import yaml
 
-from framework.errors import DataError, UserError, shown
+from framework.errors import DataError, UserError, quoted, shown
 from framework.storage.reading import RESTORE, guarded, read_bytes
 from framework.storage.text import decoded
 
 LARGEST_JSON, LARGEST_YAML = 2**24, 2**17
 """Bytes."""
 DEEPEST, MOST_ITEMS = 64, 100_000
+
+
+class PlainLoader(yaml.SafeLoader):
+    """A reader of YAML whose numbers are written as programs write them; 1_0, 0x10, 010 and 1:30 are text."""
+
+
+PlainLoader.yaml_implicit_resolvers = {
+    first: [(tag, words) for tag, words in found if tag.rpartition(":")[2] not in ("int", "float")]
+    for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_INT = re.compile(r"[-+]?(?:0|[1-9][0-9]*)$")
+_FLOAT = re.compile(
+    r"(?:[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
+PlainLoader.add_implicit_resolver("tag:yaml.org,2002:int", _INT, list("-+0123456789"))
+PlainLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
 
 
 def read_json(file: Path, wanted: str, remedy: str = RESTORE) -> dict[str, Any]:
@@ -41,11 +58,29 @@ def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserEr
     with guarded(file, wanted, remedy, kind=error):
         text = decoded(_content(file, LARGEST_YAML))
         depth = 0
-        for event in yaml.parse(text, yaml.SafeLoader):
+        for event in yaml.parse(text, PlainLoader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > DEEPEST or isinstance(event, yaml.AliasEvent):
                 raise ValueError(f"an alias, or values more than {DEEPEST} deep in others")
-        return yaml.safe_load(text)
+        return yaml.load(text, PlainLoader)
+
+
+def is_number(value: Any) -> TypeGuard[int | float]:
+    """Return whether a value of JSON or YAML is a number: true and false are integers to Python, and are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def plain_numbers(value: Any) -> Any:
+    """Return a value of JSON or YAML that is a number, or lists of numbers; NumPy and torch also read true and text.
+
+    Raises:
+        ValueError: something in it is no number; says what.
+    """
+    if isinstance(value, list | tuple):
+        return [plain_numbers(item) for item in value]
+    if not is_number(value):
+        raise ValueError(f"wanted a number, got {quoted(value)}")
+    return value
 
 
 class Foreign(ValueError):

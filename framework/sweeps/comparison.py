@@ -21,7 +21,7 @@ from framework.reports.table import (
 )
 from framework.runs.job import read_record, recorded
 from framework.runs.run import stored_config
-from framework.storage.plain_values import read_json
+from framework.storage.plain_values import is_number, read_json
 from framework.storage.progress import output
 from framework.storage.reading import RESTORE
 from framework.tracking.ended import close_and_send
@@ -210,15 +210,16 @@ def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
     wanted = {
         "method": isinstance(results["method"], str),
         "data": isinstance(results["data"], str),
-        "seed": isinstance(results.get("seed"), int | str | None),
+        "seed": isinstance(results.get("seed"), int | str | None)
+        and not isinstance(results.get("seed"), bool),
         "device": isinstance(results.get("device"), str | None),
-        "threads": isinstance(results.get("threads"), int) or "device" not in results,
+        "threads": type(results.get("threads")) is int or "device" not in results,
         "columns": isinstance(columns, dict) and all(isinstance(one, str) for one in columns.values()),
         "better": isinstance(better, dict) and all(one in ("higher", "lower") for one in better.values()),
-        **{key: isinstance(results[key], int | float | None) for key in COST_COLUMNS if key in results},
+        **{key: results[key] is None or is_number(results[key]) for key in COST_COLUMNS if key in results},
     }
     if isinstance(columns, dict):
-        wanted |= {key: isinstance(results[key], int | float | None) for key in columns if key in results}
+        wanted |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
     if wrong := [key for key, right in wanted.items() if not right]:
         raise DataError(f"{path} says {shown(wrong[0])} = {quoted(results.get(wrong[0]))}. {RESTORE}")
     plain = {key: shown(value) if isinstance(value, str) else value for key, value in results.items()}
@@ -233,7 +234,7 @@ def _trial_row(
     given = {key: value for key, _, value in (override.partition("=") for override in trial.overrides)}
     return {
         "trial": trial.folder.name,
-        "value": float(found) if isinstance(found, int | float) and trial.completed else math.nan,
+        "value": float(found) if is_number(found) and trial.completed else math.nan,
         **{key: given.get(key) for key in keys},
         **{key: results.get(key) for key in COST_COLUMNS},
         "synthetic": results.get("synthetic"),
@@ -244,12 +245,7 @@ def _better(
     metric: str, results: Sequence[Mapping[str, Any]], direction: str | None, folder: Path
 ) -> Literal["higher", "lower"]:
     again = f"The same command with hydra.sweep.dir={folder} ranks again and runs nothing twice."
-    numbers = {
-        key: None
-        for one in results
-        for key, value in one.items()
-        if isinstance(value, int | float) and not isinstance(value, bool)
-    }
+    numbers = {key: None for one in results for key, value in one.items() if is_number(value)}
     if metric not in numbers:
         raise ConfigError(
             f"hydra.sweeper.metric = {metric!r}: no trial has it.{did_you_mean(metric, numbers)} They have: "

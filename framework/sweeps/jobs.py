@@ -21,6 +21,7 @@ from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
 from framework.storage.enclosed import read_plain, read_stream
 from framework.storage.files import unlockable, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
+from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import guarded
 from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
@@ -92,7 +93,9 @@ class Job:
         """What the job left for the sweeper to minimise (`leave_value`)."""
         path = self.folder / VALUE
         with guarded(path, "a number", "Delete it, and the job runs anew."):
-            return float(json.loads(read_plain(path, LONGEST_VALUE))) if path.is_file() else None
+            return (
+                float(plain_numbers(json.loads(read_plain(path, LONGEST_VALUE)))) if path.is_file() else None
+            )
 
 
 def hashed(*parts: str) -> str:

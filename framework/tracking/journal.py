@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 from framework.errors import DataError
 from framework.storage.enclosed import open_plain, read_stream
 from framework.storage.files import lock_within, replacing
+from framework.storage.plain_values import is_number
 from framework.storage.reading import guarded
 
 _log = logging.getLogger(__name__)
@@ -366,14 +367,13 @@ def _record(line: bytes) -> dict[str, Any] | None:
         record = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(record, dict) or not isinstance(record.get("n"), int):
+    if not isinstance(record, dict) or type(record.get("n")) is not int:
         return None
     values = record.get("values", {})
     whole = isinstance(values, dict) and all(
-        value in _NO_NUMBERS if isinstance(value, str) else isinstance(value, int | float)
-        for value in values.values()
+        value in _NO_NUMBERS if isinstance(value, str) else is_number(value) for value in values.values()
     )
-    placed = [isinstance(record[key], int | float) for key in ("time", "step", "epoch") if key in record]
+    placed = [is_number(record[key]) for key in ("time", "step", "epoch") if key in record]
     return record if whole and all(placed) and (len(placed) == 3 or not values) else None
 
 

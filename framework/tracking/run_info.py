@@ -115,7 +115,7 @@ def read_run_info(folder: Path) -> RunInfo | None:
     if not os.path.lexists(path):
         return None
     with guarded(path, "what a tracker wrote", "Remove it, and the run begins anew."):
-        found = TypeAdapter(RunInfo).validate_json(read_plain(path, LARGEST_JSON))
+        found = TypeAdapter(RunInfo).validate_json(read_plain(path, LARGEST_JSON), strict=True)
     return replace(found, named=False)
 
 

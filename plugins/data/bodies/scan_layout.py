@@ -32,7 +32,7 @@ from framework.geometry import meshes
 from framework.geometry.camera import Camera
 from framework.geometry.mesh_files import COLOURS
 from framework.storage.arrays import archive
-from framework.storage.plain_values import read_json
+from framework.storage.plain_values import plain_numbers, read_json
 from framework.storage.reading import guarded, opened, read_bytes
 from framework.storage.text import lines_of
 
@@ -204,8 +204,8 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
     numbers = {}
     for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
         try:
-            numbers[key] = np.array(view.get(key), np.float64)
-        except (TypeError, ValueError):
+            numbers[key] = np.array(plain_numbers(view.get(key)), np.float64)
+        except (OverflowError, TypeError, ValueError):
             numbers[key] = np.empty(0)
         if numbers[key].shape != shape or not np.isfinite(numbers[key]).all():
             raise ValueError(f"view {name}: {key} is no array of {'×'.join(map(str, shape))} finite numbers")

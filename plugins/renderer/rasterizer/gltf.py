@@ -17,7 +17,7 @@ from framework.errors import DataError, quoted, shown
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
 from framework.storage.reading import guarded
-from plugins.renderer.rasterizer.gltf_document import WIDTHS, Document, opened, whole
+from plugins.renderer.rasterizer.gltf_document import WIDTHS, Document, numbers, opened, whole
 from plugins.renderer.rasterizer.parts import Part, Subject, drawn_without, subject
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
@@ -94,7 +94,7 @@ def _parts(document: Document, above: dict[int, int | None]) -> Iterator[Part]:
         if any(mesh.get("weights", ())) or any(node.get("weights", ())):
             document.notes.append("its blend shapes are left out.")
         for place_in_mesh, primitive in enumerate(mesh["primitives"]):
-            if primitive.get("mode", TRIANGLES) in POINTS_AND_LINES:
+            if whole(primitive.get("mode", TRIANGLES)) in POINTS_AND_LINES:
                 document.notes.append("its points and lines are left out.")
                 continue
             key = (node["mesh"], place_in_mesh)
@@ -140,9 +140,9 @@ def _places(document: Document, above: dict[int, int | None]) -> dict[int, Float
 def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     """A node's matrix, or translation · rotation · scale (section 3.5.3)."""
     if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+        return numbers(node["matrix"]).reshape(4, 4).T
     found = np.eye(4)
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    x, y, z, w = numbers(node.get("rotation", (0, 0, 0, 1)))
     turned = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -150,8 +150,8 @@ def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    found[:3, :3] = turned * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
-    found[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+    found[:3, :3] = turned * numbers(node.get("scale", (1, 1, 1))).reshape(3)
+    found[:3, 3] = numbers(node.get("translation", (0, 0, 0))).reshape(3)
     return found
 
 
@@ -254,7 +254,7 @@ def _material(
         factor, texture = described.get("baseColorFactor"), described.get("baseColorTexture")
     if factor is None:
         return None, texture
-    found = np.array(factor, np.float64).reshape(-1)[:3]
+    found = numbers(factor).reshape(-1)[:3]
     return (None if found.tolist() == [1, 1, 1] else found), texture
 
 
@@ -270,10 +270,10 @@ def _textured(document: Document, part: Part, attributes: dict[str, Any], descri
     if moved:
         # KHR_texture_transform: translation · rotation · scale, counter-clockwise where v runs downwards: its text and
         # its test model; the GLSL beside them turns the other way (github.com/KhronosGroup/glTF/issues/1563)
-        angle = float(moved.get("rotation", 0))
+        angle = float(numbers(moved.get("rotation", 0)))
         turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        uv = (uv * np.array(moved.get("scale", (1, 1)), np.float64)) @ turned.T
-        uv = uv + np.array(moved.get("offset", (0, 0)), np.float64)
+        uv = (uv * numbers(moved.get("scale", (1, 1)))) @ turned.T
+        uv = uv + numbers(moved.get("offset", (0, 0)))
     texture = document.item("textures", described["index"])
     image = _image(document, texture)
     if image is None:

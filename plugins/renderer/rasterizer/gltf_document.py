@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from framework.errors import quoted, shown
 from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
+from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer.parts import Pictures, beside
 
@@ -42,7 +43,7 @@ class Document:
             ValueError: there is none.
         """
         items = self.content.get(kind, [])
-        if not isinstance(number, int) or not 0 <= number < len(items):
+        if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < len(items):
             raise ValueError(f"it names number {quoted(number)} of its {kind}, of which it has {len(items)}")
         return items[number]
 
@@ -172,6 +173,15 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
     if b"JSON" not in found:
         raise ValueError("it has no description")
     return found[b"JSON"], found.get(b"BIN\0")
+
+
+def numbers(value: Any) -> NDArray:
+    """Return what a description holds in a place of numbers, as float64.
+
+    Raises:
+        ValueError: something in it is no number.
+    """
+    return np.array(plain_numbers(value), np.float64)
 
 
 def whole(value: Any) -> int:

@@ -15,8 +15,9 @@ from framework.errors import DataError, did_you_mean, quoted
 from framework.geometry.camera import Camera, focal_length
 from framework.geometry.rotation import about_z, viewpoint_rotation
 from framework.renderer import Scene
-from framework.storage.plain_values import LARGEST_YAML, read_yaml
+from framework.storage.plain_values import LARGEST_YAML, plain_numbers, read_yaml
 from framework.storage.reading import guarded, read_bytes
+from framework.storage.text import decoded
 from plugins.renderer.rasterizer.parts import Axis
 
 MARGIN = 1.03
@@ -148,7 +149,7 @@ def _values(file: Path) -> dict[str, Any]:
             content = read_bytes(file)
             if len(content) > LARGEST_YAML:
                 raise ValueError(f"{len(content)} bytes; at most {LARGEST_YAML}")
-            found = json.loads(content)
+            found = json.loads(decoded(content))
     elif file.suffix.lower() in (".yaml", ".yml"):
         found = read_yaml(file, wanted)
     else:
@@ -162,7 +163,7 @@ def _values(file: Path) -> dict[str, Any]:
 
 def _numbers(file: Path, found: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float[Tensor, "*shape"]:
     try:
-        numbers = torch.tensor(found[key], dtype=torch.float64)
+        numbers = torch.tensor(plain_numbers(found[key]), dtype=torch.float64)
         numbers = numbers.flatten() if numbers.shape == (3, 1) else numbers
     except (TypeError, ValueError, RuntimeError, OverflowError):
         numbers = torch.empty(0)
