@@ -11,9 +11,10 @@ from framework.configuration.loading import load_with_description
 from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
-from framework.errors import ConfigError, UserError
+from framework.errors import ConfigError
 from framework.figures.style import saved
 from framework.geometry.clouds import denormalised, sizes
+from framework.storage.commands import run_command
 from plugins.data.bodies.data import Registration
 from plugins.data.bodies.people import chosen_body
 from plugins.data.bodies.result import figure, write_ply
@@ -68,7 +69,4 @@ def register(
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    run_command(main)

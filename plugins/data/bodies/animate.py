@@ -20,8 +20,9 @@ from framework.configuration.description import Description
 from framework.configuration.loading import stored
 from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, DataError, UserError, did_you_mean
+from framework.errors import ConfigError, DataError, did_you_mean
 from framework.renderer import Renderer
+from framework.storage.commands import run_command
 from plugins.data.bodies import motion
 from plugins.data.bodies.animation import Actor, Generated, Moment, actor, columns, orbit, side_by_side
 from plugins.data.bodies.human_scans import HumanScans
@@ -210,7 +211,4 @@ def _film(file: Path, frames: Sequence[Image.Image]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    run_command(main)

@@ -20,10 +20,11 @@ from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
-from framework.errors import ConfigError, UserError
+from framework.errors import ConfigError
 from framework.geometry.clouds import denormalised
 from framework.geometry.meshes import read
 from framework.geometry.nearest import nearest
+from framework.storage.commands import run_command
 from framework.storage.generated import read_mark
 from plugins.data.bodies.faust import CHALLENGES, Challenge, pairs, test_registration, test_scan
 from plugins.data.bodies.faust_generator import people_root
@@ -139,7 +140,4 @@ def _nearest(vertices: np.ndarray, points: np.ndarray) -> Int[np.ndarray, "point
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    run_command(main)

@@ -14,11 +14,12 @@ import torch
 
 from framework.configuration.schema import build, resolve
 from framework.data import Splits
-from framework.errors import DataError, UserError
+from framework.errors import DataError
 from framework.geometry import meshes
 from framework.geometry.light import linear
 from framework.geometry.meshes import READERS, stream
 from framework.renderer import Renderer, Scene
+from framework.storage.commands import run_command
 from framework.storage.generated import draw_all, generated
 from plugins.data.bodies import scan_layout
 from plugins.data.bodies.photographs import photographed, rig
@@ -126,7 +127,4 @@ def write_person(
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    run_command(main)

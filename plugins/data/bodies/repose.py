@@ -20,8 +20,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.errors import DataError, UserError, did_you_mean
+from framework.errors import DataError, did_you_mean
 from framework.geometry.camera import Camera
+from framework.storage.commands import run_command
 from plugins.data.bodies import motion, poses, scan_layout
 from plugins.data.bodies.body import Body, BodyModel
 from plugins.data.bodies.human_scans import in_front
@@ -229,7 +230,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    run_command(main)

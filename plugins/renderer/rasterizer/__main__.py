@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import ImageColor
 
-from framework.errors import ConfigError, DataError, UserError, did_you_mean, quoted, shown
+from framework.errors import ConfigError, DataError, did_you_mean, quoted, shown
 from framework.geometry.camera import Camera
 from framework.renderer import Report
-from framework.storage.files import unwritable
+from framework.storage.commands import run_command
 from framework.storage.limits import MOST_SAMPLES
 from framework.storage.progress import tracked
 from plugins.renderer.rasterizer import pictures, turntable
@@ -280,13 +280,4 @@ def told(report: Report | None, seconds: list[float]) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except UserError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.stderr.write("error: interrupted.\n")
-        sys.exit(130)
-    except OSError as error:
-        other = f"{error.filename} cannot be written ({error.strerror}). Choose another place."
-        sys.exit(f"error: {unwritable(error) or other}")
+    run_command(main)

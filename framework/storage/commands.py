@@ -1,0 +1,31 @@
+"""Runs the `main` of a command beside `python -m framework`: errors are sentences, and `| head` ends nothing."""
+
+import sys
+from collections.abc import Callable
+
+from framework.errors import UserError
+from framework.storage.closed_pipes import survive_closed_pipes
+from framework.storage.files import unwritable
+
+
+def run_command(main: Callable[[list[str]], object]) -> None:
+    """Call `main` with the arguments of this process.
+
+    The process exits with 0, 1 (refused or failed) or 130 (interrupted); argparse exits with 2. Where the reader of its
+    output ends, as in `... | head -1`, the rest of the output is dropped and the command goes on.
+    """
+    survive_closed_pipes()
+    try:
+        main(sys.argv[1:])
+    except UserError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.stderr.write("error: interrupted.\n")
+        sys.exit(130)
+    except OSError as error:
+        refused = unwritable(error)
+        if refused is None and error.filename is None:
+            raise
+        sys.exit(
+            f"error: {refused or f'{error.filename} cannot be written ({error.strerror}). Choose another place.'}"
+        )
