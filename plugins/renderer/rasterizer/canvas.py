@@ -83,7 +83,7 @@ class Canvas:
     """
 
     def __init__(self) -> None:
-        self.seen, self.screen = np.empty((0, 3)), np.empty((0, 3))
+        self.seen, self.screen = np.empty((0, 3)), np.empty((0, 5))
         self.depth, self.face = np.empty((0, 0), np.float32), np.empty((0, 0), np.int32)
         self.tiles: Tiles = (
             np.empty((0, 0), np.float32),
@@ -111,7 +111,7 @@ class Canvas:
                 return True
         else:
             self._vertices = np.empty_like(vertices)
-            self.seen, self.screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 3))
+            self.seen, self.screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 5))
         self._vertices[:] = vertices
         self._pose = pose
         self._drawn = None

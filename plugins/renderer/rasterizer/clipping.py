@@ -22,7 +22,7 @@ def clipped(seen, faces, focal, principal, near):
             front += drawable(seen, faces[index, corner], near)
         good = finite(seen, faces, index)
         count += front if good and front < 3 else 0
-    corners = np.zeros((4 * count, 3))
+    corners = np.zeros((4 * count, 5))
     parts = np.empty((count, 3), np.int64)
     numbers = np.empty(count, np.int64)
     part = corner_number = 0

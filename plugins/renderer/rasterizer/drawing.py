@@ -213,18 +213,19 @@ def fill(given: Given, view: View, canvas: Canvas, numbers: dict[str, np.ndarray
     """Fill the channels from the visible faces."""
     top, bottom, left, right = box
     part = (slice(top, bottom), slice(left, right))
-    for name, kept in (("depth", canvas.depth), ("face", canvas.face)):
-        if name in numbers:
-            numbers[name][part] = kept[part]
+    if "face" in numbers:
+        numbers["face"][part] = canvas.face[part]
     if "mask" in numbers:
         np.greater_equal(canvas.face[part], 0, out=numbers["mask"][part])
     places = (canvas.seen, canvas.screen)
-    faces, shown = view.faces.array, (given.lens, canvas.face, box)
-    if "color" in numbers and not view.blended:
-        shading.shade(*places, faces, given.colors, given.laid, *shown, numbers["color"])
+    faces, visible = view.faces.array, (canvas.face, box)
+    color, depth = None if view.blended else numbers.get("color"), numbers.get("depth")
+    if color is not None or depth is not None:
+        painted = (given.colors, given.laid) if color is not None else (None, None)
+        shading.shade(*places, faces, *painted, given.lens, view.near, *visible, color, depth)
     if not {"normal", "barycentric", "uv"}.isdisjoint(numbers):
         asked = [numbers.get(name) for name in ("normal", "barycentric", "uv")]
-        shading.inform(*places, given.vertices, faces, given.laid, *shown, *asked)
+        shading.inform(*places, given.vertices, faces, given.laid, given.lens, *visible, *asked)
 
 
 class Picture(torch.autograd.Function):
@@ -344,7 +345,17 @@ def to_camera(
     canvas, lens, colors, laid = drawn.lease.canvas, given.lens, given.colors, given.laid
     along_color, along_depth = slopes.get("color"), slopes.get("depth")
     faces = view.faces.array
-    surface = (canvas.seen, faces, colors, laid, lens, canvas.face, drawn.box, canvas.scratch(len(faces)))
+    surface = (
+        canvas.seen,
+        canvas.screen,
+        faces,
+        colors,
+        laid,
+        lens,
+        canvas.face,
+        drawn.box,
+        canvas.scratch(len(faces)),
+    )
     of_paint = (of_colors, of_texels, of_uv)
     visible = drawn.box[0] < drawn.box[1]
     if view.gradient in ("nmr", "soft"):

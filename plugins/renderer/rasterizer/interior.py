@@ -2,7 +2,8 @@
 
 Arrays are those of `raster`. In camera coordinates a pixel's ray is r = ((column - cx) / fx, (row - cy) / fy, 1), and
 the barycentric weights of a face A, B, C under it are m_i / Σ m with m_0 = r·(B×C), m_1 = r·(C×A), m_2 = r·(A×B)
-(homogeneous edge functions, Olano & Greer 1997): linear in every corner, and right for corners behind the camera.
+(homogeneous edge functions, Olano & Greer 1997): linear in every corner, and right for corners behind the camera. Of a
+pixel beside its face r is the ray to the place that `shading` shows there, taken to stand still.
 """
 
 from typing import no_type_check
@@ -10,10 +11,11 @@ from typing import no_type_check
 import numpy as np
 
 from plugins.renderer.rasterizer.raster import compiled
+from plugins.renderer.rasterizer.shading import weights_at
 from plugins.renderer.rasterizer.textures import among_texels, mixed, mixed_slopes, uv_at
 
 FLATTEST = 1e-12
-"""Of Σ m, relative to its terms: what is flatter is seen edge-on, and has no slope that says anything."""
+"""Least Σ m, relative to its terms: a flatter face is seen edge-on, and its position has no slope of any meaning."""
 
 
 @compiled
@@ -34,6 +36,7 @@ def add(to, vertex, scale, x, y, z):
 @no_type_check
 def interior(
     seen,
+    screen,
     faces,
     colors,
     laid,
@@ -78,15 +81,14 @@ def interior(
             m1 = ray_x * sums[place, 3] + ray_y * sums[place, 4] + sums[place, 5]
             m2 = ray_x * sums[place, 6] + ray_y * sums[place, 7] + sums[place, 8]
             total = m0 + m1 + m2
-            if not abs(total) > FLATTEST * (abs(m0) + abs(m1) + abs(m2)):
-                continue
-            inverse = 1.0 / total
+            inverse = 1.0 / total if abs(total) > FLATTEST * (abs(m0) + abs(m1) + abs(m2)) else 0.0
+            w0, w1, w2 = m0 * inverse, m1 * inverse, m2 * inverse
+            at_x, at_y = ray_x, ray_y
+            if inverse == 0 or min(w0, w1, w2) < 0:
+                w0, w1, w2 = weights_at(seen, screen, faces, lens, index, row, column)
+                at_x, at_y, inverse = beside(seen, faces, index, sums, place, w0, w1, w2, inverse)
             d0 = d1 = d2 = 0.0
             if along_color is not None:
-                # rounding of corners may leave the pixel a little outside of the face
-                w0, w1, w2 = max(m0 * inverse, 0.0), max(m1 * inverse, 0.0), max(m2 * inverse, 0.0)
-                scale = 1.0 / (w0 + w1 + w2)
-                w0, w1, w2 = w0 * scale, w1 * scale, w2 * scale
                 textured = False
                 if laid is not None and laid.shown[index] >= 0:
                     textured = True
@@ -114,20 +116,48 @@ def interior(
                 sums[place, 18] += slope
                 down = slope * sums[place, 19] * inverse
                 d0, d1, d2 = d0 - down, d1 - down, d2 - down
-            sums[place, 9] += d0 * ray_x
-            sums[place, 10] += d0 * ray_y
+            sums[place, 9] += d0 * at_x
+            sums[place, 10] += d0 * at_y
             sums[place, 11] += d0
-            sums[place, 12] += d1 * ray_x
-            sums[place, 13] += d1 * ray_y
+            sums[place, 12] += d1 * at_x
+            sums[place, 13] += d1 * at_y
             sums[place, 14] += d1
-            sums[place, 15] += d2 * ray_x
-            sums[place, 16] += d2 * ray_y
+            sums[place, 15] += d2 * at_x
+            sums[place, 16] += d2 * at_y
             sums[place, 17] += d2
     for place in range(count):
         index = owners[place]
         places[index] = -1
         if of_seen is not None:
             settle(seen, faces, index, sums, place, lens, of_seen, of_lens)
+
+
+@compiled
+@no_type_check
+def beside(seen, faces, index, sums, place, w0, w1, w2, inverse):
+    """Return the ray to the place of a face at barycentric weights, and 1 / Σ m there.
+
+    Args:
+        sums, place: see `begin`.
+        inverse: 1 / Σ m at a pixel beside the face; 0 where the face is seen edge-on, then so is what is returned.
+    """
+    a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
+    x = w0 * seen[a, 0] + w1 * seen[b, 0] + w2 * seen[c, 0]
+    y = w0 * seen[a, 1] + w1 * seen[b, 1] + w2 * seen[c, 1]
+    z = w0 * seen[a, 2] + w1 * seen[b, 2] + w2 * seen[c, 2]
+    if inverse == 0 or not z > 0:
+        return 0.0, 0.0, 0.0
+    x, y = x / z, y / z
+    total = terms = 0.0
+    for corner in range(3):
+        along_x, along_y, ahead = (
+            x * sums[place, 3 * corner],
+            y * sums[place, 3 * corner + 1],
+            sums[place, 3 * corner + 2],
+        )
+        total += along_x + along_y + ahead
+        terms += abs(along_x) + abs(along_y) + abs(ahead)
+    return x, y, 1.0 / total if abs(total) > FLATTEST * terms else 0.0
 
 
 @compiled

@@ -2,13 +2,14 @@
 
 Corners are rounded to 1/256 pixel, and edge functions that are exact on those whole numbers (Pineda 1988)
 decide with the top-left rule which pixels a triangle covers: a pixel centre on the edge between two triangles
-belongs to exactly one of them.
+belongs to exactly one of them. Rounded corners also decide which of several triangles is the nearest at a pixel. What
+the nearest triangle shows there is interpolated between corners that are not rounded, see `shading`.
 
 Arrays:
     seen: (vertices, 3) float64: x right, y down, z forward from the camera, metres.
-    screen: (vertices, 3) float64: column and row in 1/256 pixel, whole numbers, and 1 / depth in 1/metre; the
-        last is 0 where a vertex cannot be drawn.
-    depth, face, mask: (height, width) float32, int32, bool.
+    screen: (vertices, 5) float64: column and row in 1/256 pixel, rounded to whole numbers; 1 / depth in 1/metre, 0
+        where a vertex cannot be drawn; column and row in 1/256 pixel, not rounded.
+    depth, face, mask: (height, width) float32, int32, bool; the depths are those of rounded corners.
     box: first row, past-the-last row, first column, past-the-last column of what may have been drawn.
 
 An argument that is None is compiled away. `no_type_check` keeps the type checks that tests switch on from wrapping a
@@ -117,11 +118,12 @@ def project(vertices, rotation, translation, focal, principal, near, seen, scree
 def on_screen(x, y, z, focal, principal, near, place):
     """Fill `place`, a row of `screen`, from camera coordinates."""
     inverse = 1.0 / z
-    column = np.rint((focal[0] * x * inverse + principal[0]) * SUBPIXELS)
-    row = np.rint((focal[1] * y * inverse + principal[1]) * SUBPIXELS)
+    column = (focal[0] * x * inverse + principal[0]) * SUBPIXELS
+    row = (focal[1] * y * inverse + principal[1]) * SUBPIXELS
     # Tested as floats and before any cast; NaN fails every comparison.
     if z >= near and z <= FARTHEST and abs(column) <= LARGEST and abs(row) <= LARGEST:
-        place[0], place[1], place[2] = column, row, inverse
+        place[0], place[1], place[2] = np.rint(column), np.rint(row), inverse
+        place[3], place[4] = column, row
     else:
         place[:] = 0.0
 
@@ -378,3 +380,14 @@ def edges(ax, ay, bx, by, cx, cy, row, column):
     x, y = column * SUBPIXELS, row * SUBPIXELS
     ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
     return bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay
+
+
+@compiled
+@no_type_check
+def to_edge(ax, ay, bx, by, x, y):
+    """Squared distance from a point to an edge, and where on it the closest point is, 0 to 1."""
+    ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
+    length = ux * ux + uy * uy
+    part = min(max((ux * vx + uy * vy) / length, 0.0), 1.0) if length > 0 else 0.0
+    ox, oy = vx - part * ux, vy - part * uy
+    return ox * ox + oy * oy, part

@@ -1,8 +1,8 @@
 """The same pictures in plain torch: the oracle of the compiled kernels, and what draws on a GPU.
 
 Every pixel in the box around a face is tried (`PAIRS` at a time), and the nearest face kept by one minimum over packed
-numbers: depth in the upper half, which sorts as its bits do, and the face's number in the lower. Colours are
-differentiable within faces, by autograd. Faces that the near plane cuts are left out.
+numbers: depth in the upper half, which sorts as its bits do, and the face's number in the lower. Colours and
+depths are differentiable within faces, by autograd. Faces that the near plane cuts are left out.
 """
 
 from collections.abc import Iterator
@@ -32,13 +32,15 @@ def picture(
     rotation, translation, lens = pose
     faces = faces.long()
     seen = vertices.double() @ rotation.double().T + translation.double()
-    face, depth = visible(seen.detach(), faces, lens.detach(), near, size, cull)
+    face = visible(seen.detach(), faces, lens.detach(), near, size, cull)
     mask = face >= 0
     corners = faces[face.clamp(min=0)] if len(faces) else face.new_zeros(*size, 3)
-    found: dict[str, Tensor] = {"mask": mask, "face": face.int(), "depth": depth}
-    if {"color", "barycentric", "uv"} & set(channels):
-        weights = barycentric(seen, corners, lens, size) if len(faces) else seen.new_zeros(*size, 3)
-        weights = weights * mask[..., None]
+    found: dict[str, Tensor] = {"mask": mask, "face": face.int()}
+    if {"color", "depth", "barycentric", "uv"} & set(channels):
+        shown_weights = barycentric(seen, corners[mask], lens, mask.nonzero().flip(1))
+        depth = (shown_weights * seen[:, 2][corners[mask]]).sum(-1).clamp(min=near)
+        found["depth"] = seen.new_full(size, torch.inf).index_put((mask,), depth).float()
+        weights = seen.new_zeros(*size, 3).index_put((mask,), shown_weights)
         found["barycentric"] = weights.detach().float()
         shown, uv = 1.0, seen.new_zeros(*size, 2)
         if colors is not None and len(faces):
@@ -67,8 +69,8 @@ def picture(
 
 def visible(
     seen: Tensor, faces: Tensor, lens: Tensor, near: float, size: tuple[int, int], cull: bool
-) -> tuple[Tensor, Tensor]:
-    """The face that each pixel shows, or -1, and its depth, float32."""
+) -> Tensor:
+    """Return the face that each pixel shows, or -1: by corners rounded to 1/256 pixel, the nearest in float32."""
     height, width = size
     place = ((lens[:2] * seen[:, :2] / seen[:, 2:] + lens[2:]) * SUBPIXELS).round()
     good = (seen[:, 2] >= near) & (seen[:, 2] <= FARTHEST) & (place.abs() <= LARGEST).all(1)
@@ -99,9 +101,7 @@ def visible(
         bits = (1 / nearness).float().view(torch.int32).long()
         pixel = row[inside] * width + column[inside]
         best.scatter_reduce_(0, pixel, bits << 32 | numbers[some][part], "amin")
-    face = torch.where(best < NOTHING, best & (2**32 - 1), -1).reshape(size)
-    depth = (best >> 32).int().view(torch.float32).reshape(size)
-    return face, depth.masked_fill(face < 0, torch.inf)
+    return torch.where(best < NOTHING, best & (2**32 - 1), -1).reshape(size)
 
 
 def portions(counts: Tensor) -> Iterator[Tensor]:
@@ -126,18 +126,47 @@ def cross(one: Tensor, other: Tensor) -> Tensor:
     return one[..., 0] * other[..., 1] - other[..., 0] * one[..., 1]
 
 
-def barycentric(seen: Tensor, corners: Tensor, lens: Tensor, size: tuple[int, int]) -> Tensor:
-    """Weights of the corners, (height, width, 3): r·(B×C), r·(C×A), r·(A×B) over their sum (Olano & Greer 1997)."""
-    row, column = torch.meshgrid(*[torch.arange(side, device=seen.device) for side in size], indexing="ij")
-    ray = (torch.stack([column, row], -1) - lens[2:]) / lens[:2]
-    ray = torch.cat([ray, torch.ones_like(ray[..., :1])], -1)
+def barycentric(seen: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor) -> Tensor:
+    """Return weights of the corners (number, 3) at pixels (number, 2), column and row, that show them: r·(B×C),
+    r·(C×A), r·(A×B) over their sum (Olano & Greer 1997), r the ray to the pixel, or to the place of the face that is
+    nearest to a pixel beside it."""
     a, b, c = seen[corners].unbind(-2)
-    volumes = [(ray * torch.linalg.cross(one, other)).sum(-1) for one, other in ((b, c), (c, a), (a, b))]
-    parts = torch.stack(volumes, -1)
+    normals = torch.stack([torch.linalg.cross(*pair) for pair in ((b, c), (c, a), (a, b))], 1)
+    parts = volumes(normals, lens, pixels.to(seen))
+    with torch.no_grad():
+        place, weights = nearest(seen, corners, lens, pixels.to(seen))
+        beside = ((parts <= 0).any(-1) & (parts >= 0).any(-1))[:, None]
+        place = torch.where(beside, place, pixels)
+    parts = volumes(normals, lens, place)
     total = parts.sum(-1, keepdim=True)
-    seen_at_all = total.abs() > 1e-12 * parts.abs().sum(-1, keepdim=True)  # what is edge-on has no slope
-    weights = torch.where(seen_at_all, parts / torch.where(seen_at_all, total, 1), 1 / 3).clamp(min=0)
-    return weights / weights.sum(-1, keepdim=True)
+    # What is edge-on has no slope. At a border no part is of another sign than the rest: their terms are compared.
+    terms = torch.where(beside, volumes(normals, lens, place, absolute=True), parts.abs())
+    seen_at_all = total.abs() > 1e-12 * terms.sum(-1, keepdim=True)
+    found = torch.where(seen_at_all, parts / torch.where(seen_at_all, total, 1), weights).clamp(min=0)
+    return found / found.sum(-1, keepdim=True)
+
+
+def volumes(normals: Tensor, lens: Tensor, places: Tensor, absolute: bool = False) -> Tensor:
+    """Return r·n (number, 3) of rays r through places (number, 2), pixels, and normals n (number, 3, 3); with
+    `absolute` the sums of the terms' absolute values."""
+    ray = (places - lens[2:]) / lens[:2]
+    terms = torch.cat([ray, torch.ones_like(ray[:, :1])], -1)[:, None] * normals
+    return (terms.abs() if absolute else terms).sum(-1)
+
+
+def nearest(seen: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where the borders of faces are nearest to pixels (number, 2), and the weights (number, 3) there."""
+    corner = seen[corners]
+    start = lens[:2] * corner[..., :2] / corner[..., 2:] + lens[2:]
+    along = start.roll(-1, 1) - start
+    part = ((pixels[:, None] - start) * along).sum(-1) / along.square().sum(-1).clamp(min=1e-300)
+    part = part.clamp(0, 1)
+    place = start + part[..., None] * along
+    edge = (place - pixels[:, None]).square().sum(-1).argmin(-1)[:, None]
+    part = part.gather(1, edge)
+    weights = torch.zeros_like(corner[..., 0]).scatter(1, edge, 1 - part).scatter(1, (edge + 1) % 3, part)
+    weights = weights / corner[..., 2]
+    return place.gather(1, edge[..., None].expand(-1, -1, 2))[:, 0], weights / weights.sum(-1, keepdim=True)
 
 
 def textured(texture: Texture, face: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

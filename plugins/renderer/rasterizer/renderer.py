@@ -24,8 +24,9 @@ class Rasterizer(Renderer):
 
     Corners are rounded to 1/256 pixel and whole numbers decide which pixels a triangle covers: triangles that
     share an edge leave no pixel between them out and share none. What has no area after rounding is left out; what
-    the near plane cuts is clipped. Depth and colour are perspective-correct. Tensors live on the CPU; a scene on a GPU
-    is drawn there in plain torch, without faces that the near plane cuts and with gradient "interior" alone.
+    the near plane cuts is clipped. Depth and colour are perspective-correct, between corners that are not rounded.
+    Tensors live on the CPU; a scene on a GPU is drawn there in plain torch, without faces that the near plane cuts and
+    with gradient "interior" alone.
 
     "color" has a gradient in vertices, colours, textures' images and uv, and the camera's rotation, translation, focal
     lengths and principal point; "depth" too, but for the edges of what is seen.

@@ -1,4 +1,7 @@
-"""What a visible face shows at its pixels: colours, textures, normals; compiled functions on arrays of `raster`.
+"""What a visible face shows at its pixels: colours, depths, textures, normals; compiled functions.
+
+Arrays are those of `raster`. Corners are where they are projected to, not rounded. A pixel that a face covers by the
+rounding of its corners alone, and which lies less than 1/256 pixel beside it, shows the nearest place of the face.
 
 Args:
     colors: (vertices, channels), or None for white ones.
@@ -11,18 +14,41 @@ from typing import no_type_check
 
 import numpy as np
 
-from plugins.renderer.rasterizer.raster import compiled, edges
+from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled, edges, to_edge
 from plugins.renderer.rasterizer.textures import among_texels, mixed, uv_at
 
 
 @compiled
 @no_type_check
-def weights(screen, a, b, c, row, column):
-    """Perspective-correct barycentric weights of a face at a pixel inside it: (w / z) / Σ (w / z)."""
-    edge0, edge1, edge2 = edges(
-        screen[a, 0], screen[a, 1], screen[b, 0], screen[b, 1], screen[c, 0], screen[c, 1], row, column
-    )
-    part0, part1, part2 = edge0 * screen[a, 2], edge1 * screen[b, 2], edge2 * screen[c, 2]
+def weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
+    """Return perspective-correct barycentric weights of a face at a pixel that shows it: (w / z) / Σ (w / z).
+
+    Args:
+        ax, ay, near0: column and row of its first corner in 1/256 pixel, not rounded, and 1 / depth; and so on.
+    """
+    edge0, edge1, edge2 = edges(ax, ay, bx, by, cx, cy, row, column)
+    part0, part1, part2 = edge0 * near0, edge1 * near1, edge2 * near2
+    scale = 1.0 / (part0 + part1 + part2)
+    part0, part1, part2 = part0 * scale, part1 * scale, part2 * scale
+    if not (part0 >= 0 and part1 >= 0 and part2 >= 0):
+        part0, part1, part2 = weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column)
+    return part0, part1, part2
+
+
+@compiled
+@no_type_check
+def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
+    """Return those of the place of a face that is nearest, on the screen, to a pixel beside it."""
+    x, y = column * SUBPIXELS, row * SUBPIXELS
+    to_ab, part_ab = to_edge(ax, ay, bx, by, x, y)
+    to_bc, part_bc = to_edge(bx, by, cx, cy, x, y)
+    to_ca, part_ca = to_edge(cx, cy, ax, ay, x, y)
+    if to_ab <= to_bc and to_ab <= to_ca:
+        part0, part1, part2 = (1 - part_ab) * near0, part_ab * near1, 0.0
+    elif to_bc <= to_ca:
+        part0, part1, part2 = 0.0, (1 - part_bc) * near1, part_bc * near2
+    else:
+        part0, part1, part2 = part_ca * near0, 0.0, (1 - part_ca) * near2
     scale = 1.0 / (part0 + part1 + part2)
     return part0 * scale, part1 * scale, part2 * scale
 
@@ -30,7 +56,8 @@ def weights(screen, a, b, c, row, column):
 @compiled
 @no_type_check
 def weights_in_space(seen, a, b, c, ray_x, ray_y):
-    """Those of a face with corners behind the camera too: r·(b × c) and so on over their sum (Olano & Greer 1997)."""
+    """Return barycentric weights of a face that may have corners behind the camera: r·(b × c) and so on over their sum
+    (Olano & Greer 1997)."""
     part0 = volume(seen, b, c, ray_x, ray_y)
     part1 = volume(seen, c, a, ray_x, ray_y)
     part2 = volume(seen, a, b, ray_x, ray_y)
@@ -46,7 +73,7 @@ def weights_in_space(seen, a, b, c, ray_x, ray_y):
 @compiled
 @no_type_check
 def volume(seen, a, b, ray_x, ray_y):
-    """r · (a × b) of two vertices and a ray (ray_x, ray_y, 1)."""
+    """Return r · (a × b) of two vertices and a ray (ray_x, ray_y, 1)."""
     ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
     bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
     return ray_x * (ay * bz - az * by) + ray_y * (az * bx - ax * bz) + (ax * by - ay * bx)
@@ -55,10 +82,12 @@ def volume(seen, a, b, ray_x, ray_y):
 @compiled
 @no_type_check
 def weights_at(seen, screen, faces, lens, index, row, column):
-    """Barycentric weights of a face at a pixel that shows it."""
+    """Return barycentric weights of a face at a pixel that shows it."""
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
-        return weights(screen, a, b, c, row, column)
+        near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
+        ax, ay, bx, by = screen[a, 3], screen[a, 4], screen[b, 3], screen[b, 4]
+        return weights(ax, ay, near0, bx, by, near1, screen[c, 3], screen[c, 4], near2, row, column)
     return weights_in_space(seen, a, b, c, (column - lens[2]) / lens[0], (row - lens[3]) / lens[1])
 
 
@@ -93,8 +122,12 @@ def tint(laid, index, w0, w1, w2, picture, row, column):
 
 @compiled
 @no_type_check
-def shade(seen, screen, faces, colors, laid, lens, face, box, color):
-    """Fill `color` (height, width, channel) where a face is seen."""
+def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth):
+    """Fill `color` (height, width, channel) and `depth` (height, width), or one of them, where a face is seen.
+
+    Args:
+        near: distance of the near plane, metres: no depth is less.
+    """
     top, bottom, left, right = box
     for row in range(top, bottom):
         for column in range(left, right):
@@ -103,11 +136,18 @@ def shade(seen, screen, faces, colors, laid, lens, face, box, color):
                 continue
             # as `weights_at` and `light` do, in place: a call for each pixel counts references to every array
             a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-            if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
-                w0, w1, w2 = weights(screen, a, b, c, row, column)
+            near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
+            if near0 != 0 and near1 != 0 and near2 != 0:
+                ax, ay, bx, by = screen[a, 3], screen[a, 4], screen[b, 3], screen[b, 4]
+                cx, cy = screen[c, 3], screen[c, 4]
+                w0, w1, w2 = weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column)
             else:
                 ray_x, ray_y = (column - lens[2]) / lens[0], (row - lens[3]) / lens[1]
                 w0, w1, w2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
+            if depth is not None:
+                depth[row, column] = max(w0 * seen[a, 2] + w1 * seen[b, 2] + w2 * seen[c, 2], near)
+            if color is None:
+                continue
             if colors is None:
                 for channel in range(color.shape[2]):
                     color[row, column, channel] = 1.0

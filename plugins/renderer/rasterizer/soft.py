@@ -22,7 +22,7 @@ from typing import no_type_check
 import numpy as np
 
 from plugins.renderer.rasterizer.boundary import along
-from plugins.renderer.rasterizer.raster import BACK, BEHIND, DRAWN, FLAT, OUTSIDE, compiled
+from plugins.renderer.rasterizer.raster import BACK, BEHIND, DRAWN, FLAT, OUTSIDE, compiled, to_edge
 
 BACKGROUND = 1e-3  # ε, as published
 REACH = math.log(1e4 - 1)  # -log(odds) of D = 1e-4
@@ -163,17 +163,6 @@ def parts(ax, ay, bx, by, cx, cy, x, y):
         ((cx - x) * (ay - y) - (ax - x) * (cy - y)) * inverse,
         ((ax - x) * (by - y) - (bx - x) * (ay - y)) * inverse,
     )
-
-
-@compiled
-@no_type_check
-def to_edge(ax, ay, bx, by, x, y):
-    """Squared distance from a pixel to an edge, and where on it the closest point is, 0 to 1."""
-    ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
-    length = ux * ux + uy * uy
-    part = min(max((ux * vx + uy * vy) / length, 0.0), 1.0) if length > 0 else 0.0
-    ox, oy = vx - part * ux, vy - part * uy
-    return ox * ox + oy * oy, part
 
 
 @compiled

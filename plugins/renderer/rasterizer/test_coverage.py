@@ -40,7 +40,7 @@ def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np
     rotation, translation = camera.rotation.double().numpy(), camera.translation.double().numpy()
     lens = np.array(camera.focal), np.array(camera.principal)
     size = camera.height, camera.width
-    seen, screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 3))
+    seen, screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 5))
     number, alone, mask = np.zeros(size, np.int64), np.zeros(size, np.bool_), np.zeros(size, np.bool_)
     counts = np.zeros(6, np.int64)
     raster.project(vertices, rotation, translation, *lens, camera.near, seen, screen)

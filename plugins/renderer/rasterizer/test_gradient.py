@@ -207,6 +207,52 @@ def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
         torch.testing.assert_close(one.grad, other.grad, rtol=2e-3, atol=2e-3 * float(other.grad.abs().max()))
 
 
+def test_inside_a_face_slopes_are_those_of_differences() -> None:
+    """Of colour and depth, in every number of a scene whose one face covers all pixels, against central differences of
+    the picture itself."""
+    torch.manual_seed(0)
+    slope, down = torch.rand(20, 24, 4), torch.rand(20, 24)
+    given = {
+        "vertices": torch.tensor([[-8.0, -8, 4], [9, -6, 5], [-1, 9, 3]], dtype=torch_float),
+        "colors": torch.rand(3, 4, dtype=torch_float),
+        "translation": torch.tensor([0.02, 0.03, 0.1], dtype=torch_float),
+        "focal": torch.tensor([40.0, 45.0]).double(),
+        "principal": torch.tensor([12.2, 9.7]).double(),
+    }
+    rotation = turned(torch.eye(3, dtype=torch_float), torch.tensor([0.1, -0.05, 0.2]).double())
+
+    def loss(vertices: torch.Tensor, colors: torch.Tensor, *pose: torch.Tensor) -> torch.Tensor:
+        translation, focal, principal = pose
+        seen = Camera(rotation, translation, focal, principal, 20, 24, 0.5)
+        drawn = Rasterizer()(Scene(vertices, torch.tensor([[0, 2, 1]]), colors, seen), ("color", "depth"))
+        assert bool(drawn["depth"].isfinite().all())
+        return (slope * drawn["color"]).double().sum() + (down * drawn["depth"]).double().sum()
+
+    learned = [part.clone().requires_grad_() for part in given.values()]
+    found = torch.autograd.grad(loss(*learned), learned)
+    for number, (name, part) in enumerate(given.items()):
+        differences = torch.zeros_like(part)
+        step = (
+            0.3 if name in ("focal", "principal") else 1e-3
+        )  # pixels, or metres: pictures are rounded to float32
+        for index in range(part.numel()):
+            ends = []
+            for sign in (1, -1):
+                parts = [other.clone() for other in given.values()]
+                parts[number].view(-1)[index] += sign * step
+                with torch.no_grad():
+                    ends.append(loss(*parts).item())
+            differences.view(-1)[index] = (ends[0] - ends[1]) / (2 * step)
+        largest = float(differences.abs().max())
+        torch.testing.assert_close(
+            found[number],
+            differences,
+            rtol=0,
+            atol=1e-3 * largest,
+            msg=lambda told, name=name: f"{name}: {told}",
+        )
+
+
 @pytest.mark.parametrize("gradient", ["boundary", "interior", "nmr", "soft"])
 def test_gradients_of_extreme_scenes_are_finite(gradient: Gradient) -> None:
     edge_on = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0.5, 2.5]])
