@@ -22,9 +22,14 @@ def test_maps_are_written_and_what_is_bad_is_listed(tmp_path: Path, framework: F
     for name, spectra in (("one", bad), ("two", held["spectra"])):
         np.savez(mine / f"{name}.npz", spectra=spectra, offsets=held["offsets"], mask=mask)
     (mine / "three.npz").write_bytes((mine / "two.npz").read_bytes()[:3000])
-    always = ("logger=none", "threads=1", "pictures=false")
+    always = ("logger=none", "threads=1")
     trained = framework(
-        "experiment=cest/mlp", "debug=fast", f"data.root={tmp_path}", *always, folder="trained"
+        "experiment=cest/mlp",
+        "debug=fast",
+        f"data.root={tmp_path}",
+        "pictures=false",
+        *always,
+        folder="trained",
     )
     assert trained.code == 0, trained.out
     done = framework(
