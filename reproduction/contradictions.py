@@ -181,7 +181,7 @@ PARTS = (
 
 
 def write_noisy_heads() -> None:
-    """The drawn heads' pictures, and their labels with errors, unless they are there."""
+    """The drawn heads' figures, and their labels with errors, unless they are there."""
     if (NOISY / LABELS).exists():
         return
     drawn = Idiap().source.folder()

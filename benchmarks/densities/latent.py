@@ -54,7 +54,7 @@ KINDS = {
     ("independent", "samples"): ("independent points", RED, "s"),
     ("lattice", "tolerance"): ("lattice points until a tolerance is met", GREEN, "^"),
 }
-"""How each kind of points looks in the picture."""
+"""How each kind of points looks in the figure."""
 COLUMNS = {
     "method": "method",
     "knob": "knob",
@@ -352,7 +352,7 @@ def main() -> None:
         "Errors are root mean squares against the head's own integral by quadrature; the last error is the mean "
         "negative log-likelihood above that of the truth, on the same samples. `lattice`: randomised "
         "quasi-Monte-Carlo points of the framework; `independent`: plain Monte Carlo. "
-        "All values: `latent.csv`; picture: `latent.png`.\n\n"
+        "All values: `latent.csv`; figure: `latent.png`.\n\n"
         f"{table.markdown(shown, COLUMNS)}\n\n"
         "## Points\n\n"
         "Variance of independent normal points over that of a sequence with a random shift, same number of points: "

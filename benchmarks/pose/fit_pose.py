@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python -m benchmarks.pose.fit_pose                 # all three, some 50 minutes
     OMP_NUM_THREADS=1 python -m benchmarks.pose.fit_pose measure soft    # one of them; what is done is kept in outputs/
-    python -m benchmarks.pose.fit_pose report                            # the table and the picture of what is there
+    python -m benchmarks.pose.fit_pose report                            # the table and the figure of what is there
 
 Writes fit_pose.md and fit_pose.png beside this file.
 """
@@ -34,7 +34,7 @@ GRADIENTS: dict[str, dict[str, Any]] = {
     "nmr": {"gradient": "nmr", "supersampling": 4},
     "soft": {"gradient": "soft", "supersampling": 2},
 }
-"""A picture of `soft` is smooth already; with 4 × 4 samples a pixel it takes four times as long."""
+"""An image of `soft` is smooth already; with 4 × 4 samples a pixel it takes four times as long."""
 OPTIONS: dict[str, Any] = {"steps": 30, "restarts": 1, "enough": 0.003}
 """The head's own."""
 
@@ -131,7 +131,7 @@ def picture(results: dict[str, list[dict[str, np.ndarray]]], number: int) -> Non
         scene = source.figure.scene(torch.from_numpy(numbers).double(), camera)
         return eight_bit(fine(scene)["color"][..., :3]).numpy()
 
-    figure = titled_figure((13, 8.5), "A body fitted to its picture from 30° and 20 cm off", True)
+    figure = titled_figure((13, 8.5), "A body fitted to its image from 30° and 20 cm off", True)
     halves = figure.subfigures(2, 1, height_ratios=(1, 1.05))
     assert isinstance(halves, np.ndarray)
     above, below = halves
@@ -183,7 +183,7 @@ def report() -> None:
     text = [
         "# fit_pose: a body's pose by descent through the rasteriser",
         "",
-        "Synthetic pictures of the default body (13,718 vertices), 128 × 96 pixels, drawn with 8 × 8 samples a pixel: "
+        "Synthetic images of the default body (13,718 vertices), 128 × 96 pixels, drawn with 8 × 8 samples a pixel: "
         "a person of random shape in a random pose, turned by exactly 30° about a random axis and moved by 20 cm in a "
         "random direction from where every descent starts. 30 numbers are fitted: rotation, translation, 20 movements "
         "of joints, 4 of shape. `density_head=fit_pose`, the same settings for every gradient; at most one restart.",

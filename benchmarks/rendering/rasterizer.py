@@ -25,7 +25,7 @@ DISTANCE = 2.6  # metres
 ASKED = (("mask",), ("depth",), ("color",), ("color", "depth"))
 LEARNED = ("vertices", "colors")
 ALONE = ("view", "box")
-"""Savings of pictures that nothing came before."""
+"""Savings of images that nothing came before."""
 SCENES = 32
 ROUNDS = 8
 FIRST_CALL = """
@@ -106,7 +106,7 @@ def cells(drawing: Renderer, drawn: Scene) -> list[Callable[[], object]]:
 
 
 def both_ways(renderer: Renderer, drawn: Scene, learned: str) -> None:
-    """A picture, and the slopes of a loss in the vertices or in the colours."""
+    """An image, and the slopes of a loss in the vertices or in the colours."""
     part = getattr(drawn, learned).clone().requires_grad_()
     renderer(replace(drawn, **{learned: part}), ("color",))["color"].sum().backward()
 
@@ -168,7 +168,7 @@ def savings(drawn: Scene) -> list[str]:
 
 
 def side_by_side(drawn: Scene) -> list[str]:
-    """Pictures a second of wall clock, all kept: one by one, in batches on one thread and on two; the best of 25, in
+    """Images a second of wall clock, all kept: one by one, in batches on one thread and on two; the best of 25, in
     turn."""
     scenes = [replace(drawn, vertices=drawn.vertices + 0.001 * number) for number in range(SCENES)]
     plain = renderer(cull=True)
@@ -187,7 +187,7 @@ def side_by_side(drawn: Scene) -> list[str]:
     torch.set_num_threads(1)
     single, one, two = (SCENES / seconds for seconds in best)
     return [
-        "| | pictures a second | ratio |",
+        "| | images a second | ratio |",
         "|---|---|---|",
         f"| {SCENES} one by one | {single:.0f} | 1 |",
         f"| batch of {SCENES}, 1 thread | {one:.0f} | {one / single:.2f} |",
@@ -225,7 +225,7 @@ def report() -> str:
             "",
             f"A synthetic closed body in {HEIGHT} rows × {WIDTH} columns, of which it covers {cover:.0%}; "
             f"one thread; processor time, the lowest of {ROUNDS} medians of 40 calls. Nothing is kept from one "
-            "picture to the next.",
+            "image to the next.",
             "",
             f"| vertices / faces | {' | '.join(' + '.join(asked) for asked in ASKED)} | "
             + " | ".join(f"color, and back to {what}" for what in LEARNED)

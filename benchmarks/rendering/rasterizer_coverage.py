@@ -61,7 +61,7 @@ def report() -> str:
             "within 1/128 pixel of its border are left out.",
             "",
             "| plane | cameras | pixels on it | covered by none | by more than one | pixels off it that are covered | "
-            "other than the whole picture |",
+            "other than the whole image |",
             "|---|---|---|---|---|---|---|",
             *rows,
             "",

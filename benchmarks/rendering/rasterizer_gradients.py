@@ -50,7 +50,7 @@ def loss(
 
 
 def targets(finest: Renderer) -> list[list[Tensor]]:
-    """Pictures of another pose, in each view, with colours and with a texture."""
+    """Images of another pose, in each view, with colours and with a texture."""
     found = []
     for view, azimuth in enumerate(VIEWS):
         torch.manual_seed(view)
@@ -60,7 +60,7 @@ def targets(finest: Renderer) -> list[list[Tensor]]:
 
 
 def differences(finest: Renderer, aims: list[list[Tensor]]) -> dict[str, np.ndarray]:
-    """Central differences of the finest picture's squared error, in every parameter of every view."""
+    """Central differences of the finest image's squared error, in every parameter of every view."""
     found: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for azimuth, aim in zip(VIEWS, aims, strict=True):
         for kind, (name, textured) in KINDS.items():
@@ -75,7 +75,7 @@ def differences(finest: Renderer, aims: list[list[Tensor]]) -> dict[str, np.ndar
 
 
 def slopes(drawing: Renderer, aims: list[list[Tensor]]) -> dict[str, np.ndarray]:
-    """Of the kinds that the renderer draws: blended pictures have no textures."""
+    """Of the kinds that the renderer draws: blended images have no textures."""
     parts = PARTS if "texture" in drawing.differentiable else (False,)
     found: dict[str, list[float]] = {}
     for azimuth, aim in zip(VIEWS, aims, strict=True):
@@ -156,12 +156,12 @@ def main() -> None:
     text = [
         "# rasterizer: four gradients",
         "",
-        "Cosine with, and length over, central differences of a picture with 16 × 16 samples a pixel: the squared "
+        "Cosine with, and length over, central differences of an image with 16 × 16 samples a pixel: the squared "
         "error against another pose, over 4 views, in 8 deformations of the vertices, 3 changes of colours, and the "
         "camera's rotation, translation and focal length; and, of the body with a smooth texture instead, in 3 changes "
         "of it and in the deformations. A synthetic body with 3,280 vertices that hides parts of "
-        "itself, 72 × 88 pixels. `nmr` is Kato et al.'s approximation (CVPR 2018), `soft` Liu et al.'s blurred picture "
-        "(ICCV 2019), whose own slope is exact: the table says how far it is from that of the sharp picture.",
+        "itself, 72 × 88 pixels. `nmr` is Kato et al.'s approximation (CVPR 2018), `soft` Liu et al.'s blurred image "
+        "(ICCV 2019), whose own slope is exact: the table says how far it is from that of the sharp image.",
         "",
         f"Milliseconds: forward and backward of that error; and of a figure with 6,890 vertices in {HEIGHT} × {WIDTH} "
         "pixels, in its vertices. One thread; processor time, median of 10.",

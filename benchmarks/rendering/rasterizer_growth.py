@@ -2,7 +2,7 @@
 
     python -m benchmarks.rendering.rasterizer_growth --draw
 
-draws rasterizer_growth.png anew from rasterizer_growth.csv, which `benchmarks/rendering/rasterizer.py` writes.
+draws rasterizer_growth.png again from rasterizer_growth.csv, which `benchmarks/rendering/rasterizer.py` writes.
 """
 
 import math
@@ -28,11 +28,11 @@ FACES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 PIXELS = (100, 200, 400, 800, 1_600, 4_000)
 """Along each side."""
 CHANNELS = {"mask": "silhouette alone (mask)", "color": "colours"}
-PANELS = {"faces": "faces of the ball (400 × 400 pixels)", "pixels": "pixels of the picture (10,000 faces)"}
+PANELS = {"faces": "faces of the ball (400 × 400 pixels)", "pixels": "pixels of the image (10,000 faces)"}
 
 
 def ball(faces: int, side: int) -> Scene:
-    """A closed sphere that fills most of a square picture."""
+    """A closed sphere that fills most of a square image."""
     return replace(
         sphere(int(math.sqrt(faces / 4))), camera=look_from(0.3, 0.2, 0.1, 4.0, 0.55, (side, side))
     )
@@ -56,7 +56,7 @@ def slope(sizes: Sequence[float], times: Sequence[float]) -> float:
 
 
 def report(picture: Path) -> list[str]:
-    """Lines of Markdown; writes the table and draws the picture beside."""
+    """Lines of Markdown; writes the table and draws the figure beside."""
     renderer = build(
         "renderer", resolve("renderer", {"name": "rasterizer", "cull": True, "savings": ("view", "box")})
     )
@@ -82,7 +82,7 @@ def report(picture: Path) -> list[str]:
 
 
 def drawn(rows: Sequence[Row], picture: Path) -> None:
-    figure = titled_figure((9, 4), "Time of a picture of a ball", True)
+    figure = titled_figure((9, 4), "Time of an image of a ball", True)
     panels = figure.subplots(1, 2, sharey=True)
     for axes, (against, label) in zip(panels, PANELS.items(), strict=True):
         for (channel, name), colour, marker in zip(CHANNELS.items(), COLOURS, MARKERS, strict=False):

@@ -30,7 +30,7 @@ def status(name: str) -> int:
 
 
 def both_ways(drawn: Scene, renderer: Rasterizer) -> list[Tensor]:
-    """A picture and its slopes in vertices and colours: outputs, and copies of inputs."""
+    """An image and its slopes in vertices and colours: outputs, and copies of inputs."""
     assert drawn.colors is not None
     learned = [drawn.vertices.clone().requires_grad_(), drawn.colors.clone().requires_grad_()]
     color = renderer(replace(drawn, vertices=learned[0], colors=learned[1]))["color"]
@@ -39,7 +39,7 @@ def both_ways(drawn: Scene, renderer: Rasterizer) -> list[Tensor]:
 
 
 def measured(gradient: Gradient) -> str:
-    """Of a renderer's first picture of the body, in a process that has compiled all before: what the process grew by at
+    """Of a renderer's first image of the body, in a process that has compiled all before: what the process grew by at
     most, and what NumPy and Python had allocated at most, without inputs and outputs, MiB."""
     torch.set_num_threads(1)
     body, small = (scene(*shape, distance=DISTANCE) for shape in (subdivided(*figure()), figure(8, 8)))
@@ -72,8 +72,8 @@ def report() -> str:
         [
             "# rasterizer: peak memory, MiB",
             "",
-            f"A picture (`color`, {HEIGHT} × {WIDTH}) of a body of 27,554 vertices and its slopes in vertices and "
-            "colours, the first of a renderer; each in a process of its own that has drawn a small picture before.",
+            f"An image (`color`, {HEIGHT} × {WIDTH}) of a body of 27,554 vertices and its slopes in vertices and "
+            "colours, the first of a renderer; each in a process of its own that has drawn a small image before.",
             "",
             "| gradient | process grew by, beyond inputs and outputs | allocated by NumPy and Python, outputs too | "
             "inputs and outputs |",

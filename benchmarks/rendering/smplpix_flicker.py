@@ -3,7 +3,7 @@
     python -m framework experiment=smplpix/quick
     python -m benchmarks.rendering.smplpix_flicker <run> <walk.bvh>
 
-Of a generated person that the run never saw. Each picture is brought along to the next by the flow of the registered
+Of a generated person that the run never saw. Each image is brought along to the next by the flow of the registered
 mesh, which is known exactly, and compared with it where a point is seen in both. Writes smplpix_flicker.md and .png
 beside this file.
 """
@@ -38,7 +38,7 @@ SUBJECTS = ("test_0000", "test_0003", "test_0005")
 FRAMES, START, AZIMUTH = 20, 0.5, math.radians(35)
 PAIRS = FRAMES - 1
 SHOWN = 8
-"""Frame of the picture."""
+"""Frame of the image."""
 LOOPS = 60
 BRIGHT = 60.0
 """Of 255: white in the maps."""
@@ -50,7 +50,7 @@ def rendered(name: str, **config: Any) -> Renderer:
 
 
 def walk(run: str, file: Path, subject: str) -> tuple[Pictures, list[Scene]]:
-    """Pictures of each way, as files hold them, 0…255; and what they are of."""
+    """Images of each way, as files hold them, 0…255; and what they are of."""
     description, _ = stored(run)
     data = data_of(description)
     height, width = description.target.size
@@ -74,7 +74,7 @@ def walk(run: str, file: Path, subject: str) -> tuple[Pictures, list[Scene]]:
 
 
 def differences(pictures: Pictures, scenes: list[Scene]) -> tuple[dict[str, list[Tensor]], list[Tensor]]:
-    """Of each way and pair of pictures the difference, of 255, NaN where a point is not seen in both; and that mask."""
+    """Of each way and pair of images the difference, of 255, NaN where a point is not seen in both; and that mask."""
     renderer = rendered("rasterizer")
     drawn = [renderer(scene, flow.CHANNELS) for scene in scenes]
     found: dict[str, list[Tensor]] = {name: [] for name in pictures}
@@ -104,7 +104,7 @@ def judged(per_subject: list[dict[str, list[Tensor]]]) -> dict[str, dict[str, fl
 
 
 def drawing(pictures: Pictures, found: dict[str, list[Tensor]]) -> Figure:
-    figure = titled_figure((9.5, 6.5), "A walk, and how much of each picture flickers", True)
+    figure = titled_figure((9.5, 6.5), "A walk, and how much of each image flickers", True)
     axes = figure.subplots(2, len(pictures))
     for column, name in enumerate(pictures):
         axes[0, column].imshow(pictures[name][SHOWN].byte().numpy())
@@ -114,12 +114,12 @@ def drawing(pictures: Pictures, found: dict[str, list[Tensor]]) -> Figure:
         for axis in axes[:, column]:
             axis.set_axis_off()
     bar = figure.colorbar(shown, ax=axes[1], extend="max")
-    bar.set_label("|difference| to the next picture\nafter the flow (of 255)")
+    bar.set_label("|difference| to the next image\nafter the flow (of 255)")
     return figure
 
 
 def rates(run: str, scene: Scene) -> list[str]:
-    """Milliseconds of processor time a picture in plain loops of one thread, beside what the run measured of itself."""
+    """Milliseconds of processor time an image in plain loops of one thread, beside what the run measured of itself."""
     results = json.loads((find_checkpoint(run).parent.parent / "results.json").read_text())
     assert scene.colors is not None
     points = torch.cat([scene.camera.canonical(scene.vertices), encoded(scene.colors)], 1).numpy()[None]
@@ -130,7 +130,7 @@ def rates(run: str, scene: Scene) -> list[str]:
     def predicted() -> object:
         return loaded(points).mean
 
-    # on one frozen sample the mean of the picture is what the renderer paints, but as files hold it
+    # on one frozen sample the mean of the image is what the renderer paints, but as files hold it
     apart = np.abs(eight_bit(drawn(scene)["color"]).numpy() - (frozen(points)[0] * 255).round()).max()
     calls: dict[str, Callable[[], object]] = {
         "`framework.freeze(run)(points)`": lambda: frozen(points),
@@ -153,7 +153,7 @@ def rates(run: str, scene: Scene) -> list[str]:
         *lines,
         f"| the run of itself, one sample alone, wall clock | {results['latency_milliseconds']:.1f} | |",
         "",
-        f"Frozen and drawn pictures differ by {apart:g} of 255 at most.",
+        f"Frozen and drawn images differ by {apart:g} of 255 at most.",
     ]
 
 
@@ -189,11 +189,11 @@ def report(run: str, file: Path) -> str:
             "",
             f"The network: {training(run)}",
             "",
-            f"{len(SUBJECTS)} generated test subjects walk as `{file.name}` says, {FRAMES} pictures each at {SPEED} a "
-            f"second, {scenes[0].camera.height} × {scenes[0].camera.width} pixels. Each picture is brought to the next "
+            f"{len(SUBJECTS)} generated test subjects walk as `{file.name}` says, {FRAMES} images each at {SPEED} a "
+            f"second, {scenes[0].camera.height} × {scenes[0].camera.width} pixels. Each image is brought to the next "
             "by the flow of the registered mesh (visible face and barycentric weights, exact), bilinear; the "
-            "difference of sRGB numbers, of 255, mean of the channels, is taken where a point is seen in both pictures "
-            f"and no outline is near: {statistics.mean(covered):.1%} of a frame. Photographs say what a true picture "
+            "difference of sRGB numbers, of 255, mean of the channels, is taken where a point is seen in both images "
+            f"and no outline is near: {statistics.mean(covered):.1%} of a frame. Photographs say what a true image "
             "has of it: fine patterns that interpolation blurs, cloth that moves beside the registered body, light "
             "that changes as the body turns. A mesh with fixed colours of its vertices has less of all three, and may "
             "be below.",

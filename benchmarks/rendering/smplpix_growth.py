@@ -3,7 +3,7 @@
     python -m benchmarks.rendering.smplpix_growth
     python -m benchmarks.rendering.smplpix_growth --draw
 
-Writes smplpix_growth.md, .csv and .png beside this file; `--draw` draws the picture anew from the table.
+Writes smplpix_growth.md, .csv and .png beside this file; `--draw` draws the figure again from the table.
 """
 
 import math
@@ -52,7 +52,7 @@ def encoder(name: str, shape: tuple[int, ...], **config: object) -> Encoder:
 
 
 def ways(shape: tuple[int, ...], name: str) -> dict[str, Callable[[Tensor], Tensor]]:
-    """A picture from coloured points, by how it is drawn."""
+    """An image from coloured points, by how it is drawn."""
     height, width = SIZE
     size = {"height": height, "width": width}
     projection = encoder("projection", shape, **size)
@@ -124,7 +124,7 @@ def report(picture: Path) -> str:
 
 def drawn(rows: Sequence[Row], picture: Path) -> None:
     figure = titled_figure(
-        (8, 4.4), f"Time of a picture of {SIZE[0]} × {SIZE[1]} pixels against vertices", True
+        (8, 4.4), f"Time of an image of {SIZE[0]} × {SIZE[1]} pixels against vertices", True
     )
     axes = figure.subplots()
     for way, colour, marker in zip(

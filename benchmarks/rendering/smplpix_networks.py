@@ -45,7 +45,7 @@ TRAININGS = {
 """Arguments of runs of about a quarter of an hour: half an epoch, and ten."""
 MARGINS = (0, 8, 16, 24, 32, 48, 64)
 SHOWN = {"unet": 12, "slim": 96}
-"""Test pictures on which crop and bfloat16 are compared: the first of them."""
+"""Test images on which crop and bfloat16 are compared: the first of them."""
 LEAST_RATIO, MOST_FLOAT32, MOST_BFLOAT16, LEAST_GAIN, MOST_BELOW = 6.0, 60.0, 20.0, 1.5, 0.3
 
 
@@ -55,7 +55,7 @@ class Trained(NamedTuple):
     Attributes:
         encoder: the network.
         numbers: of its run's test.
-        points: (picture, point, 6), the inputs of the test split.
+        points: (image, point, 6), the inputs of the test split.
         minutes: of processor time, the whole run.
     """
 
@@ -129,7 +129,7 @@ def frames() -> tuple[list[str], dict[tuple, Rounds], list[float]]:
 
 
 def steps() -> list[str]:
-    """Milliseconds of a training step of four pictures, forwards and backwards, without the optimiser."""
+    """Milliseconds of a training step of four images, forwards and backwards, without the optimiser."""
     lines = []
     with torch.no_grad():
         batch = projection(SIZES[1])(body()).expand(4, -1, -1, -1)
@@ -175,7 +175,7 @@ def equal_time(found: dict[str, Trained]) -> list[str]:
 
 @torch.inference_mode()
 def costs(found: dict[str, Trained]) -> list[str]:
-    """What crop and bfloat16 change of a trained network's pictures."""
+    """What crop and bfloat16 change of a trained network's images."""
     lines = []
     kinds: list[tuple[str, dict[str, Any]]] = [(f"margin {margin}", {"crop": margin}) for margin in MARGINS]
     kinds += [("bfloat16, whole frame", {"crop": None, "precision": "bfloat16"})]
@@ -244,7 +244,7 @@ def of_frames() -> str:
     return "\n".join(
         [
             f"A synthetic body of {body().shape[1]:,} points, projected with splats of {SPLAT} pixels as "
-            f"`smplpix/quick` has it; it covers {cover[0]:.0%} of the larger, {cover[1]:.0%} of the smaller picture. "
+            f"`smplpix/quick` has it; it covers {cover[0]:.0%} of the larger, {cover[1]:.0%} of the smaller image. "
             f"One thread, processor time, all in turn: median of {ROUNDS} rounds (least to largest). GFLOP: "
             "multiply-adds of convolutions, times two. Pixels: those computed, beyond the border too, of those of the "
             "picture.",
@@ -274,13 +274,13 @@ def report() -> str:
             "",
             "## Training",
             "",
-            f"Four pictures of {SIZES[1][0]} × {SIZES[1][1]} in float32, forwards and backwards:",
+            f"Four images of {SIZES[1][0]} × {SIZES[1][1]} in float32, forwards and backwards:",
             "",
             "| network | ms |",
             "|---|---:|",
             *steps(),
             "",
-            "What each makes of about as much time: seed 0, 96 test pictures of 16 unseen generated people, 256 × 192. "
+            "What each makes of about as much time: seed 0, 96 test images of 16 unseen generated people, 256 × 192. "
             "Minutes of processor time, the whole run on one core.",
             "",
             "| network | training | minutes | PSNR, dB | inside | SSIM | inside |",
@@ -291,7 +291,7 @@ def report() -> str:
             "",
             "## What crop and bfloat16 cost",
             "",
-            f"The networks of that training on inputs of the test split (slim: {SHOWN['slim']} pictures, unet: "
+            f"The networks of that training on inputs of the test split (slim: {SHOWN['slim']} images, unet: "
             f"{SHOWN['unet']}). Largest difference of a colour from the whole frame in float32, of 255; mean in "
             "brackets:",
             "",

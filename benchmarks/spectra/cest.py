@@ -5,7 +5,7 @@
     python -m benchmarks.spectra.cest outputs/cest/0 outputs/cest/1 outputs/cest/2
 
 Writes cest.md, cest.csv, cest.png and cest_maps.png beside this file. One thread, processor time, all in one run.
-With `--draw` it draws cest.png anew from cest.csv, with `--only speed brain7T.mat` it writes the first section alone,
+With `--draw` it draws cest.png again from cest.csv, with `--only speed brain7T.mat` it writes the first section alone,
 in four minutes and without networks.
 """
 

@@ -3,7 +3,7 @@
     python -m reproduction.thesis_tables 2.1
 
 Or of sweeps that have run: `python -m reproduction.chapter2.moons <their folders>`. Writes moons.md,
-moons_landscapes.png and moons_reliability.png beside this file; with `--draw` before the folders only the pictures.
+moons_landscapes.png and moons_reliability.png beside this file; with `--draw` before the folders only the figures.
 """
 
 import json

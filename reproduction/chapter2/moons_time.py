@@ -7,7 +7,7 @@
     python -m reproduction.chapter2.moons_time outputs/time
     python -m reproduction.chapter2.moons_time --draw
 
-Writes moons_time.csv and moons_time.png beside this file; `--draw` draws moons_time.png anew from moons_time.csv.
+Writes moons_time.csv and moons_time.png beside this file; `--draw` draws moons_time.png again from moons_time.csv.
 """
 
 import sys

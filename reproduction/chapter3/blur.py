@@ -5,7 +5,7 @@
     python -m reproduction.chapter3.blur --draw
 
 Every trained model of the pan alone sees its own test split under Gaussian blurs. Writes blur.md, blur.csv, blur.png
-(the curves) and blur_strip.png (one head's densities) beside this file; `--draw` draws blur.png anew from blur.csv.
+(the curves) and blur_strip.png (one head's densities) beside this file; `--draw` draws blur.png again from blur.csv.
 """
 
 import argparse
@@ -37,7 +37,7 @@ METHODS = {
     "cvae": "CVAE",
     "scvae": "sCVAE",
 }
-"""The experiments, and what the pictures call them."""
+"""The experiments, and what the figures call them."""
 UNIFORM = -math.log(2 * math.pi)
 CUT = -3.0
 """Nats: below, the axis of the curves is compressed."""
@@ -210,7 +210,7 @@ def main(sweeps: list[Path], root: str | None) -> None:
         f"# Log-likelihood of the pan under Gaussian blur: {label}\n\n"
         f"Nats, {len(fields['target'])} test images of {fields['input'].shape[-1]} pixels, models trained "
         f"without blur; σ is the Gaussian's in pixels of an image of {SIDE}; ± is the standard "
-        f"deviation over seeds. The uniform density has {UNIFORM:.2f}. Commands in `blur.py`, pictures "
+        f"deviation over seeds. The uniform density has {UNIFORM:.2f}. Commands in `blur.py`, figures "
         f"`blur.png` (Figure 3.7) and `blur_strip.png` (Figure 3.8).\n\n{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
@@ -224,7 +224,7 @@ if __name__ == "__main__":
     )
     arguments.add_argument("sweeps", nargs="*", type=Path)
     arguments.add_argument("--root", help="the real data set, where runs were trained on a generated one")
-    arguments.add_argument("--draw", action="store_true", help="draw blur.png anew from blur.csv")
+    arguments.add_argument("--draw", action="store_true", help="draw blur.png again from blur.csv")
     given = arguments.parse_args()
     if given.draw:
         curves(read_rows(HERE.with_suffix(".csv")), HERE.with_suffix(".png"))

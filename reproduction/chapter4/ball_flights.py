@@ -4,7 +4,7 @@
     python -m reproduction.chapter4.ball_flights --draw
 
 Trains what is not yet in outputs/ball_flights, some ten minutes a method on one core, and writes ball_flights.md, .csv,
-.png and ball_flights_bundle.png beside this file; `--draw` draws ball_flights.png anew from the table. On recorded
+.png and ball_flights_bundle.png beside this file; `--draw` draws ball_flights.png again from the table. On recorded
 flights networks start from the weights of the simulated ones; flights, not windows, are split, by the seed.
 """
 
@@ -51,7 +51,7 @@ EPOCHS = {"tvae": 600, "lstm": 150, "hybrid": 150}
 MOST = 1000
 """Test windows that are looked at."""
 BUNDLES = (0, 3, 5)
-"""Of the windows that `FlightError` keeps for its picture, those drawn."""
+"""Of the windows that `FlightError` keeps for its figure, those drawn."""
 AT = (1, 5, 10, 20, 35)
 """Frames of the table."""
 Model = Any
@@ -299,7 +299,7 @@ def write(
     latencies: list[str],
     alike: str,
 ) -> None:
-    """The page and both pictures."""
+    """The page and both figures."""
     text = [
         "# Predicted ball flights: error against time", "",
         "![Error against time](ball_flights.png)", "",

@@ -4,7 +4,7 @@
     python -m reproduction.chapter6.reconstruction --draw
 
 Writes reconstruction.csv, reconstruction_time.csv, reconstruction.png and reconstruction.md beside this file; half a
-minute on one core. `--draw` draws the picture anew from both tables. Shapes are the generated CAD models of
+minute on one core. `--draw` draws the figure again from both tables. Shapes are the generated CAD models of
 data=modelnet40.
 """
 
@@ -52,7 +52,7 @@ METHODS = {
     "bps ball_grid": "basis points, grid in the ball",
     "bps grid": "basis points, grid in the cube",
 }
-"""The encodings, and what the picture calls them."""
+"""The encodings, and what the figure calls them."""
 ENCODER, BALL_TREE = "bps", "scikit-learn ball tree"
 CLOUD_SIZES = (10, 100, 1000, 2048, 10_000, 100_000)
 BASIS_SIZES = (100, 512, 4096, 32_768)
@@ -268,7 +268,7 @@ def main() -> None:
         f"{'synthetic ' if synthetic else ''}CAD shapes, "
         f"{POINTS} points of each surface, in the unit ball. Error: the Chamfer distance (eq. 6.6) between a cloud and "
         "what is decoded from N numbers: N/3 of its points (raw), the centres of occupied cells of N flags, or basis "
-        "points and deltas of N/3 basis points. Values: `reconstruction.csv`, `reconstruction_time.csv`; picture: "
+        "points and deltas of N/3 basis points. Values: `reconstruction.csv`, `reconstruction_time.csv`; figure: "
         "`reconstruction.png`.\n\n"
         f"Thesis (Figure 6.4): less than half of the occupancy grid's error up to about N = 1e4; near that of raw "
         "points; random and hexagonal best. Measured (ratios of errors, curves read between their points):\n\n"

@@ -6,7 +6,7 @@
 
 Writes registration.md beside this file; of the first run also its error and, of both, those of the correspondences that
 FAUST's challenges ask for, on people generated in its layout; of a scan (one is in the folder REAL_DATA_ROOT) the
-picture registration.png. Times are the processor's, of one thread.
+figure registration.png. Times are the processor's, of one thread.
 """
 
 import argparse

@@ -3,7 +3,7 @@
     python -m reproduction.chapter7.smplpix_figures <run of smplpix/quick> <run of smplpix/hybrid>
 
 Other people than in training, other views, other poses, other shapes: projected points, mesh, what each run paints,
-photograph, and where each is off. Writes smplpix_figures.md and a picture of each figure beside this file.
+photograph, and where each is off. Writes smplpix_figures.md and each figure beside this file.
 """
 
 import math
@@ -232,7 +232,7 @@ def decibels(drawn: Mapping[str, Pictures]) -> str:
     for name in ways:
         errors = [np.square((some[name].astype(float) - some[TRUTH]) / 255).mean() for some in known]
         means.append(f"{name} {np.mean(-10 * np.log10(errors)):.1f} dB")
-    count = f"{len(known)} pictures" if len(known) > 1 else "one picture"
+    count = f"{len(known)} images" if len(known) > 1 else "one image"
     return f"PSNR of the frame, mean of {count}: {', '.join(means)}."
 
 

@@ -2,7 +2,7 @@
 
     python -m reproduction.chapter7.smplpix_table
 
-Runs SWEEPS into outputs/smplpix_table, or goes on with them, then judges every test picture anew; `… <folders of
+Runs SWEEPS into outputs/smplpix_table, or goes on with them, then judges every test image again; `… <folders of
 sweeps> [--lpips <alexnet.pth>]` only judges. Writes smplpix_table.md beside it.
 """
 
@@ -65,7 +65,7 @@ SAID = (
     *("experiment", "data.topology", "seed", "trainer.max_epochs"),
     *("metric", "pictures", "logger", "threads", "workers"),
 )
-"""Arguments that a row says already, or that all have, or that change no picture."""
+"""Arguments that a row says already, or that all have, or that change no image."""
 RIVAL = "rasterised"
 COLUMNS = {
     "psnr_db": ("PSNR, dB", 2),
@@ -111,12 +111,12 @@ THESIS = {
 
 @dataclass(frozen=True)
 class Judged:
-    """One trained model on every test picture.
+    """One trained model on every test image.
 
     Attributes:
-        numbers: of each picture by key, NaN where it has none.
-        subjects: of each picture.
-        drawing, network: milliseconds of a picture, of encoders that are fixed and of those that learn.
+        numbers: of each image by key, NaN where it has none.
+        subjects: of each image.
+        drawing, network: milliseconds of an image, of encoders that are fixed and of those that learn.
         learns: whether anything was trained.
     """
 
@@ -164,10 +164,10 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "# Table 7.1 on synthetic people",
             "",
             f"{about} Sweeps: {told}. Means over "
-            "test pictures; behind ± the standard deviation over seeds, then that over subjects (of the means of each "
-            "one's pictures and seeds). A dash: nothing is trained, all seeds give the same numbers. Inside: over "
+            "test images; behind ± the standard deviation over seeds, then that over subjects (of the means of each "
+            "one's images and seeds). A dash: nothing is trained, all seeds give the same numbers. Inside: over "
             "the subject's pixels; the others over the frame, most of which is white. Milliseconds of "
-            "processor time, one picture alone on one thread: drawing the mesh, 4 × 4 samples a pixel unless said, or "
+            "processor time, one image alone on one thread: drawing the mesh, 4 × 4 samples a pixel unless said, or "
             "projecting its vertices; then the network. Networks are trained for a quarter of the experiments' epochs; "
             "what longer training brings: [smplpix_training.md](smplpix_training.md)." + unfinished(runs),
             "",
@@ -178,7 +178,7 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "",
             "## Against the mesh with the same vertices' colours",
             "",
-            "Picture by picture, then the mean of each subject: mean difference ± standard deviation over subjects.",
+            "Image by image, then the mean of each subject: mean difference ± standard deviation over subjects.",
             "",
             f"| | vertices | {' | '.join(gain_heading(key) for key in GAINS)} | subjects who gain inside |",
             f"|---|---|{'---:|' * (len(GAINS) + 1)}",
@@ -302,7 +302,7 @@ def described(data: Data) -> str:
 
 
 def by_subject(values: np.ndarray, subjects: np.ndarray) -> np.ndarray:
-    """Means over each subject's pictures that have a number."""
+    """Means over each subject's images that have a number."""
     return np.array([np.nanmean(values[subjects == one]) for one in np.unique(subjects)])
 
 

@@ -311,7 +311,7 @@ def draw(rows: Record, place: Path) -> None:
 
 @torch.inference_mode()
 def sheet(place: Path, chosen: Sequence[int] = (0, 20, 44, 75)) -> None:
-    """Photographs of unseen people, their pictures, and where these are off; as it was where a run is not there."""
+    """Photographs of unseen people, their images, and where these are off; as it was where a run is not there."""
     names = {RIVAL: 0, "points alone, 7k": 20, "over the mesh, 7k": 20}
     runs = [METHODS[name].place(epochs, 0) for name, epochs in names.items()]
     if not all((run / "results.json").is_file() for run in runs):

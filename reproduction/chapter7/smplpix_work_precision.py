@@ -3,7 +3,7 @@
     python -m reproduction.chapter7.smplpix_work_precision <run> …
 
 With runs of smplpix/quick, hybrid or their like, all on the same data; writes smplpix_work_precision.md, .csv
-and .png beside this file. `--draw` draws the picture anew from the table.
+and .png beside this file. `--draw` draws the figure again from the table.
 """
 
 import math
@@ -88,7 +88,7 @@ def networks(run: str) -> Iterator[tuple[str, Predictor, Data]]:
 
 
 def feature_distance(predictor: Predictor, data: Data) -> float:
-    """Mean over the test pictures of the objective `random_features`, whose network knows nothing about images."""
+    """Mean over the test images of the objective `random_features`, whose network knows nothing about images."""
     objective = build("objective", resolve("objective", {"name": "random_features", "cache": 0}))
     total, count = 0.0, 0
     with torch.no_grad():
@@ -139,7 +139,7 @@ def main(runs: list[str]) -> None:
     text = [
         "# Quality of an image against its run time (synthetic people)",
         "",
-        f"{about} Means over subjects. Milliseconds of processor time, one picture alone on one thread: of drawing the "
+        f"{about} Means over subjects. Milliseconds of processor time, one image alone on one thread: of drawing the "
         "mesh or projecting its vertices, and of the network. Networks compute the subject's box or the whole frame. "
         "The distance in random features is that of an untrained network (objective `random_features`), not LPIPS, "
         "whose weights are not available.",
@@ -162,7 +162,7 @@ def drawn(rows: Sequence[Row]) -> None:
         rows,
         SHOWN,
         BETTER,
-        title="Pictures of unseen people against the time of one picture",
+        title="Images of unseen people against the time of one image",
         synthetic=True,
         machine="one core, processor time",
         note="Bars: standard error over subjects. Numbers beside points: samples of a pixel along each axis.",
