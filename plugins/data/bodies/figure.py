@@ -164,7 +164,7 @@ class Figure:
         The joints' slopes are central differences in float64, all at once; what they blend is linear in the rest.
         """
         numbers = numbers.double()
-        steps = STEP * torch.eye(len(numbers), dtype=torch.float64)
+        steps = STEP * torch.eye(len(numbers), dtype=torch.float64, device=numbers.device)
         ends = self._transforms(torch.cat([numbers + steps, numbers - steps])).unflatten(0, (2, -1))
         along = ((ends[0] - ends[1]) / (2 * STEP)).float()
         weights, rest = self.weights[:, chosen], self._rest(numbers, chosen)
@@ -186,7 +186,8 @@ class Figure:
         count = len(self.slots)
         joints = self.joints + torch.einsum("...s,sjk->...jk", numbers[..., 6 + count :], self.joint_shapes)
         about = torch.cat([numbers[..., None, :3], self.axes * numbers[..., 6 : 6 + count, None]], -2)
-        turns = (turns_less_identity(about) + torch.eye(3, dtype=torch.float64)).unbind(-3)
+        identity = torch.eye(3, dtype=torch.float64, device=numbers.device)
+        turns = (turns_less_identity(about) + identity).unbind(-3)
         local: dict[int, Tensor] = {self.order[0]: turns[0]}
         for joint, turn in zip(self.slots, turns[1:], strict=True):
             local[joint] = local[joint] @ turn if joint in local else turn
