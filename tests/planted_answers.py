@@ -97,7 +97,9 @@ def nameless(head: Faulty, raw: Tensor) -> Distribution:
 def shared_noise(density: Any, shape: torch.Size) -> Tensor:
     """The same draws for every row of the batch."""
     whole = (*shape, *density.location.shape)
-    noise = torch.randn(*shape, *([1] * len(density.batch_shape)), 1, dtype=density.scale.dtype)
+    noise = torch.randn(
+        *shape, *([1] * len(density.batch_shape)), 1, dtype=density.scale.dtype, device=density.scale.device
+    )
     return density.location + density.scale * noise.expand(whole)
 
 
@@ -120,7 +122,9 @@ def below_labels(density: Any, shape: torch.Size) -> Tensor:
 
 def second_as_first(density: Any, shape: torch.Size) -> Tensor:
     """Both numbers from one noise: each marginal is right."""
-    noise = torch.randn(*shape, *density.batch_shape, 1, dtype=density.scale.dtype)
+    noise = torch.randn(
+        *shape, *density.batch_shape, 1, dtype=density.scale.dtype, device=density.scale.device
+    )
     return density.location + density.scale * noise
 
 
@@ -134,7 +138,9 @@ def first_only(density: Any) -> Tensor:
 
 
 def laplace(density: Any, shape: torch.Size) -> Tensor:
-    drawn = torch.rand((*shape, *density.location.shape), dtype=density.scale.dtype)
+    drawn = torch.rand(
+        (*shape, *density.location.shape), dtype=density.scale.dtype, device=density.scale.device
+    )
     return density.location + density.scale * math.sqrt(12) * (drawn - 0.5)
 
 

@@ -336,7 +336,7 @@ ALL_FAULTS = (
     Fault(
         "draws every class alike",
         CLASSES,
-        {"sample": lambda d, s: torch.randint(3, (*s, *d.batch_shape))},
+        {"sample": lambda d, s: torch.randint(3, (*s, *d.batch_shape), device=d.logits.device)},
         "samples follow log_prob",
     ),
     Fault("entropy in bits", CLASSES, {"entropy": lambda d: d.entropy() / math.log(2)}, "entropy"),

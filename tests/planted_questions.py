@@ -22,6 +22,7 @@ from framework.distributions.protocol import (
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
 from plugins.density_head.von_mises.density import VonMises
+from tests import planted_devices
 from tests.planted_heads import CLASSES, HEIGHT, IMAGE, ONE, PLACE, Fault, Faulty
 from tests.right_heads import LaplaceHead, Logistic, LogisticHead, Product, StudentTHead
 
@@ -207,6 +208,7 @@ def cut_batch(head: Faulty, raw: Tensor) -> Distribution:
 
 
 FURTHER_FAULTS = (
+    *planted_devices.HEADS,
     # estimate
     Fault("estimate 0.05 nats high", ONE,
           {"estimate": lambda d, v: exactly(d, v)._replace(log_mean=d.log_prob(v) + 0.05)}, "estimate"),

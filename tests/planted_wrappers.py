@@ -99,7 +99,7 @@ class Weighted(Uncertainty):
         seen = list(batches)
         for model in self.each():
             model.calibrate(seen)
-        shares = torch.linspace(0.02, 0.98, 25, dtype=torch.float64)
+        shares = torch.linspace(0.02, 0.98, 25, dtype=torch.float64, device=self.share.device)
         values = [
             torch.cat([self.mixed(one["input"], share).log_prob(one["target"]) for one in seen])
             .double()

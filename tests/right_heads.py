@@ -184,7 +184,8 @@ class Logistic(Distribution):
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.place.shape
-        drawn = torch.rand(shape, dtype=self.place.dtype).clamp(min=torch.finfo(self.place.dtype).tiny)
+        drawn = torch.rand(shape, dtype=self.place.dtype, device=self.place.device)
+        drawn = drawn.clamp(min=torch.finfo(self.place.dtype).tiny)
         return self.place + self.width * torch.logit(drawn, eps=torch.finfo(self.place.dtype).eps / 2)
 
     def entropy(self) -> Tensor:
@@ -235,7 +236,9 @@ class LogisticHead(_OfReals):
     @torch.no_grad()
     def calibrate(self, raw: Tensor, target: Tensor) -> None:
         place, scale = self.parameters_of(raw)
-        factors = self.factor * torch.logspace(-1, 1, 41, dtype=torch.float64)  # 1 among them
+        factors = self.factor * torch.logspace(
+            -1, 1, 41, dtype=torch.float64, device=raw.device
+        )  # 1 among them
         found = [Logistic(place, scale * one).log_prob(target).double().mean() for one in factors]
         self.factor.copy_(factors[int(torch.stack(found).argmax())])
 
@@ -268,7 +271,8 @@ class WrappedNormal(Distribution):
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.place.shape
-        return wrap(self.place + self.width * torch.randn(shape, dtype=self.place.dtype))
+        noise = torch.randn(shape, dtype=self.place.dtype, device=self.place.device)
+        return wrap(self.place + self.width * noise)
 
     def entropy(self) -> Tensor:
         # of a narrow one the normal's; otherwise by the trapezium rule, exact where it resolves the density

@@ -34,7 +34,7 @@ class Contrast(Metric):
 
     def update(self, prediction):
         entropy = prediction.entropy.double()
-        seen = torch.stack([torch.tensor(float(len(entropy)), dtype=torch.float64), entropy.sum()])
+        seen = torch.stack([entropy.new_tensor(float(len(entropy))), entropy.sum()])
         split = prediction.split
         if self.fault == "split ignored":
             split = "test"

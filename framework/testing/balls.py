@@ -22,7 +22,7 @@ def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANN
         size: height and width of the pictures, pixels.
     """
     height, width = size
-    row, column = ((torch.arange(side) + 0.5) / side for side in size)
+    row, column = ((torch.arange(side, device=place.device) + 0.5) / side for side in size)
     across, down = (
         (side - 0.5 - place[:, number, None].float() / 8) * length / min(size)
         for side, number, length in ((column, 0, width), (row, -1, height))
@@ -58,7 +58,7 @@ class Ball(Mixture):
         self.size = size
         self.asked: list[frozenset[str]] = []
         shape = (*density.batch_shape, 1)
-        super().__init__(torch.zeros(shape, dtype=place.dtype), Reshaped(density, shape))
+        super().__init__(place.new_zeros(shape), Reshaped(density, shape))
 
 
 @images.register

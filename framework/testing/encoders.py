@@ -21,6 +21,7 @@ from framework.testing.cloud_encoders import (
     other_shapes,
     padding,
 )
+from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.encoder_gradients import STEPS, moved_a_little, of_weights
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import CloudRow, EncoderRow
@@ -52,6 +53,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         return _slow(make, inputs)
 
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
+        "on the device of its inputs": (0.0, lambda worst: _on_one_device(make, inputs, worst)),
         "feature shapes": (0.0, lambda worst: _shapes(make, inputs, worst)),
         "number types": (0.0, lambda worst: _number_types(make, inputs, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, inputs, worst)),
@@ -85,6 +87,28 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield examined(name, row.limits.get(name, limit), check)
+
+
+def _on_one_device(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+    """In evaluation, and in training where a gradient is wanted; images also as bytes."""
+
+    def questions(mode: OneDevice) -> Questions:
+        encoder = make()
+        mode.move(encoder)
+        batch = mode.receive(inputs(2))
+
+        @torch.enable_grad()
+        def trained() -> None:
+            encoder.train()(batch.clone().requires_grad_())
+
+        if batch.is_floating_point():
+            yield "training", trained
+        encoder.eval()
+        yield "evaluation", lambda: encoder(batch)
+        if batch.dim() == 4:
+            yield "bytes", lambda: encoder((255 * batch).to(torch.uint8))
+
+    on_one_device(questions, worst)
 
 
 def _shapes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:

@@ -16,9 +16,10 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import images, median
+from framework.distributions.protocol import images, median, pick
 from framework.geometry.light import light_of
 from framework.target import Target
+from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import SEED, Finding, Worst, examined, seed
 from framework.testing.rows import HeadRow
 
@@ -123,6 +124,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     from framework.testing.units import TOLERANCE, units
 
     checks = (
+        ("on the device of its inputs", 0.0, _on_one_device),
         ("batch shapes", 0.0, _shapes),
         ("number types", 0.0, _number_types),
         ("NaN and infinity refused", 0.0, _refuses_non_finite),
@@ -150,6 +152,32 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         if name == "target's unit" and (subject.of is None or subject.row.target.kind != "real"):
             continue
         yield subject.examined(name, limit, lambda worst, check=check: check(subject, worst))
+
+
+def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
+    """Losses, calibration, and all that a density can be asked."""
+    from framework.testing.questions import every_question
+
+    def make(mode: OneDevice) -> Questions:
+        head = subject.make()
+        mode.move(head)
+        raw, value = mode.receive((subject.raws(2), subject.values(2)))
+        pairs = mode.receive(subject.raws(1, 2))
+        index = mode.receive(torch.tensor([[0], [1], [0]]))
+        temperature = mode.receive(torch.tensor(1.7, dtype=torch.float64))
+
+        @torch.enable_grad()
+        def trained() -> None:
+            head.train().loss(raw.clone().requires_grad_(), value)
+
+        yield "loss", trained
+        head.eval()
+        yield "calibrate", lambda: head.calibrate(raw, value)
+        yield "log_prob of targets", lambda: head(raw).log_prob(value)
+        yield "pick", lambda: pick(head(pairs), index).sample()
+        yield from every_question(head(raw), index, temperature)
+
+    on_one_device(make, worst)
 
 
 def _shapes(subject: HeadSubject, worst: Worst) -> None:

@@ -26,6 +26,7 @@ from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target
 from framework.testing.balls import Ball, ball
+from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
 from framework.testing.metric_numbers import (
@@ -81,13 +82,15 @@ class Cardioid(Distribution):
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         # with t = tan(θ/2) the density of strength 1 is ∝ 1/(1+t²)²: √3 t is Student's with 3 degrees of freedom
-        normal = torch.randn(4, *shape, dtype=self.location.dtype)
+        like = {"dtype": self.location.dtype, "device": self.location.device}
+        normal = torch.randn(4, *shape, **like)
         found = self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
         if (self.strength == 1).all():
             return found
         # 1 + s cos d = s (1 + cos d) + (1 - s): that density, or else the uniform one
-        anywhere = 2 * math.pi * torch.rand(shape, dtype=self.location.dtype)
-        return torch.where(torch.rand(shape) < self.strength.unsqueeze(-1), found, anywhere)
+        anywhere = 2 * math.pi * torch.rand(shape, **like)
+        chosen = torch.rand(shape, device=self.location.device)
+        return torch.where(chosen < self.strength.unsqueeze(-1), found, anywhere)
 
     def entropy(self) -> Tensor:
         # log 2π - (1/2π) ∫ (1 + s cos d) log(1 + s cos d) = log 4π - 1 + r - log(1 + r) with r = √(1 - s²)
@@ -133,7 +136,7 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
         return Independent(Normal(image, wide.to(image), validate_args=False), 3, validate_args=False)
     if target.kind == "real":
         # MultivariateNormal, since Independent refuses empty batches
-        scale = torch.eye(place.shape[-1], dtype=place.dtype)
+        scale = torch.eye(place.shape[-1], dtype=place.dtype, device=place.device)
         if breadth is not None and breadth.numel():  # torch asks for no batch of 0 matrices
             scale = scale * breadth[..., None, None].to(place)
         return MultivariateNormal(place, scale_tril=scale, validate_args=False)
@@ -148,6 +151,7 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
     whole = predictions(row, SAMPLES, images=reads)
     many, kind = Many(build, row, images=reads), row.target.kind
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
+        "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, whole, worst)),
         "named numbers": (0.0, lambda worst: _named(build, whole, worst)),
         "nothing seen is NaN": (0.0, lambda worst: _nothing(build, whole, worst)),
         "batches do not matter": (1e-9, lambda worst: _batches(build, whole, many, worst)),
@@ -249,6 +253,25 @@ def _after(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tens
     for part in parts:
         _feed(metric, some, part)
     return metric.compute()
+
+
+def _on_one_device(build: Make, some: "Predictions", worst: Worst) -> None:
+    """Two updates of every split, the numbers, and the same after a reset."""
+
+    def questions(mode: OneDevice) -> Questions:
+        metric = build()
+        mode.move(metric)
+        fields = ("target", "place", "breadth", "outliers", "fields")
+        received = replace(some, **mode.receive({name: getattr(some, name) for name in fields}))
+        parts = mode.receive(list(torch.arange(SAMPLES).split(SAMPLES // 2)))
+        for part in parts:
+            yield "update", lambda part=part: _feed(metric, received, part)
+        yield "compute", metric.compute
+        yield "reset", metric.reset
+        yield "update after a reset", lambda: _feed(metric, received, parts[0])
+        yield "compute after a reset", metric.compute
+
+    on_one_device(questions, worst)
 
 
 def _named(build: Make, some: Slices, worst: Worst) -> None:

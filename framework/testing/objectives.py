@@ -13,6 +13,7 @@ from framework.errors import ConfigError, UserError
 from framework.model import Predictor, each_alone
 from framework.objective import Objective
 from framework.target import Target
+from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.heads import values
 from framework.testing.metrics import density_about, numbers_about
@@ -76,6 +77,7 @@ class Members(Predictor):
 def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
     """Every property of one objective on small predictors of `row.target`, fresh for each."""
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
+        "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, row, worst)),
         "a finite scalar": (0.0, lambda worst: _scalar(build, row, worst)),
         "gradient": (1e-5, lambda worst: _gradient(build, row, worst)),
         "weight is a factor": (1e-6, lambda worst: _weight(build, row, worst)),
@@ -137,6 +139,27 @@ def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[
         for name, parameter in predictor.named_parameters()
         if parameter.grad is not None
     }
+
+
+def _on_one_device(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """The penalty of one model and of three members."""
+
+    def questions(mode: OneDevice) -> Questions:
+        for count in (None, 3):
+            objective, predictor = build(1.0), predictor_of(row, count)
+            mode.move(predictor)
+            mode.move(objective)
+            batch = mode.receive(batch_of(row, SAMPLES))
+
+            @torch.enable_grad()
+            def trained(
+                objective: Objective = objective, predictor: Members = predictor, batch: Batch = batch
+            ) -> None:
+                penalty(objective, predictor, batch)
+
+            yield "one model" if count is None else f"{count} members", trained
+
+    on_one_device(questions, worst)
 
 
 def _scalar(build: Make, row: ObjectiveRow, worst: Worst) -> None:

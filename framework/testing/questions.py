@@ -1,7 +1,8 @@
 """Optional questions of the protocol (framework.distributions.protocol), compared with log_prob and with draws."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,8 +12,11 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import (
     about,
+    arc,
+    cdf,
     each_cdf,
     estimate,
+    images,
     mahalanobis,
     marginal,
     median,
@@ -22,6 +26,7 @@ from framework.distributions.protocol import (
     scales,
     slope,
     tempered,
+    value_set,
 )
 from framework.errors import UserError
 from framework.testing.finding import SEED, Worst, seed
@@ -310,6 +315,57 @@ def marginals_of_draws(density: Distribution, worst: Worst) -> None:
 
 def mixed(components: Distribution) -> Mixture:
     """Of densities with batch_shape (rows, 2), seven tenths of the first."""
-    weights = torch.tensor([0.7, 0.3], dtype=torch.float64).log().expand(components.batch_shape)
     like = components.log_prob(components.mode)
+    weights = like.new_tensor([0.7, 0.3], dtype=torch.float64).log().expand(components.batch_shape)
     return Mixture(weights.to(like.dtype), components)
+
+
+def every_question(
+    density: Distribution, index: Tensor, temperature: Tensor
+) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Yield all that densities (rows,) can be asked, by name; what one does not know it refuses.
+
+    Args:
+        index: (draw, 1), numbers of rows.
+        temperature: above 0, of no dimension.
+    """
+    few = torch.Size((5,))
+    value = density.sample(few)
+
+    def answer(made: Distribution) -> None:
+        made.log_prob(made.sample(few))
+
+    yield "sample", lambda: density.sample(few)
+    yield "log_prob", lambda: density.log_prob(value)
+    yield "mode", lambda: density.mode
+    yield "entropy", lambda: density.entropy()
+    yield "mean", lambda: density.mean
+    yield "variance", lambda: density.variance
+    yield "estimate", lambda: estimate(density, value)
+    yield "cdf", lambda: cdf(density, value)
+    yield "each_cdf", lambda: each_cdf(density, value)
+    yield "arc", lambda: arc(density, value - 0.1, value + 0.1)
+    yield "marginal", lambda: answer(marginal(density, 0))
+    yield "median", lambda: median(density, 50)
+    if density.event_shape == (1,):
+        rows = index[:, 0]
+        yield (
+            "about",
+            lambda: about(density, (rows,), value[0].double()[rows]).log_prob(value[:, :1].double()),
+        )
+    yield "tempered", lambda: answer(tempered(density, temperature))
+    yield "normals", lambda: normals(density)
+    yield "mahalanobis", lambda: mahalanobis(density, value)
+    yield "peaks", lambda: peaks(density)
+    yield "scales", lambda: scales(density)
+    yield "slope", lambda: slope(density, value)
+    yield "images", lambda: images(density, {"color"})
+    yield "value_set", lambda: _of_set(density, value)
+    yield "expand", lambda: answer(density.expand(torch.Size((2, *density.batch_shape))))
+    yield "enumerate_support", lambda: density.enumerate_support()
+
+
+def _of_set(density: Distribution, value: Tensor) -> None:
+    sets = value_set(density)
+    if sets is not None:
+        _ = sets.contains(value), sets.size(), sets.empty(), sets.parts()

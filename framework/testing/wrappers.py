@@ -16,6 +16,7 @@ from framework.distributions.circular import Circular
 from framework.model import Predictor
 from framework.target import Target
 from framework.testing import densities as asked
+from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import SEED, Finding, Worst, examined, seed
 from framework.testing.heads import values
 from framework.testing.metrics import density_about, numbers_about
@@ -92,6 +93,7 @@ def examine_wrapper(
         return build(row.target).eval()
 
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
+        "on the device of its inputs": (0.0, lambda worst: _on_one_device(make, row, worst)),
         "densities": (0.0, lambda worst: _densities(make, row, worst)),
         "number types": (0.0, lambda worst: _number_types(make, row, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, row, worst)),
@@ -166,6 +168,33 @@ def batches(row: WrapperRow) -> list[Batch]:
     target = values(row.target, (40,))
     parts = zip(inputs(40).split(16), target.split(16), strict=True)
     return [{"input": some, "target": labels} for some, labels in parts]
+
+
+def _on_one_device(make: Make, row: WrapperRow, worst: Worst) -> None:
+    """Losses, calibration, and all that its densities can be asked after it."""
+    from framework.testing.questions import every_question
+
+    def questions(mode: OneDevice) -> Questions:
+        wrapper = make()
+        mode.move(wrapper)
+        given, labels = mode.receive((inputs(4), values(row.target, (4,))))
+        labelled = mode.receive(batches(row))
+        index = mode.receive(torch.zeros(3, 1, dtype=torch.int64))
+        temperature = mode.receive(torch.tensor(1.7, dtype=torch.float64))
+
+        @torch.enable_grad()
+        def trained() -> None:
+            wrapper.train().loss(given, labels)
+            density = wrapper.training_densities(given)
+            density.log_prob(density.sample())
+
+        yield "loss", trained
+        wrapper.eval()
+        yield "log_prob of targets", lambda: wrapper(given).log_prob(labels)
+        yield "calibrate", lambda: wrapper.calibrate(labelled)
+        yield from every_question(wrapper(given), index, temperature)
+
+    on_one_device(questions, worst)
 
 
 def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
