@@ -20,6 +20,8 @@ VOLUME = 8 * math.pi**2
 """∫ cos e da de dt over the chart."""
 CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
 """Of azimuth, elevation and tilt."""
+SUMMITS = 6
+"""Of the density of one angle on a grid, at which its mode is looked for."""
 
 
 class MatrixFisher(Distribution):
@@ -124,14 +126,17 @@ class Angle(Distribution):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 1"]:
-        """The best of a grid and the joint mode's angle, polished."""
+        """The highest of the peaks next to the joint mode's angle and to the summits of a grid."""
         points = 90
         around = grid(points, dtype=torch.float64, device=self.joint.parameter.device)
-        around = (around / 2 if self.index == 1 else around).expand(*self.batch_shape, points)
-        candidates = torch.cat([around, self.joint.mode.double()[..., self.index, None]], -1)
-        best = self._log_density(candidates).argmax(-1, keepdim=True)
-        start = candidates.gather(-1, best).squeeze(-1)
-        found = quadrature.maximum(self._log_density, start, 2 * math.pi / points)
+        step = 2 * math.pi / points
+        if self.index == 1:
+            around, step = around / 2, step / 2
+        height = self._log_density(around.expand(*self.batch_shape, points))
+        lower = torch.maximum(height.roll(1, -1), height.roll(-1, -1))
+        summits = height.where(height >= lower, -math.inf).topk(SUMMITS).indices
+        starts = torch.cat([around[summits], self.joint.mode.double()[..., self.index, None]], -1)
+        found = quadrature.maximum(self._log_density, starts, step)
         return found.unsqueeze(-1).to(self.joint.dtype)
 
     def entropy(self) -> Tensor:

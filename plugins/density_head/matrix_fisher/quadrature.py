@@ -99,12 +99,12 @@ def gauss(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], F
 
 
 def maximum(
-    log_density: Callable[[Tensor], Tensor], start: Float[Tensor, "*batch"], step: float
+    log_density: Callable[[Tensor], Tensor], starts: Float[Tensor, "*batch start"], step: float
 ) -> Float[Tensor, "*batch"]:
-    """The place of the maximum within `step` of `start`, radians."""
-    start = start[..., None]
-    found, _ = _refine(log_density, start, step, start - step, start + step)
-    return found.squeeze(-1)
+    """Return the place of the highest of the maxima within `step` of each start, radians."""
+    found, _ = _refine(log_density, starts, step, starts - step, starts + step)
+    best = log_density(found).argmax(-1, keepdim=True)
+    return found.gather(-1, best).squeeze(-1)
 
 
 def _refine(

@@ -245,6 +245,25 @@ def test_concentrated_densities_are_normal(concentration):
         torch.testing.assert_close(found, wanted, rtol=0, atol=10 / math.sqrt(concentration) + 1e-8)
 
 
+@pytest.mark.parametrize("concentration", [1e-3, 1.0, 1e2, 1e4])
+def test_the_mode_of_an_angle_is_its_highest_place(concentration):
+    """Of ranks 0 to 3, against a fine grid that is finer about its own highest point; of rank one the angle has two
+    narrow peaks, of which only one is near the likeliest rotation's."""
+    left, right = random_rotations(2, seed=3)
+    shapes = [(0, 0, 0), (1, 0, 0), (1, 0.6, 0), (1, 0.5, 0.1), (1, 0.6, -0.6)]
+    parameters = [left @ torch.diag(concentration * double(shape)) @ right.T for shape in shapes]
+    density = MatrixFisher(torch.stack(parameters))
+    for index, most in enumerate((math.pi, math.pi / 2, math.pi)):
+        alone = Angle(density, index)
+        count = 801 if concentration > 1e3 else 201
+        grid = torch.linspace(-most, most, count).double()
+        coarse = alone.log_prob(grid[:, None, None].expand(-1, len(shapes), 1))
+        around = 2 * most / count * torch.linspace(-1, 1, 41).double()
+        fine = alone.log_prob((grid[coarse.argmax(0)] + around[:, None]).unsqueeze(-1))
+        highest = torch.maximum(coarse.amax(0), fine.amax(0))
+        assert (alone.log_prob(alone.mode) >= highest - 1e-3).all()
+
+
 @pytest.mark.parametrize("concentration", [0.0, 3.0, 1e3, 1e6])
 @pytest.mark.parametrize("shape", [(1, 0, 0), (1, 0.6, -0.6), (1, 0.5, 0.1)])
 def test_marginals_of_ridges_and_flat_directions_integrate_to_one(concentration, shape):
