@@ -64,7 +64,7 @@ CORES = Cores(2, 2, 0.1)
             {},
             "2 cores that this process may use of the machine's 64, one for each",
         ),
-        (2, None, Cores(2, 2, 3.27), {}, "a load of 3.3 in the last minute"),
+        (2, None, Cores(2, 2, 3.27), {}, "the machine's load was 3.3 in the last minute"),
     ],
 )
 def test_a_run_says_how_many_threads_compute_and_why(

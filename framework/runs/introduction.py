@@ -92,9 +92,7 @@ def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Ma
         )
     else:
         why = "one for each core; threads=1 sets another number"
-    busy = f"; other work came before or runs beside it: a load of {cores.load:.1f} in the last minute" * (
-        cores.load >= BUSY
-    )
+    busy = f"; the machine's load was {cores.load:.1f} in the last minute" * (cores.load >= BUSY)
     return f"threads: {threads} on {of}{limited}, {why}{busy}"
 
 

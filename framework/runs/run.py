@@ -29,6 +29,8 @@ from framework.tracking.silent import SilentTracker
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
 from framework.tracking.watch import watched
 
+TRACEBACK = "traceback.txt"
+"""How a run ended that failed or was stopped; gone when it has gone on and finished."""
 LEFT_BY_RUNS = (
     "config.yaml",
     "overrides.yaml",
@@ -39,7 +41,7 @@ LEFT_BY_RUNS = (
     "params.json",
     "predictions.csv",
     "work_precision.csv",
-    "traceback.txt",
+    TRACEBACK,
     "unreadable.txt",
 )
 """What modes write into a run folder, but for the journal, which the tracker keeps."""
@@ -120,6 +122,8 @@ def opened(config: Config) -> Iterator[Run]:
             if refused := unwritable(error):
                 raise DataError(f"{refused} What was written is whole: {going_on(run)} goes on.") from error
             raise
+        if resumed:
+            (config.folder / TRACEBACK).unlink(missing_ok=True)
         tracker.close("FINISHED")
 
 
@@ -218,7 +222,7 @@ def _describe(run: Run) -> None:
 
 def _record(run: Run, error: BaseException) -> None:
     """Leave the traceback and the sentence with the run."""
-    path = run.folder / "traceback.txt"
+    path = run.folder / TRACEBACK
     with suppress(OSError):  # of a full disk there is no more to be said than the error itself
         write_whole(path, encodable("".join(traceback.format_exception(error))).encode())
         run.tracker.log_artifact(path)

@@ -1,0 +1,149 @@
+"""Runs that end badly or start from a checkpoint: what is left of them, what is refused, and what is done once."""
+
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+from framework.configuration import composition, loading
+from framework.configuration.assembly import build_predictor
+from framework.configuration.config import Config
+from framework.data import Data
+from framework.errors import CheckpointError, DataError
+from framework.modes import calibrate, train
+from framework.modes import test as testing
+from framework.runs import run as runs
+from framework.runs import session
+from framework.runs.run import TRACEBACK, opened
+from framework.tracking.run_info import read_run_info
+from framework.tracking.signals import Stopped
+from plugins.data.moons.data import Moons
+from tests.test_tracking import build, client, empty_store, folder, identity, impatient
+
+__all__ = ["empty_store", "folder", "impatient"]
+
+SMALL = (
+    *("data=moons", "data.train=60", "data.validation=40", "data.test=40", "encoder=[mlp]"),
+    *("encoder.mlp.widths=[4]", "density_head=bernoulli", "metric=[accuracy,nll]", "batch_size=20"),
+    *("trainer.max_epochs=1", "logger=none", "threads=1", "pictures=false"),
+)
+Composed = Callable[..., Config]
+
+
+@pytest.fixture
+def composed() -> Iterator[Composed]:
+    """The config of a command."""
+
+    def config(folder: Path, *overrides: str) -> Config:
+        values = composition.plain(compose("config", ["experiment_name=test", *overrides]))
+        return Config.of({**values, "experiment_name": None}, folder, overrides)
+
+    composition.register()
+    with initialize_config_dir(str(composition.folder()), version_base="1.3"):
+        yield config
+    GlobalHydra.instance().clear()
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), DataError("bad"), KeyboardInterrupt()], ids=repr)
+def test_a_run_that_has_finished_says_no_error_any_more(
+    error: BaseException, folder: Path, composed: Composed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = composed(folder, *SMALL[:-3])
+    monkeypatch.setattr(runs, "_tracker", lambda config, run_id, resumed: build(folder, run_id=run_id))
+    with pytest.raises(type(error)), opened(config):
+        raise error
+    tags = client(folder).get_run(identity(folder)).data.tags
+    assert "error" in tags and (folder / TRACEBACK).is_file()
+    with opened(config) as run:
+        assert run.resumed
+    found = client(folder).get_run(identity(folder))
+    assert found.info.status == "FINISHED" and "error" not in found.data.tags
+    assert not (folder / TRACEBACK).exists()
+
+
+def numbers(folder: Path) -> dict[str, torch.Tensor]:
+    return loading.stored(folder)[1]
+
+
+@pytest.mark.parametrize("place", ["calibrate", "save", "report_test"])
+@pytest.mark.parametrize("how", [Stopped(signal.SIGTERM), OSError("disk")], ids=repr)
+def test_a_calibration_that_was_stopped_leaves_the_model_whole_and_can_be_repeated(
+    place: str, how: BaseException, tmp_path: Path, composed: Composed
+) -> None:
+    train.run(composed(tmp_path / "plain", *SMALL))
+    source = tmp_path / "plain" / "checkpoints" / "model.ckpt"
+    before = source.read_bytes()
+    words = ("mode=calibrate", f"checkpoint={tmp_path / 'plain'}", "uncertainty=[temperature]", *SMALL[-3:])
+    calibrate.run(composed(tmp_path / "whole", *words))
+
+    def stopped(*given: object, **named: object) -> None:
+        raise how
+
+    config = composed(tmp_path / "again", *words)
+    with pytest.MonkeyPatch.context() as planted:
+        planted.setattr(*{"save": (torch, "save")}.get(place, (calibrate, place)), stopped)
+        with pytest.raises((type(how), CheckpointError, DataError)):
+            calibrate.run(config)
+    assert source.read_bytes() == before
+    info = read_run_info(tmp_path / "again")
+    assert info is not None and info.status == ("KILLED" if isinstance(how, Stopped) else "FAILED")
+    if place != "report_test":
+        assert not (tmp_path / "again" / "checkpoints" / "model.ckpt").exists()
+    calibrate.run(config)
+    assert source.read_bytes() == before
+    info = read_run_info(tmp_path / "again")
+    assert info is not None and info.status == "FINISHED"
+    first, second = numbers(tmp_path / "whole"), numbers(tmp_path / "again")
+    assert all(torch.equal(second[name], tensor) for name, tensor in first.items())
+    testing.run(composed(tmp_path / "tested", "mode=test", f"checkpoint={tmp_path / 'again'}", *SMALL[-3:]))
+
+
+@pytest.mark.parametrize(
+    "change", ["encoder.mlp.widths=[5]", "encoder.mlp.batch_norm=true", "density_head=categorical"]
+)
+def test_a_checkpoint_of_another_model_is_refused_before_data_are_read(
+    change: str, tmp_path: Path, composed: Composed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train.run(composed(tmp_path / "first", *SMALL))
+
+    def prepare(self: Data) -> None:
+        raise AssertionError("data are read")
+
+    monkeypatch.setattr(Moons, "prepare", prepare)
+    start = f"checkpoint={tmp_path / 'first'}"
+    with pytest.raises(CheckpointError, match="belongs to another model"):
+        train.run(composed(tmp_path / "other", *SMALL, start, change))
+    assert not (tmp_path / "other").exists()
+    with pytest.raises(AssertionError, match="data are read"):
+        train.run(composed(tmp_path / "same", *SMALL, start))
+
+
+def test_a_training_reads_its_checkpoint_and_builds_its_model_once(
+    tmp_path: Path, composed: Composed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train.run(composed(tmp_path / "first", *SMALL))
+    calls: list[str] = []
+
+    def counted(name: str, function: Callable[..., object]) -> None:
+        monkeypatch.setattr(
+            session, name, lambda *given, **named: calls.append(name) or function(*given, **named)
+        )
+
+    counted("build_predictor", build_predictor)
+    counted("read", session.read)
+    train.run(composed(tmp_path / "second", *SMALL, f"checkpoint={tmp_path / 'first'}"))
+    assert sorted(calls) == ["build_predictor", "read"]
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_batch_norm_wants_more_than_one_row(rows: int, tmp_path: Path, composed: Composed) -> None:
+    config = composed(tmp_path / "run", *SMALL, f"batch_size={rows}", "encoder.mlp.batch_norm=true")
+    if rows > 1:
+        train.run(config)
+        return
+    with pytest.raises(Exception, match=r"batch norm one value of each channel.*Give a batch_size"):
+        train.run(config)
