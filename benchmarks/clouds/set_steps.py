@@ -25,12 +25,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
+from benchmarks.clouds.shapes import shapes
 from benchmarks.pages import machine, write_page
 from framework.encoder import Encoder
 from plugins.encoder.point_sets import pooled
 from plugins.encoder.point_sets.deepsets import DeepSets
 from plugins.encoder.point_sets.pointnet import PointNet
-from reproduction.chapter6.reconstruction import shapes
 
 HERE = Path(__file__).resolve()
 BATCH, POINTS, TRAINED, ROUNDS = 16, 2048, 60, 7

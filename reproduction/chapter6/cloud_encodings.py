@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.clouds.shapes import shapes
 from benchmarks.pages import machine, write_page
 from framework.geometry.clouds import Normalisation
 from framework.reports.table import markdown
@@ -25,7 +26,6 @@ from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import encode, prepared
 from plugins.encoder.grids.occupancy import occupancy
 from plugins.encoder.grids.tdf import truncated_distance
-from reproduction.chapter6.reconstruction import shapes
 
 HERE = Path(__file__).resolve()
 POINTS = 2048

@@ -24,10 +24,10 @@ from matplotlib.ticker import NullFormatter
 from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
+from benchmarks.clouds.shapes import shapes
 from benchmarks.pages import machine, read_rows, write_page
-from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
-from framework.geometry.clouds import Normalised, normalised, sizes
+from framework.geometry.clouds import Normalised, sizes
 from framework.geometry.nearest import chamfer
 from framework.reports.table import csv, markdown
 from plugins.encoder.bps.basis import Strategy, basis
@@ -58,22 +58,6 @@ CLOUD_SIZES = (10, 100, 1000, 2048, 10_000, 100_000)
 BASIS_SIZES = (100, 512, 4096, 32_768)
 TIMED_TREES = (512, 4096)
 """Sizes of the basis at which the ball tree is timed too."""
-
-
-def shapes(points: int, models: int, classes: list[str] | None = None) -> tuple[Tensor, bool]:
-    """Normalised clouds, so many of each class, and whether they are synthetic."""
-    config = {
-        "name": "modelnet40",
-        "points": points,
-        "train_models": 2,
-        "test_models": models,
-        "classes": classes,
-    }
-    data = build("data", resolve("data", config))
-    data.prepare()
-    test = data.splits().test
-    clouds = test.__getitems__(range(len(test)))["input"]
-    return normalised(clouds, "unit_ball").clouds, data.synthetic
 
 
 def raw(clouds: Tensor, count: int) -> Tensor:
