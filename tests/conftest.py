@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import yaml
+from _pytest.mark import ParameterSet
 from filelock import FileLock
 
 from framework.configuration.paths import paths_of, words
@@ -38,6 +39,26 @@ TINY = [
     "threads=1",
 ]
 """A run of 27 steps (9 an epoch) on the stranger's data, done in a second after its imports."""
+
+
+def first_of_each(
+    cases: Iterable[Any], kind: Callable[[Any], Hashable], name: Callable[[Any], str] | None = None
+) -> list[ParameterSet]:
+    """Return parameters of a test: of each kind of case the first, and all others as slow tests.
+
+    Args:
+        cases: a tuple where the test takes several parameters.
+        kind: what cases that test nearly the same have in common.
+        name: for the test's id; none leaves it to pytest.
+    """
+    seen = set[Hashable]()
+    parameters = []
+    for case in cases:
+        marks = [pytest.mark.slow] if kind(case) in seen else []
+        values = case if isinstance(case, tuple) else (case,)
+        parameters.append(pytest.param(*values, marks=marks, id=name(case) if name else None))
+        seen.add(kind(case))
+    return parameters
 
 
 @contextmanager

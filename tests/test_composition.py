@@ -117,7 +117,18 @@ HUGE = {"registration/large"}
 """Checkpoints of 1.5 GB; it differs from registration/quick in numbers alone."""
 
 
-@pytest.mark.parametrize("name", sorted({*EXPERIMENTS} - {*SMOKE_RUNS.values()} - HUGE))
+SHORTENED = sorted({*EXPERIMENTS} - {*SMOKE_RUNS.values()} - HUGE)
+FAMILIES = {name.partition("/")[0]: name for name in [*reversed(SHORTENED), *SMOKE_RUNS.values()]}
+"""An experiment of each family: a smoke run where there is one, else the first."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in FAMILIES.values() else pytest.mark.slow, id=name)
+        for name in SHORTENED
+    ],
+)
 def test_every_experiment_runs_shortened(name: str, framework: Framework) -> None:
     """In the cache that all tests share, since bodies take minutes to make."""
     done = framework(

@@ -1,19 +1,27 @@
-"""The contract of every installed plugin: a row in its `rows.py` buys every test."""
+"""The contract of every installed plugin: a row in its `rows.py` buys every test.
+
+The first row of each plugin is always tested; the others are slow tests. All rows of a plugin:
+`pytest tests/test_contract.py -m "" -k <name>`.
+"""
 
 import pytest
 
 from framework.configuration.registry import installed
 from framework.testing.contract import CONTRACTS, Row, contract
 from framework.testing.finding import require
+from tests.conftest import first_of_each
 
 ROWS = [
-    pytest.param(group, name, row, id=f"{group} {name}: {row.name}")
+    (group, name, row)
     for group in CONTRACTS
     for name in installed(group)
     for row in contract(group, name).rows
 ]
 
 
-@pytest.mark.parametrize("group, name, row", ROWS)
+@pytest.mark.parametrize(
+    "group, name, row",
+    first_of_each(ROWS, lambda case: case[:2], lambda case: f"{case[0]} {case[1]}: {case[2].name}"),
+)
 def test_contract(group: str, name: str, row: Row) -> None:
     require(*contract(group, name).findings(row))

@@ -77,6 +77,7 @@ from framework.testing.heads import ready, values
 from framework.testing.metrics import Cardioid
 from framework.testing.rows import HeadRow
 from framework.testing.wrappers import LENGTH, Plain
+from tests.conftest import first_of_each
 
 BATCH = 4
 ROWS = [(name, row) for name in installed("density_head") for row in contract("density_head", name).rows]
@@ -283,7 +284,9 @@ def pictured(kind: str, made: Made, density: Distribution) -> None:
         close(found, wanted)
 
 
-@pytest.mark.parametrize("name, row", ROWS, ids=ids(ROWS))
+@pytest.mark.parametrize(
+    "name, row", first_of_each(ROWS, lambda case: case[0], lambda case: f"{case[0]}: {case[1].name}")
+)
 def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow) -> None:
     with torch.no_grad():
         made, again = Made(name, row), Made(name, row, seed=1)

@@ -97,6 +97,7 @@ def until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_fitted_at_once_logs_every_number_once(tmp_path: Path) -> None:
     """Wherever it was killed: fitted, validated, tested."""
     for name in ("whole", "killed"):

@@ -20,6 +20,7 @@ MEGABYTES, SECONDS = 1000, 5.0
 ROOT = Path(__file__).parent.parent
 
 
+@pytest.mark.slow  # each case is a process, and there are 300
 @pytest.mark.parametrize(("what", "least"), [("parameters", 250), ("fields", 15), ("files", 25)])
 def test_nothing_small_takes_much(what: str, least: int) -> None:
     """Every number in every plugin's config, all else that a checkpoint says of its model, and every reader's bombs."""

@@ -7,10 +7,11 @@ from framework.target import Target
 from framework.testing.finding import require
 from framework.testing.metrics import examine_metric
 from framework.testing.rows import MetricRow
+from tests.conftest import first_of_each
 from tests.planted_metrics import ALL_FAULTS, RIGHT, Fault
 
 
-@pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", first_of_each(ALL_FAULTS, lambda fault: fault.by, lambda fault: fault.name))
 def test_the_fault_is_found(fault: Fault) -> None:
     failed = {
         finding.name

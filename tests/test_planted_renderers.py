@@ -5,10 +5,11 @@ import pytest
 from framework.testing.finding import require
 from framework.testing.renderers import examine_renderer
 from framework.testing.rows import RendererRow
+from tests.conftest import first_of_each
 from tests.planted_renderers import ALL, ALL_FAULTS, RIGHT, Fault
 
 
-@pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", first_of_each(ALL_FAULTS, lambda fault: fault.by, lambda fault: fault.name))
 def test_the_fault_is_found(fault: Fault) -> None:
     others = {name: "another test's" for name in ALL if name != fault.by}
     (found,) = examine_renderer(RendererRow("", leave_out=others), fault.build)

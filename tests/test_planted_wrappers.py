@@ -7,6 +7,7 @@ from framework.testing.contract import _defaults
 from framework.testing.finding import require
 from framework.testing.rows import WrapperRow
 from framework.testing.wrappers import Plain, examine_wrapper
+from tests.conftest import first_of_each
 from tests.planted_heads import CLASSES, HEIGHT
 from tests.planted_wrappers import ALL_FAULTS, RIGHT, Fault
 
@@ -22,7 +23,7 @@ class Only(dict[str, str]):
         return name != self.name
 
 
-@pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", first_of_each(ALL_FAULTS, lambda fault: fault.by, lambda fault: fault.name))
 def test_the_fault_is_found(fault: Fault) -> None:
     row = WrapperRow("", fault.target, leave_out=Only(fault.by))
     (finding,) = examine_wrapper(row, lambda target: fault.kind(lambda: Plain(target)), None)

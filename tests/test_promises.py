@@ -37,6 +37,14 @@ CHAINS = {
 ELSEWHERE = {"refined"}
 """Wrappers of one data set's models alone: least squares of Z-spectra."""
 ONLY = {"platt": ("class",)}
+OFTEN = {
+    "conformal": ("degrees",),
+    "temperature": ("real",),
+    "mc_dropout": ("several reals",),
+    "ensemble": ("class",),
+    "platt": ("class",),
+}
+"""The kinds that each wrapper is always asked; the others are slow tests."""
 PROMISED = 0.8
 
 
@@ -85,7 +93,11 @@ def test_every_wrapper_is_asked() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "wrapper"),
-    [(kind, wrapper) for wrapper in CHAINS for kind in ONLY.get(wrapper, tuple(KINDS))],
+    [
+        pytest.param(kind, wrapper, marks=() if kind in OFTEN[wrapper] else pytest.mark.slow)
+        for wrapper in CHAINS
+        for kind in ONLY.get(wrapper, tuple(KINDS))
+    ],
 )
 def test_a_set_is_the_same_wherever_it_is_said(
     kind: str, wrapper: str, table: Path, framework: Framework, tmp_path: Path

@@ -94,7 +94,9 @@ SAME = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SAME)
+@pytest.mark.parametrize(
+    "name", ["moons/vanilla_128", pytest.param("pascal3d/von_mises", marks=pytest.mark.slow)]
+)
 def test_two_ranks_give_the_numbers_of_one_process(name: str, framework: Framework) -> None:
     one = framework(*SAME[name], *QUIET, "threads=1", folder="one")
     two = framework(*SAME[name], *QUIET, *TWO, folder="two")
@@ -122,6 +124,7 @@ KILLS = {
 """How the run is closed when a rank ends at a moment in some way, from its start to its end."""
 
 
+@pytest.mark.slow
 def test_a_rank_that_dies_ends_the_others_and_the_run_goes_on_to_the_same_bits(
     whole_of_two: Done, stranger_site: Path, tmp_path: Path
 ) -> None:
@@ -136,6 +139,7 @@ def test_a_rank_that_dies_ends_the_others_and_the_run_goes_on_to_the_same_bits(
     assert said.count("Rank 1 of the training failed (exit code 1)") == 1
 
 
+@pytest.mark.slow
 def test_ranks_that_were_stopped_go_on_under_another_launcher_to_the_same_bits(
     whole_of_two: Done, framework: Framework, stranger_site: Path, tmp_path: Path
 ) -> None:

@@ -211,13 +211,24 @@ class Faulty(Renderer):
     [
         (lambda vertices: vertices, lambda color: color, None),
         (lambda vertices: vertices.float(), lambda color: color, "millimetres at"),
-        (
+        pytest.param(
             lambda vertices: vertices.where(vertices.abs() < 1e20, math.nan),
             lambda color: color,
             "1e30 m away",
+            marks=pytest.mark.slow,
         ),
-        (lambda vertices: vertices, lambda color: color.square().sqrt(), "slope of"),
-        (lambda vertices: vertices, lambda color: color / color.sum(), "color of"),
+        pytest.param(
+            lambda vertices: vertices,
+            lambda color: color.square().sqrt(),
+            "slope of",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            lambda vertices: vertices,
+            lambda color: color / color.sum(),
+            "color of",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_contract_finds_what_extreme_scenes_break(

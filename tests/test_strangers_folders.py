@@ -164,6 +164,11 @@ CASES = [
     *((attack, "sweep with a store") for attack in (database, own_store_that_is_a_link)),
     *((attack, "resume") for attack in CONFIGS),
 ]
+OFTEN: dict[Callable[[Sent], None], str] = {}
+for number, attack in enumerate(dict.fromkeys(attack for attack, _ in CASES)):
+    names = [name for case, name in CASES if case is attack]
+    OFTEN[attack] = names[number % len(names)]
+"""One command of each attack, in turn; the others are slow tests."""
 SURVIVED = {("results_of_two_names", name) for name in ("test", "predict", "train from it")} | {
     (attack, name)
     for attack in ("journal_linked", "record_piped")
@@ -222,7 +227,12 @@ def state(folder: Path) -> dict[str, tuple[int, int, bytes]]:
 
 
 @pytest.mark.parametrize(
-    ("attack", "name"), CASES, ids=lambda one: one if isinstance(one, str) else one.__name__
+    ("attack", "name"),
+    [
+        pytest.param(attack, name, marks=() if OFTEN[attack] == name else pytest.mark.slow)
+        for attack, name in CASES
+    ],
+    ids=lambda one: one if isinstance(one, str) else one.__name__,
 )
 def test_a_strangers_folder_does_nothing_but_say_a_sentence(
     attack: Callable[[Sent], None],
