@@ -63,6 +63,12 @@ class JointNormal(MultivariateNormal):
         scale = self.root.diagonal(dim1=-2, dim2=-1)
         return -(standard.square() / 2 + scale.log() + math.log(2 * math.pi) / 2).sum(-1)
 
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        with torch.autocast(
+            self.loc.device.type, enabled=False
+        ):  # which would round the product with the root
+            return super().rsample(torch.Size(sample_shape))
+
 
 @marginal.register
 def _(density: JointNormal, index: int) -> JointNormal:

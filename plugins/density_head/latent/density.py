@@ -70,6 +70,10 @@ class Latent(ABC):
     def items(self) -> int:
         return self.center.shape[:-1].numel()
 
+    def full_precision(self) -> torch.autocast:
+        """Return the context in which networks are not rounded, whatever the precision that training chose."""
+        return torch.autocast(self.center.device.type, enabled=False)
+
     def points(self, effort: Effort, kept: int = 0) -> NormalPoints:
         """Noise of every item."""
         dtype, device = self.center.dtype, self.center.device
@@ -126,7 +130,8 @@ class LatentDensity(Distribution):
     @cached_property
     def mixture(self) -> SampledMixture:
         """Equal weights on S components with z from the prior: decoded on first use, then kept."""
-        return sampled_mixture(self.latent, self._mixture_points, self._fixed)
+        with self.latent.full_precision():
+            return sampled_mixture(self.latent, self._mixture_points, self._fixed)
 
     def log_prob(self, value: Tensor) -> Tensor:
         return estimate(self, value).log_mean
@@ -136,7 +141,9 @@ class LatentDensity(Distribution):
         shape = torch.Size(sample_shape)
         if shape.numel() == 0 or self.batch_shape.numel() == 0:
             return self._example.sample(shape)
-        return self.latent.sample(shape.numel()).reshape(shape + self.batch_shape + self.event_shape)
+        with self.latent.full_precision():
+            drawn = self.latent.sample(shape.numel())
+        return drawn.reshape(shape + self.batch_shape + self.event_shape)
 
     @property
     def mode(self) -> Tensor:
@@ -160,9 +167,10 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
         return torch.stack([found + log_share, log_share.expand_as(found)])
 
     at_once = CHUNK // latent.width
-    found = estimate_log_mean(
-        log_weights, len(items), density.effort, at_once=at_once, device=latent.center.device
-    )
+    with latent.full_precision():
+        found = estimate_log_mean(
+            log_weights, len(items), density.effort, at_once=at_once, device=latent.center.device
+        )
     return found.each(lambda field: field.reshape(shape))
 
 
