@@ -18,6 +18,10 @@ from framework.target import Target
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+NEAR = 2.0**-20
+"""Confidences so near to each other count as equal where bins are chosen: float32 gives the same probability by a few
+times 2^-24 more or less on another device."""
+
 
 class CalibrationError(Metric, Pictured):
     """How far stated confidence is from the share that is right, over bins of confidence (thesis eq. 2.28-2.31).
@@ -25,14 +29,16 @@ class CalibrationError(Metric, Pictured):
     - `ece`: expected calibration error in bins of equal width.
     - `ece_positive`: of two classes, in such bins of p(y = 1) against y = 1 whatever `probability` says: the letter of
       eq. 2.28-2.29, in which a class that is predicted with confidence 0.9 and one with 0.1 do not share a bin.
-    - `ece_equal_mass`: in bins of equally many samples; equal confidences share a bin, whatever their order.
+    - `ece_equal_mass`: in bins of equally many samples; confidences within 2^-20 of each other share a bin, whatever
+      their order.
     - `mce`: the largest gap of a bin of equal width that is not empty.
     - `squared_ce_debiased`: the squared calibration error in bins of equal mass less the part that chance adds to it,
       which may leave it negative. Bins of one sample tell nothing of chance and are left out; NaN where all are.
     - `ece_debiased`: its root, 0 where it is negative.
 
     Each is NaN where nothing was seen. A confidence of 1 belongs to the last bin, which the half-open intervals of
-    eq. 2.28 would leave out.
+    eq. 2.28 would leave out, and one that misses the lower edge of a bin by 2^-21 or less to that bin. Only the bins
+    are chosen so: the sums are of the confidences as they are.
 
     Args:
         bins: L of eq. 2.31, of either kind.
@@ -165,13 +171,15 @@ class Bins:
 
 
 def equal_width(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Bin l - 1 where (l - 1)/L ≤ confidence < l/L (eq. 2.28); the last for a confidence of 1."""
+    """Return bin l - 1 where (l - 1)/L ≤ confidence < l/L (eq. 2.28), edges lowered by NEAR/2; the last for 1."""
     edges = torch.arange(1, bins, dtype=torch.float64, device=confidence.device) / bins
-    return torch.bucketize(confidence, edges, right=True)
+    return torch.bucketize(confidence, edges - NEAR / 2, right=True)
 
 
 def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Bins of as equal numbers of samples as can be (Nguyen & O'Connor 2015) where equal confidences stay together.
+    """Return bins of as equal numbers of samples as can be (Nguyen & O'Connor 2015).
+
+    Confidences of one group of `least_of_near` stay together.
 
     Of n samples in order of confidence the one of rank r = 0, 1, ... belongs to bin ⌊L (r + ½) / n⌋, and equal ones to
     that of their middle.
@@ -179,11 +187,34 @@ def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, 
     Args:
         confidence: in any order.
     """
+    confidence = least_of_near(confidence)
     ordered = confidence.sort().values
     first = torch.searchsorted(ordered, confidence)
     after = torch.searchsorted(ordered, confidence, right=True)
     # their middle is (first + after - 1) / 2, and with ½ more (first + after) / 2: in integers, so that nothing rounds
     return bins * (first + after) // (2 * max(1, len(confidence)))
+
+
+def least_of_near(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sample"]:
+    """Return the least confidence of each one's group.
+
+    From below, a group is the least confidence that is in none yet and all up to NEAR above it. Rounding to a grid
+    would part equal confidences that lie about the middle between two of its points.
+    """
+    ordered, order = confidence.sort()
+    count = len(ordered)
+    # where the group of each one would end if it began there; groups begin where jumps from the first lead
+    end = torch.searchsorted(ordered, ordered + NEAR, right=True)
+    end = torch.cat([end, end.new_full((1,), count)])
+    begins = torch.zeros_like(end, dtype=torch.bool)
+    begins[0] = True
+    jumps = 1
+    while jumps < count:
+        begins[end[begins]] = True
+        end, jumps = end[end], 2 * jumps
+    begins = begins[:count]
+    least = ordered[begins][begins.cumsum(0) - 1]
+    return torch.empty_like(confidence).scatter_(0, order, least)
 
 
 def in_bins(

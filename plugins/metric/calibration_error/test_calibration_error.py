@@ -18,7 +18,7 @@ from framework.errors import ConfigError, DataError, UserError
 from framework.metric import Pictured
 from framework.prediction import Prediction
 from framework.target import Target
-from plugins.metric.calibration_error.metric import CalibrationError, equal_mass, equal_width
+from plugins.metric.calibration_error.metric import NEAR, CalibrationError, equal_mass, equal_width
 from plugins.metric.calibration_error.picture import reliability, wilson
 
 TWO = Target("class", ("off", "on"))
@@ -44,14 +44,14 @@ def measured(*batches, target=TWO, **config):
 
 
 def loop_width(confidence, right, bins):
-    """[(count, mean confidence, accuracy)] of the bins of eq. 2.28, one by one; the last one closed."""
+    """[(count, mean confidence, accuracy)] of the bins of eq. 2.28, edges a little lower; the last one closed."""
     found = []
     for number in range(bins):
         last = number == bins - 1
         inside = [
             (c, r)
             for c, r in zip(confidence, right, strict=True)
-            if number / bins <= c and (last or c < (number + 1) / bins)
+            if (number == 0 or number / bins - NEAR / 2 <= c) and (last or c < (number + 1) / bins - NEAR / 2)
         ]
         if inside:
             found.append((len(inside), np.mean([c for c, _ in inside]), np.mean([r for _, r in inside])))
@@ -59,12 +59,15 @@ def loop_width(confidence, right, bins):
 
 
 def loop_mass(confidence, right, bins):
-    """The same of equally many samples; a group of equal confidences goes where its middle lies."""
-    groups = itertools.groupby(sorted(zip(confidence, right, strict=True)), key=lambda pair: pair[0])
+    """The same of equally many samples; a group of near confidences goes where its middle lies."""
+    groups = []
+    for pair in sorted(zip(confidence, right, strict=True)):
+        if not groups or pair[0] > groups[-1][0][0] + NEAR:
+            groups.append([])
+        groups[-1].append(pair)
     inside = [[] for _ in range(bins)]
     before = 0
-    for _, group in groups:
-        pairs = list(group)
+    for pairs in groups:
         middle = before + Fraction(len(pairs), 2)
         inside[math.floor(bins * middle / len(confidence))] += pairs
         before += len(pairs)
@@ -135,7 +138,7 @@ def test_predicted_agrees_with_loops(data, count, samples, dtype):
 def test_edges_belong_to_the_bin_above_and_one_to_the_last(bins):
     edges = torch.tensor([k / bins for k in range(bins + 1)], dtype=torch.float64)
     assert equal_width(edges, bins).tolist() == [*range(bins), bins - 1]
-    below = torch.nextafter(edges[1:], edges[:1])
+    below = edges[1:] - NEAR
     assert equal_width(below, bins).tolist() == list(range(bins))
 
 
@@ -159,6 +162,18 @@ def test_equal_confidences_share_a_bin_in_any_order():
         order = np.random.default_rng(seed).permutation(60)
         batches = [predicted(positive(probability[part]), label[part]) for part in np.array_split(order, 7)]
         assert measured(*batches, bins=4, probability="positive") == pytest.approx(wanted, abs=1e-13)
+
+
+@pytest.mark.parametrize("bins", [1, 7, 10, 15, 100])
+@pytest.mark.parametrize("parts", [2, 10, 100, 125])
+def test_confidences_that_a_device_rounds_otherwise_stay_in_their_bins(parts, bins):
+    generator = torch.Generator().manual_seed(parts)
+    share = torch.randint(parts + 1, (3000,), generator=generator) / parts  # votes of trees, float32
+    last_digit = torch.randint(-1, 2, share.shape, generator=generator).float()
+    near = torch.nextafter(share, share + last_digit).clamp(0, 1).double()
+    assert (near != share.double()).any()
+    for choose in (equal_width, equal_mass):
+        assert torch.equal(choose(near, bins), choose(share.double(), bins))
 
 
 def test_a_model_that_is_right_as_often_as_it_says_has_no_error():
