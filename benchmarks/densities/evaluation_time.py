@@ -128,8 +128,9 @@ def main() -> None:
         [
             "# Run time of metrics, by kind of density",
             "",
-            f"Milliseconds a sample in batches of {BATCH}, float32, one thread, median of seven calls (of one that "
-            "takes half a second); densities of drawn raw numbers, targets drawn from them.",
+            f"Milliseconds per sample in batches of {BATCH}, float32, one thread: the median of seven calls, or one "
+            "call "
+            "where it takes half a second. Raw parameters are random; targets are drawn from their densities.",
             "",
             "## Metrics",
             "",

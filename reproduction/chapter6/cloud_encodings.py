@@ -39,8 +39,8 @@ Encode = Callable[[Tensor], Tensor]
 ENCODINGS: dict[str, Encode] = {
     "512 distances": lambda clouds: encode(clouds, BASIS, ["distance"], "none").features["distance"],
     "512 vectors": lambda clouds: encode(clouds, BASIS, ["delta"], "none").features["delta"].flatten(1),
-    "32³ flags": lambda clouds: occupancy(clouds, 32).float(),
-    "8³ flags": lambda clouds: occupancy(clouds, 8).float(),
+    "32³ occupancy": lambda clouds: occupancy(clouds, 32).float(),
+    "8³ occupancy": lambda clouds: occupancy(clouds, 8).float(),
     "32³ truncated distances": lambda clouds: truncated_distance(clouds, 32, 1.0),
     "8³ truncated distances": lambda clouds: truncated_distance(clouds, 8, 1.0),
 }
@@ -102,7 +102,7 @@ def empty(clouds: Tensor) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     for side in SIDES:
         share, error = mean((occupancy(clouds, side) == 0).double().mean(1))
-        rows.append({"encoding": f"{side}³ flags", "zero": share, "zero_sem": error, "synthetic": True})
+        rows.append({"encoding": f"{side}³ occupancy", "zero": share, "zero_sem": error, "synthetic": True})
     for name in ("512 distances", "32³ truncated distances"):
         found = ENCODINGS[name](clouds)
         nothing = 0.0 if "512" in name else 1.0  # a truncated distance that is cut off
@@ -160,16 +160,15 @@ def main() -> None:
         "# How encodings change with shift, rotation and stray points (synthetic data)\n\n"
         f"`python -m reproduction.chapter6.cloud_encodings`: {len(clouds)} synthetic CAD shapes of {POINTS} points, "
         "in the unit ball. ± is the standard error over shapes.\n\n"
-        "**Shift and turn** (§6.4.1). The change of the features as a share of the mean distance between two shapes' "
-        "features, for steps of so many radii or radians, and the power of the step by which its "
-        "root mean square grows over the last decade: 1 is smooth, "
-        "0.5 is what numbers do that jump, some with each step.\n\n"
+        "**Shift and rotation** (§6.4.1). The change of the features relative to the mean distance between two shapes' "
+        "features, for steps in radii or radians; and the power of the step with which its root mean square grows over "
+        "the last decade. The power is 1 for smooth features and 0.5 where some features jump with each step.\n\n"
         f"{markdown(movement(clouds), moved)}\n\n"
-        "**Empty cells** (§6.2, §6.4.1). The share of numbers that say nothing: flags of cells without a point, "
+        "**Empty cells** (§6.2, §6.4.1). The share of features without information: empty cells of an occupancy grid, "
         "distances of 0, truncated distances that are cut off.\n\n"
         f"{markdown(empty(clouds), {'encoding': 'encoding', 'zero': 'share'})}\n\n"
-        "**Stray points** (§6.5.2). A share of each cloud's points is put elsewhere; how many of the clouds are still "
-        "known again, 512 distances being nearest to those of the same cloud undisturbed.\n\n"
+        "**Stray points** (§6.5.2). A share of each cloud's points is moved elsewhere. The table shows how many clouds "
+        "are still recognised: their 512 distances are nearest to those of the same cloud without stray points.\n\n"
         f"{markdown(stray(clouds), disturbed)}\n\n"
         f"{machine('torch', 'numba')}\n"
     )

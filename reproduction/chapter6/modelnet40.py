@@ -40,7 +40,7 @@ from framework.evaluation.cost import wall_time
 from framework.reports.table import Better, aggregate, markdown
 
 ROWS = {  # table and row, what the thesis reports: accuracy, FLOPs, parameters
-    "voxnet": ("6.1, 1", "VoxNet (32³ flags)", "83.0 %", "> 1e8", "9.0e5"),
+    "voxnet": ("6.1, 1", "VoxNet (32³ occupancy)", "83.0 %", "> 1e8", "9.0e5"),
     "occ_mlp_32": ("6.1, 2", "Occ-MLP (32³)", "79.9 %", "3.4e7", "1.7e7"),
     "occ_mlp_8": ("6.1, 3", "Occ-MLP (8³)", "74.5 %", "1.1e6", "5.5e5"),
     "tdf_mlp_32": ("6.1, 4", "TDF-MLP (32³)", "80.0 %", "3.4e7", "1.7e7"),
@@ -116,12 +116,12 @@ def cheaper(grid: str, other: str) -> dict[str, float]:
 
 CLAIMS: dict[str, tuple[Contrast, ...]] = {
     "Basis point sets are better than occupancy and truncated distances (§6.5.1)": (
-        Contrast("than flags, 32³", "+8.4", better("bps_mlp_grid_32", "occ_mlp_32")),
-        Contrast("than flags, 8³", "+13.1", better("bps_mlp_grid_8", "occ_mlp_8")),
+        Contrast("than occupancy, 32³", "+8.4", better("bps_mlp_grid_32", "occ_mlp_32")),
+        Contrast("than occupancy, 8³", "+13.1", better("bps_mlp_grid_8", "occ_mlp_8")),
         Contrast("than truncated distances, 32³", "+8.3", better("bps_mlp_grid_32", "tdf_mlp_32")),
         Contrast("than truncated distances, 8³", "+11.7", better("bps_mlp_grid_8", "tdf_mlp_8")),
     ),
-    "A plain network on them is better than VoxNet on flags (§6.5.1)": (
+    "A plain network on them is better than VoxNet on occupancy (§6.5.1)": (
         Contrast("32³", "+5.3", better("bps_mlp_grid_32", "voxnet")),
     ),
     "A small grid costs them little (§6.5.1)": (
@@ -131,18 +131,18 @@ CLAIMS: dict[str, tuple[Contrast, ...]] = {
             better("bps_mlp_grid_8", "bps_mlp_grid_32"),
             0.02,
         ),
-        Contrast("less than it costs flags", "0.7, 5.4", cheaper("bps_mlp_grid", "occ_mlp")),
+        Contrast("less than it costs occupancy", "0.7, 5.4", cheaper("bps_mlp_grid", "occ_mlp")),
         Contrast("less than it costs truncated distances", "0.7, 4.1", cheaper("bps_mlp_grid", "tdf_mlp")),
     ),
-    "Truncated distances are hardly better than flags (§6.5.1)": (
+    "Truncated distances are hardly better than occupancy (§6.5.1)": (
         Contrast("32³: by less than two points", "+0.1", better("occ_mlp_32", "tdf_mlp_32"), 0.02),
         Contrast("8³: by less than two points", "+1.4", better("occ_mlp_8", "tdf_mlp_8"), 0.02),
     ),
     "A small grid costs others (§6.5.1)": (
-        Contrast("flags", "5.4", better("occ_mlp_32", "occ_mlp_8")),
+        Contrast("occupancy", "5.4", better("occ_mlp_32", "occ_mlp_8")),
         Contrast("truncated distances", "4.1", better("tdf_mlp_32", "tdf_mlp_8")),
     ),
-    "With flags the plain network is below VoxNet (Table 6.1)": (
+    "With occupancy the plain network is below VoxNet (Table 6.1)": (
         Contrast("32³", "+3.1", better("voxnet", "occ_mlp_32")),
     ),
     "Other arrangements of 512 points are better than a grid (Table 6.1)": (

@@ -42,7 +42,7 @@ POINTS = 10_000
 EDGES = (2, 3, 4, 5, 6, 8, 10, 12, 15, 18, 21)
 """Of the grid basis; every basis has as many points, N = 3 · edge³ numbers are its deltas."""
 SIDES = (3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 25, 28, 31)
-"""Cells along an occupancy grid of N = side³ flags."""
+"""Cells along an occupancy grid of N = side³ cells."""
 STRATEGIES: tuple[Strategy, ...] = ("ball_uniform", "hexagonal", "ball_grid", "grid")
 METHODS = {
     "raw points": "raw points",
@@ -251,9 +251,9 @@ def main() -> None:
         f"`python -m reproduction.chapter6.reconstruction`: {rows[0]['shapes']} "
         f"{'synthetic ' if synthetic else ''}CAD shapes, "
         f"{POINTS} points of each surface, in the unit ball. Error: the Chamfer distance (eq. 6.6) between a cloud and "
-        "what is decoded from N numbers: N/3 of its points (raw), the centres of occupied cells of N flags, or basis "
-        "points and deltas of N/3 basis points. Values: `reconstruction.csv`, `reconstruction_time.csv`; figure: "
-        "`reconstruction.png`.\n\n"
+        "what is decoded from N numbers: N/3 of its points (raw), the centres of occupied cells of a grid of N cells, "
+        "or basis points and deltas of N/3 basis points. Values: `reconstruction.csv`, `reconstruction_time.csv`; "
+        "figure: `reconstruction.png`.\n\n"
         f"Thesis (Figure 6.4): less than half of the occupancy grid's error up to about N = 1e4; near that of raw "
         "points; random and hexagonal best. Measured (ratios of errors, curves read between their points):\n\n"
         f"{claims(rows)}\n\n"

@@ -47,10 +47,10 @@ DARKER = 3
 NAMES = {"quick": "SMPLpix", "hybrid": "network over the mesh"}
 """Of runs, by their experiments; others are called as these."""
 ABOUT = (
-    "Generated people, of whom training saw none: {height} × {width} pixels, {vertices:,} vertices. The mesh has its "
-    "vertices' colours and 4 × 4 samples a pixel. In other poses the registration to the first scan is posed anew, the "
-    "clothed person is photographed again; other shapes have no photograph, since clothes would fall otherwise. "
-    f"Errors are drawn {DARKER} times as large as they are."
+    "Generated people who are not in the training data: {height} × {width} pixels, {vertices:,} vertices. The mesh "
+    "has its vertices' colours and 4 × 4 samples a pixel. For other poses, the registration to the first scan is "
+    "posed and the clothed person is photographed in that pose; other shapes have no photograph, since clothes would "
+    f"fall otherwise. Errors are drawn {DARKER} times as large as they are."
 )
 
 
