@@ -70,8 +70,11 @@ def trained(framework: Framework, *more: str, folder: str) -> Done:
     return done
 
 
-@pytest.mark.parametrize("objectives", [(), RIVALS], ids=["likelihood", "rivals"])
-@pytest.mark.parametrize("at", [2, 7])
+@pytest.mark.parametrize(
+    "objectives",
+    [pytest.param((), id="likelihood", marks=pytest.mark.slow), pytest.param(RIVALS, id="rivals")],
+)
+@pytest.mark.parametrize("at", [pytest.param(2, marks=pytest.mark.slow), 7])
 def test_a_killed_run_goes_on_bit_by_bit(
     framework: Framework, tmp_path: Path, objectives: tuple[str, ...], at: int
 ) -> None:
@@ -228,11 +231,17 @@ def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(
 @pytest.mark.parametrize(
     "wrapped",
     [
-        ("uncertainty=[ensemble]", "uncertainty.ensemble.members=2"),
-        ("uncertainty=[temperature]",),
-        ("density_head.scale=pixel", "encoder.slim.scales=1", "uncertainty=[ensemble,temperature]"),
+        pytest.param(
+            ("uncertainty=[ensemble]", "uncertainty.ensemble.members=2"),
+            id="ensemble",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(("uncertainty=[temperature]",), id="temperature", marks=pytest.mark.slow),
+        pytest.param(
+            ("density_head.scale=pixel", "encoder.slim.scales=1", "uncertainty=[ensemble,temperature]"),
+            id="scales",
+        ),
     ],
-    ids=["ensemble", "temperature", "scales"],
 )
 def test_wrappers_and_objectives_work_on_images(framework: Framework, wrapped: tuple[str, ...]) -> None:
     done = trained(

@@ -94,8 +94,15 @@ def test_a_stray_variable_makes_no_run_a_second_rank(framework: Framework, whole
     assert (done.folder / "results.json").exists()
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("at", [14, 18], ids=["mid-epoch", "last-batch"])
+@pytest.mark.parametrize(
+    ("workers", "at"),
+    [
+        pytest.param(2, 14, id="2 workers, mid-epoch"),
+        pytest.param(0, 18, id="no workers, last batch"),
+        pytest.param(0, 14, id="no workers, mid-epoch", marks=pytest.mark.slow),
+        pytest.param(2, 18, id="2 workers, last batch", marks=pytest.mark.slow),
+    ],
+)
 def test_a_killed_run_goes_on_with_the_same_bits(
     framework: Framework, whole: Done, tmp_path: Path, workers: int, at: int
 ) -> None:
@@ -120,7 +127,7 @@ STOPS = ["trainer.patience=1", "trainer.max_epochs=30", "optimizer.learning_rate
 """A run whose validation loss soon is higher than before."""
 
 
-@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("every", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "further", [[], ["+trainer.min_epochs=16", "trainer.keep=last"]], ids=["stops", "goes on"]
 )
@@ -233,7 +240,13 @@ def test_a_signal_saves_and_says_so(
     )
 
 
-@pytest.mark.parametrize("name", ["run", "lr=0.1,b=[2]", "it's é {x} \\", "50%25 'a'"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "it's é {x} \\",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("run", "lr=0.1,b=[2]", "50%25 'a'")),
+    ],
+)
 def test_a_run_is_resumed_where_it_stopped_whatever_its_folder_is_called(
     framework: Framework, whole: Done, tmp_path: Path, name: str
 ) -> None:
@@ -406,6 +419,7 @@ def test_a_finished_run_is_in_the_store_with_all_it_needs_to_be_repeated(framewo
     assert parameters["density_head.name"] == "wrapped_cauchy"
 
 
+@pytest.mark.slow  # it waits half a minute
 def test_a_store_locked_while_training_costs_no_number(framework: Framework) -> None:
     first = framework(*TINY, "trainer.max_epochs=1", folder="first")
     assert first.code == 0, first.out
@@ -589,7 +603,7 @@ def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> Non
     assert "Traceback" not in done.out
 
 
-@pytest.mark.parametrize("fork", ["true", "false"])
+@pytest.mark.parametrize("fork", ["true", pytest.param("false", marks=pytest.mark.slow)])
 def test_a_job_of_a_sweep_gives_the_bits_of_a_run_by_itself(
     framework: Framework, whole: Done, tmp_path: Path, fork: str
 ) -> None:

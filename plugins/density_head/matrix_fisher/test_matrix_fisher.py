@@ -281,8 +281,14 @@ def test_marginals_of_ridges_and_flat_directions_integrate_to_one(concentration,
         assert (weights * alone.log_prob(points[:, None]).exp()).sum().item() == pytest.approx(1, abs=1e-4)
 
 
-@pytest.mark.parametrize("index", [0, 1, 2])
-@pytest.mark.parametrize("count", angles.FEW)
+@pytest.mark.parametrize(
+    "index, count",
+    [
+        pytest.param(index, count, marks=() if place % 3 == index else pytest.mark.slow)
+        for place, count in enumerate(angles.FEW)
+        for index in range(3)
+    ],
+)
 def test_few_nodes_do_up_to_their_bound(index, count, monkeypatch):
     """At the bound itself, for peaks, ridges and flat directions, wherever they lie and far from them too."""
     bound = angles.FEW[count]
