@@ -1,7 +1,7 @@
-"""An experiment framework for robust and efficient visual learning; `python -m framework --help` says what it runs."""
+"""An experiment framework for robust and efficient visual learning; `python -m framework --help` lists its commands."""
 
-# Only what Python has loaded by itself is imported here: `python -m` looks for anything else in the working directory
-# until `__main__` forbids it.
+# This file imports only modules that Python has already loaded: `python -m` would look for any other module in the
+# working directory until `__main__` forbids it.
 import sys
 from importlib import import_module
 from importlib.machinery import ModuleSpec
@@ -60,11 +60,11 @@ _NOW = {
         "validation": "calibration.validation",
     }.items()
 }
-"""Old names of modules that plugins import, and where those are now."""
+"""Old names of modules that plugins import, and the current names of these modules."""
 
 
 class _Moved:
-    """A finder by which an old name is the module at its new place, not a copy of it."""
+    """Finder that makes the old name of a module refer to the module itself, not to a copy."""
 
     def find_spec(
         self, fullname: str, path: "Sequence[str] | None", target: "ModuleType | None" = None
@@ -77,7 +77,7 @@ class _Moved:
         return module
 
     def exec_module(self, module: "ModuleType") -> None:
-        module.__spec__ = self.spec  # which the import system has just replaced by the old name's
+        module.__spec__ = self.spec  # the import system has just replaced it by the spec of the old name
 
 
 sys.meta_path.append(_Moved())

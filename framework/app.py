@@ -1,4 +1,4 @@
-"""The command line: composes the config, runs the chosen mode, and says what went wrong in a sentence."""
+"""The command line: it composes the config, runs the chosen mode, and reports an error in a sentence."""
 
 import os
 import sys
@@ -13,13 +13,13 @@ from framework.storage.threads import wait_passively
 
 
 def main() -> None:
-    """Entry of `python -m framework`.
+    """Run `python -m framework`.
 
-    It exits with 0, 1 (failed), 2 (refused), 129 (its terminal was closed), 130 (interrupted) or 143 (terminated).
+    The exit code is 0, 1 (failed), 2 (refused), 129 (the terminal was closed), 130 (interrupted) or 143 (terminated).
     """
     wait_passively()
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a table must not fail for an ± that a terminal has not
+        if isinstance(stream, TextIOWrapper):  # printing a table must not fail on a terminal without ±
             stream.reconfigure(errors="backslashreplace")
     survive_closed_pipes()
     # Hydra prints its own errors and exits unless told to raise them.
@@ -50,7 +50,7 @@ def _run() -> None:
             f"The package `plugins` was found at {spec and spec.origin}, not at {expected}: a file or folder of that "
             "name hides it. Rename it, take its folder out of PYTHONPATH, or use `python -P -m framework`."
         )
-    if sys.argv[1:] == ["mode=plugins"]:  # needs no config, and so makes no run folder
+    if sys.argv[1:] == ["mode=plugins"]:  # needs no config, so it makes no run folder
         from framework.modes.plugins import show
 
         show()
@@ -81,9 +81,9 @@ def _run() -> None:
         except UserError as error:
             with suppress(
                 OSError
-            ):  # it holds something: a mistake that was made before the run began leaves nothing
+            ):  # a folder that holds files stays; the empty one of a run that never began is removed
                 run_folder.rmdir()
-            # Hydra would print a stack trace's worth of its own around a sentence.
+            # Hydra would print a long stack trace of its own around the sentence.
             failures.append(error)
             return None
 

@@ -14,20 +14,24 @@ from framework.errors import DataError
 from framework.target import Target
 
 Batch = dict[str, Tensor]
-"""Named fields of a batch, first dimension the samples: "input"; "target" (radians for angles); "index", int64, the
-sample's number in its split; "group", int64 index into `Data.groups`; and what a plugin adds, said in its README.
+"""Named fields of a batch; the first dimension of each counts the samples.
 
-Optional is "symmetry", int64, set by a data set that knows it (generated objects, say) and read by the pictures of
-densities: n where the object looks the same after 1/n of a turn about its vertical axis, so that n values of the
-first angle are equally right; 1 where none is, as where the field is missing; 0 where any turn looks the same, so that
-there is no direction.
+Every batch has "input", "index" (int64, the number of the sample in its split) and, where samples are labelled,
+"target" (radians for angles) and "group" (int64, an index into `Data.groups`). A plugin may add fields, which its
+README describes.
 
-Optional are "color", "mask" and "depth" too: the true image, laid out as `framework.renderer.Renderer.channels` says,
-read by metrics of images."""
+"symmetry", int64, is optional. A data set sets it if it knows the symmetry of an object, for example of a generated
+one. The figures of densities read it. The value n means that the object looks the same after 1/n of a turn about its
+vertical axis, so that n values of the first angle are equally right. 1 means no symmetry, and so does a missing field.
+0 means that every turn looks the same, so that the object has no direction.
+
+"color", "mask" and "depth" are optional too. They hold the true image in the layout of
+`framework.renderer.Renderer.channels`, and metrics of images read them.
+"""
 
 
 class Frame(NamedTuple):
-    """Where the targets of some samples lie: the user's own numbers are location + scale · target.
+    """Affine map from the targets of a batch to the user's unit: location + scale · target.
 
     Attributes:
         location: (batch, number).
@@ -39,12 +43,12 @@ class Frame(NamedTuple):
 
 
 class Splits(NamedTuple):
-    """The splits of a data set; disjoint.
+    """The three splits of a data set; no sample is in two of them.
 
     Attributes:
-        train: what is trained on.
-        validation: early stopping and calibration see it, training does not.
-        test: seen by nothing but the test stage.
+        train: samples for training.
+        validation: samples for early stopping and calibration; training does not see them.
+        test: samples for the test stage only.
     """
 
     train: Dataset[Batch]
@@ -53,93 +57,116 @@ class Splits(NamedTuple):
 
 
 class Data(ABC):
-    """Gives the three splits of a data set; order, batching, workers and resuming are the framework's.
+    """A data set with three splits. The framework handles order, batching, workers and resuming.
 
-    The constructor only keeps its keyword-only parameters (the config): it reads nothing. `prepare` does the work
-    and is called once before anything but `read`; after it all attributes below are set. Bad input raises a DataError
-    that says which file, what was wanted and what to do; a sample that cannot be read is never replaced silently.
+    The constructor only keeps its keyword-only parameters (the config) and reads nothing. `prepare` does the work. The
+    framework calls it once, before every other method but `read`. After it all attributes below are set. Bad input
+    raises a DataError that says which file is bad, what was wanted and what to do. A sample that cannot be read is
+    never replaced silently.
 
-    A data set that cannot be shipped may be generated: its generator writes the official layout to the cache
-    (`framework.storage.cache.folder`) and the same loader reads it; `synthetic` is then True, and the framework says so
-    wherever a number or picture made from it appears.
+    A data set that cannot be shipped may be generated. Its generator writes the official layout to the cache
+    (`framework.storage.cache.folder`), and the same loader reads it. `synthetic` is then True, and the framework says
+    so beside every number and figure that comes from it.
     """
 
     group: ClassVar[str] = "data"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the data set, as BibTeX."""
     target: Target
-    """What is to be predicted."""
+    """Description of the predicted quantity."""
     input_shape: tuple[int, ...]
-    """Shape of one input, without the batch dimension; of point clouds (points, columns), of the largest of them."""
+    """Shape of one input, without the batch dimension; for point clouds (points, columns) of the largest cloud."""
     suffixes: tuple[str, ...] = ()
-    """Of the files that `read` reads, in small letters, so that others may lie beside them; () where any may be one."""
+    """Suffixes, in small letters, of the files that `read` reads. () allows every suffix.
+
+    A folder may hold other files beside them.
+    """
     companions: tuple[str, ...] = ()
-    """How the names of files end that are read along with another one and hold no samples, in small letters."""
+    """Endings, in small letters, of files that are read along with another file and hold no samples themselves."""
     columns: tuple[str, ...] = ()
-    """What the numbers of an input's last dimension are called, where they have names: ("x", "y", "z", "red", ...)."""
+    """Names of the numbers in the last dimension of an input, if they have names: ("x", "y", "z", "red", ...)."""
     plane: bool = False
-    """Whether an input is two numbers, a place in a plane, over which what a classifier says can be drawn."""
+    """True if an input is two numbers, a point in a plane.
+
+    A figure can then show the class probabilities over the plane.
+    """
     varies: bool = True
-    """Whether `augment` may change a batch."""
+    """True if `augment` may change a batch."""
     title: str = ""
-    """What pictures and tables call the data; where empty its only group, or else the plugin's name."""
+    """Name of the data in figures and tables.
+
+    If it is empty, they use the name of the only group, or else the plugin's name.
+    """
     directions: tuple[str, ...] = ()
-    """Where the first angle says from where an object is seen: words for 0°, 90°, 180° and 270°, seen from above
-    counter-clockwise. Pictures of other angles show degrees."""
+    """Words for 0°, 90°, 180° and 270° of the first angle, if that angle is the direction from which an object is seen.
+
+    The directions count counter-clockwise as seen from above. Figures of other angles show degrees.
+    """
     groups: tuple[str, ...]
-    """Names by which results are also reported apart (object classes, say); one name where there is one."""
+    """Names of the groups for which results are also reported separately, such as object classes.
+
+    If there is only one group, there is one name.
+    """
     synthetic: bool
-    """Whether the samples were generated."""
+    """True if the samples were generated."""
     skipped: int = 0
-    """How many samples were left out because they could not be read (only when the config allows it)."""
+    """Number of samples that were left out because they could not be read (only if the config allows this)."""
     remarks: tuple[str, ...] = ()
-    """What is not read of the user's files, and what looks odd in them, for the first lines of a run: clauses such as
-    "left out: 'note' (words)". Set by `prepare`."""
+    """Clauses about parts of the user's files that are not read or look odd, such as "left out: 'note' (words)".
+
+    `prepare` sets them, and the first lines of a run print them.
+    """
 
     def __init_subclass__(cls, **keywords: Any) -> None:
-        # plugins written before `splits` have three methods of the splits' names
+        # Plugins written before `splits` existed have one method per split, named like it.
         if "splits" not in vars(cls) and all(callable(getattr(cls, name, None)) for name in Splits._fields):
             cls.splits = _from_three_methods  # type: ignore[method-assign]
         super().__init_subclass__(**keywords)
 
     @abstractmethod
     def prepare(self) -> None:
-        """Find or generate the data, check its layout, read what is needed to set the attributes.
+        """Find or generate the data, check its layout, and read what is needed to set the attributes.
 
         Raises:
-            DataError: a missing root, a wrong layout, an unreadable file, a label that is not finite, an empty split.
+            DataError: the root is missing, the layout is wrong, a file is unreadable, a label is not finite, or a split
+                is empty.
         """
 
-    def check_files(self) -> None:  # noqa: B027 - most data have nothing to look at
-        """Look whether a user's own files are as `prepare` wants them, as far as that takes seconds.
+    def check_files(self) -> None:  # noqa: B027 - most data sets have nothing to check
+        """Check in a few seconds, as far as possible, that a user's own files are as `prepare` wants them.
 
-        A sweep asks before its jobs start. By default nothing is looked at.
+        A sweep calls it before its jobs start. The default checks nothing.
 
         Raises:
-            DataError: as `prepare`.
+            DataError: as in `prepare`.
         """
 
     @abstractmethod
     def splits(self) -> Splits:
-        """The three splits. Items are dicts of tensors without batch dimension; a dataset that can fetch many items
-        faster at once also has `__getitems__(indices) -> Batch`, already batched (framework.datasets.fields)."""
+        """Return the three splits.
+
+        Items are dicts of tensors without a batch dimension. A dataset that fetches many items at once faster also has
+        `__getitems__(indices) -> Batch`, which returns them as a batch (framework.datasets.fields).
+        """
 
     @abstractmethod
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Unlabelled samples from a user's own files, for `mode=predict`: "input" and "index" only. Needs no `prepare`.
+        """Return the unlabelled samples of a user's own files, with "input" and "index" only, for `mode=predict`.
+
+        It works without `prepare`.
 
         Raises:
-            DataError: there is no file, or one cannot be read; names it.
+            DataError: there is no file, or a file cannot be read; the message names that file.
         """
 
     def inputs(self, given: Any) -> Tensor:
-        """What a user gives a trained model, as a batch of inputs; needs no `prepare`.
+        """Return the inputs that a user gives to a trained model as a batch; works without `prepare`.
 
-        By default files are `read`, and an array of inputs, or of one input, is taken as it is. A data set that scales
-        its inputs, or whose users have something else at hand (a table, an image), says so here.
+        The default calls `read` on files, and takes an array of inputs, or of one input, as it is. A data set overrides
+        this method if it scales its inputs, or if its users have another format at hand (a table, an image).
 
         Raises:
-            DataError: it is none of these, or of another shape.
+            DataError: `given` is neither files nor an array of inputs, or the array has another shape.
         """
         files = [given] if isinstance(given, str | Path) else given
         if isinstance(files, Sequence) and files and all(isinstance(item, str | Path) for item in files):
@@ -151,23 +178,33 @@ class Data(ABC):
         return as_inputs(given, self.input_shape)
 
     def asked(self, given: Any) -> Batch:
-        """What a user gives a trained model, with whatever `frame` reads beside "input". Raises as `inputs`."""
+        """Return the batch that a user gives to a trained model: "input", and the fields that `frame` reads.
+
+        Raises:
+            DataError: as in `inputs`.
+        """
         return {"input": self.inputs(given)}
 
     def frame(self, batch: Batch) -> Frame | None:
-        """Of samples whose target of reals lies in a frame of the input's own (a normalised cloud's), so that answers
-        can be given in the user's; None, the default, where targets are in the user's own unit."""
+        """Return the frames of the samples of a batch, with which predictions are mapped to the user's unit.
+
+        A data set of real targets overrides this if each target is given in a frame of its own input, such as a
+        normalised cloud. The default, None, means that targets are in the user's unit.
+        """
         return None
 
     def state_dict(self) -> Mapping[str, Any]:
-        """What `inputs` and `read` need beside the config, as plain values and tensors: it travels with the model."""
+        """Return what `inputs` and `read` need beside the config, as plain values and tensors.
+
+        It travels with the model.
+        """
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take that of a model's training data; `prepare` after it makes inputs as that model reads them.
+        """Take over the state of a model's training data; a later `prepare` makes inputs as that model reads them.
 
         Raises:
-            DataError: it belongs to another kind of data.
+            DataError: the state belongs to another kind of data.
         """
         if state:
             raise DataError(
@@ -177,44 +214,50 @@ class Data(ABC):
 
     @abstractmethod
     def augment(self, batch: Batch) -> Batch:
-        """A training batch, randomly varied, on whatever device it is; or the batch itself.
+        """Return a training batch with random variations, on the batch's device, or the batch itself.
 
-        Random numbers come from torch's global generator, which the framework seeds by (seed, step) before the call,
-        so that a resumed run sees the same variations. What changes the target (a mirror) changes it too.
+        Random numbers come from torch's global generator. The framework seeds it by (seed, step) before the call, so
+        that a resumed run sees the same variations. A variation that changes the target (a mirror) changes "target"
+        too.
         """
 
     @abstractmethod
     def fingerprint(self) -> Mapping[str, str]:
-        """What identifies the data: root, version, number of samples a split, a hash over names and labels."""
+        """Return what identifies the data: root, version, samples per split, and a hash of names and labels."""
 
     @abstractmethod
     def picture(self, inputs: Tensor) -> np.ndarray:
-        """One input as a person would see it: (height, width, 3) uint8."""
+        """Return an image of one input for a person to look at, (height, width, 3) uint8."""
 
 
 class Mapped(ABC):
-    """What a data set derives from as well when the samples of one file are places (a volume's voxels), of which people
-    want maps."""
+    """Second base of a data set whose samples are places in one file, of which maps can be drawn.
+
+    An example is a data set whose samples are the voxels of a volume.
+    """
 
     @abstractmethod
     def write_maps(self, file: Path, point: Tensor, deviation: Tensor, folder: Path) -> Sequence[Path]:
-        """Write what is predicted for one file; called by `mode=predict`, after `read`. The files it wrote.
+        """Write maps of the predictions for one file and return the files written.
+
+        `mode=predict` calls it after `read`.
 
         Args:
-            file: the user's.
-            point, deviation: (sample, number) of its samples in the order of `read`, in the target's unit: what is
-                predicted, and its standard deviation.
-            folder: where to write; exists, and others' maps may be there.
+            file: the user's file.
+            point: (sample, number), point predictions for the samples of the file in the order of `read`, in the
+                target's unit.
+            deviation: (sample, number), standard deviations of the predicted densities, in the same unit.
+            folder: folder for the maps; it exists, and may hold maps of other files.
         """
 
 
 def as_inputs(given: Any, shape: tuple[int, ...]) -> Tensor:
-    """An array, or whatever NumPy makes one of, as a batch of inputs of `shape`; one input becomes a batch of one.
+    """Return an array, or whatever NumPy can turn into an array, as a batch of inputs of `shape`.
 
-    Clouds, of shape (points, columns), may have any number of points.
+    One input becomes a batch of one. Clouds, of shape (points, columns), may have any number of points.
 
     Raises:
-        DataError: it is no array of numbers, or of another shape.
+        DataError: `given` is no array of numbers, or has another shape.
     """
     wanted = "×".join(["any number", str(shape[-1])] if len(shape) == 2 else map(str, shape)) or "one number"
     try:
@@ -243,4 +286,5 @@ def as_inputs(given: Any, shape: tuple[int, ...]) -> Tensor:
 
 
 def _from_three_methods(data: Any) -> Splits:
+    """Return the splits of a data set of an old plugin, which has a method for each split."""
     return Splits(data.train(), data.validation(), data.test())

@@ -1,4 +1,4 @@
-"""The contract of a density head: raw numbers in, a probability density over the target out."""
+"""The contract of a density head: it turns raw parameters into a probability density over the target."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -10,74 +10,82 @@ from torch.distributions import Distribution
 
 
 class DensityHead(nn.Module, ABC):
-    """Turns raw network outputs into a density over the target.
+    """Base class of the modules that turn raw parameters, the outputs of a network, into a density over the target.
 
-    The framework puts one linear layer, encoder features → `size` raw numbers, in front of every head (the final
-    layer "set to match the number of required parameters", thesis §3.6.1). So a head owns the meaning of the raw
-    numbers and nothing before them, and any head can be a component of another: a mixture of K components reads
-    K × (component.size + 1) numbers. A head that is `direct` reads the features themselves.
+    The framework puts one linear layer, encoder features → `size` raw parameters, in front of every head (the final
+    layer "set to match the number of required parameters", thesis §3.6.1). So a head defines the meaning of the raw
+    parameters and nothing before them, and any head can be a component of another: a mixture of K components reads K ×
+    (component.size + 1) raw parameters. A head that is `direct` reads the features themselves.
 
-    A constructor asks for `target: Target` (framework.target) before `*`; its keyword-only parameters are the
-    config. It calls `target.require("angle", by="...")` or the like, so that it refuses what it cannot describe.
+    A constructor takes `target: Target` (framework.target) before `*`; its keyword-only parameters are the config. It
+    calls `target.require("angle", by="...")` or the like to refuse targets that it cannot describe.
 
-    The density is a `torch.distributions.Distribution` (build it with `validate_args=False`; the head has checked)
-    with `batch_shape == raw.shape[:-1]`; its `event_shape` is `target.event_shape`: `(len(target.names),)` for angles
-    and reals, `()` for classes, `(height, width, len(target.names))` for images. It has `log_prob` (nats), `sample`,
+    The density is a `torch.distributions.Distribution` (build it with `validate_args=False`; the head has checked) with
+    `batch_shape == raw.shape[:-1]`. Its `event_shape` is `target.event_shape`: `(len(target.names),)` for angles and
+    reals, `()` for classes, `(height, width, len(target.names))` for images. It has `log_prob` (nats), `sample`,
     `entropy` (nats) and `mode`. Angles are radians and read modulo 2π; the `support` of their density is
-    `distributions.circular.circular`. What else a density may be asked stands on one page,
-    framework.distributions.protocol: over several numbers it registers `marginal`, over an image `images`, and where
-    its log_prob draws nothing `estimate` with `exactly`; the rest has defaults that claim nothing they do not know.
+    `distributions.circular.circular`. framework.distributions.protocol describes all other functions of a density. A
+    density over several numbers registers `marginal`. A density over an image registers `images`. A density whose
+    log_prob draws nothing registers `estimate` with `exactly`. The other functions have defaults that claim nothing
+    they do not know.
 
-    Raw numbers may be anything finite, however large; the head maps them to a density whose log_prob is finite
-    wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw numbers
-    are refused with a `ValueError` that names the first bad batch row. A batch may be of any shape, also empty.
+    Raw parameters may be any finite numbers, however large. The head maps them to a density whose log_prob is finite
+    wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw parameters are
+    refused with a `ValueError` that names the first bad batch row. A batch may have any shape and may be empty.
     """
 
     group: ClassVar[str] = "density_head"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the method, as BibTeX."""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    """Attributes that trade error for run time and may be set at any time after training, with the values worth
-    trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
+    """Attributes that trade error for run time, each with its useful values in ascending order.
+
+    An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. Empty if there is none.
+    """
     direct: ClassVar[bool] = False
-    """Whether the last encoder's features, flattened, are the raw numbers, without a linear layer: images, say, whose
-    every pixel an encoder gives. There must be `size` of them."""
+    """True if the last encoder's flattened features are the raw parameters, without a linear layer.
+
+    An example is an encoder that gives every pixel of an image. There must be `size` features.
+    """
     size: int
-    """How many raw numbers the head reads per sample, > 0; set by the constructor."""
+    """Number of raw parameters that the head reads per sample, > 0; set by the constructor."""
     backbones: tuple[int, ...] = ()
-    """Sizes of parts of the raw numbers, in order and `size` together, each of which encoders of its own give: as many
-    networks as there are parts. Empty: one gives all. May be set by the constructor."""
+    """Sizes of the parts of the raw parameters that separate networks give, in order; they add up to `size`.
+
+    The model has as many networks as there are parts. Empty: one network gives all raw parameters. The constructor may
+    set it.
+    """
 
     @abstractmethod
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
-        """The density over the target, given raw numbers. Called for training, testing and prediction.
+        """Return the density over the target for raw parameters; called in training, testing and prediction.
 
-        In training mode the density may be a cheaper one than in evaluation (fewer samples). Random numbers come
-        from torch's global generator, which the framework seeds before every step.
+        In training mode the density may be a cheaper one than in evaluation (fewer samples). Random numbers come from
+        torch's global generator, which the framework seeds before every step.
         """
 
     @abstractmethod
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """The training loss per sample in nats, differentiable in `raw`; the framework takes the mean.
+        """Return the training loss per sample in nats, differentiable in `raw`; the framework takes the mean.
 
-        Usually `-self(raw).log_prob(target)`; a variational head returns its negative bound.
+        It is usually `-self(raw).log_prob(target)`; a variational head returns its negative bound.
         """
 
     @abstractmethod
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit what is not trained by gradient, such as a single global concentration (eq. 3.5), in place.
+        """Fit in place what is not trained by gradient, such as a single global concentration (eq. 3.5).
 
-        Called once after training, in evaluation mode and without gradient, with the whole validation set. What it
-        fits is a buffer, so that it is stored in the checkpoint. A head with nothing to fit does nothing.
+        The framework calls it once after training, in evaluation mode and without gradient, with the whole validation
+        split. Fitted values are buffers, so that the checkpoint stores them. A head with nothing to fit does nothing.
         """
 
 
 class Fitted(ABC):
-    """A density head that is fitted to the whole training split at once and not by gradient: trees, say.
+    """Second base of a density head that is fitted to the whole training split at once, not by gradient.
 
-    No linear layer is put before it: it reads the features as they are, and its `size` is their number, 0 before it
-    was fitted. Encoders before it may not learn either. Its state is of any shape: `load_state_dict` takes what is
-    stored, in a head that was just built.
+    Trees are an example. No linear layer precedes the head: it reads the features as they are, and its `size` is their
+    number, 0 before the fit. The encoders before it may have no trained parameters either. Its state may have any
+    shape: `load_state_dict` of a newly built head takes what is stored.
     """
 
     @abstractmethod
@@ -85,7 +93,7 @@ class Fitted(ABC):
         """Fit to all training samples, in place.
 
         Args:
-            features: of the training split.
-            target: theirs, (sample, *event).
-            seed: of what is drawn; members of an ensemble get different ones.
+            features: features of the training split.
+            target: targets of the same samples, (sample, *event).
+            seed: seed of random numbers; the members of an ensemble get different seeds.
         """

@@ -1,4 +1,4 @@
-"""The contract of an encoder: raw input in, a fixed-length feature vector out."""
+"""The contract of an encoder: it turns a raw input into a fixed-length feature vector."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar
@@ -8,43 +8,53 @@ from torch import Tensor, nn
 
 
 class Encoder(nn.Module, ABC):
-    """Turns an input, or the features of the encoder before it, into features.
+    """Base class of the modules that turn an input, or the features of the encoder before it, into features.
 
-    A constructor asks for `input_shape: tuple[int, ...]` before `*`: the shape of one sample without the batch
-    dimension, (channels, height, width) for images, (points, columns) for point clouds, (length,) for features. It
-    refuses a shape it cannot read with a ConfigError that says which shape it wants. It may ask for
-    `input_columns: tuple[str, ...]` too: what the numbers of an input's last dimension are called (`Data.columns`).
-    Its keyword-only parameters are the config.
+    A constructor takes `input_shape: tuple[int, ...]` before `*`: the shape of one sample without the batch dimension.
+    It is (channels, height, width) for images, (points, columns) for point clouds and (length,) for features. The
+    constructor refuses a shape that it cannot read with a ConfigError that says which shape it wants. It may also take
+    `input_columns: tuple[str, ...]`, the names of the numbers in an input's last dimension (`Data.columns`). Its
+    keyword-only parameters are the config.
 
-    Images come as uint8 with values 0…255 or as float with values 0…1, whatever the data plugin yields; an encoder
-    that reads images converts uint8 to float in [0, 1] itself and then normalises as it likes.
+    Images are uint8 with values 0…255 or float with values 0…1, as the data plugin gives them. An encoder that reads
+    images converts uint8 to float in [0, 1] itself and then normalises as it likes.
 
-    Point clouds come as (batch, points, columns), coordinates in the first three columns; those of fewer points are
+    Point clouds are (batch, points, columns), with coordinates in the first three columns. Clouds of fewer points are
     padded at their end with rows of NaN (geometry.clouds). A cloud that cannot be read is refused with a UserError.
 
-    Encoders chain: `encoder=[biternion_vgg,mlp]` feeds the second with the first's output; each is built with the
+    Encoders chain: `encoder=[biternion_vgg,mlp]` feeds the second with the first's output. Each is built with the
     `output_shape` of the one before it.
     """
 
     group: ClassVar[str] = "encoder"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the method, as BibTeX."""
     vectorises: bool = False
-    """Whether `torch.vmap` over its parameters computes several such encoders in one pass, to rounding, and faster than
-    one after the other: layers of matrix products without buffers. May be set by the constructor."""
+    """True if `torch.vmap` over the parameters of several such encoders gives their features in one pass, and faster.
+
+    The features agree to rounding. This holds for layers of matrix products without buffers. The constructor may set
+    it.
+    """
     fixed: bool = False
-    """Whether features are a function of the input alone: nothing in them is learned or drawn. The framework computes
-    them once per sample then, not once per epoch, where neither the data nor an objective varies its inputs."""
+    """True if features are a function of the input alone: no part of them is learned or drawn.
+
+    The framework then computes them once per sample and not once per epoch, if neither the data nor an objective varies
+    the inputs.
+    """
     starts_flat: bool = False
-    """Whether the linear layer to the head starts with weights of 0 where this encoder is last, so that all inputs are
-    given one density at first: for heads of very many numbers, whose usual first weights are noise that takes long to
-    unlearn. May be set by the constructor."""
+    """True if the linear layer to the head starts with weights of 0 when this encoder is the last one.
+
+    All inputs then have the same density at first. This is for heads with very many raw parameters, whose usual initial
+    weights are noise that takes long to unlearn. The constructor may set it.
+    """
     initial: ClassVar[frozenset[str]] = frozenset()
-    """Parameters that only say what training starts from: a file of weights, say. A loaded model needs none of them,
-    for its checkpoint holds the weights; it is built with None for each."""
+    """Names of parameters that only set where training starts, such as a file of weights.
+
+    A loaded model needs none of them, because its checkpoint holds the weights; it is built with None for each.
+    """
     output_shape: tuple[int, ...]
-    """Shape of the features of one sample; set by the constructor. The last encoder's is (length,)."""
+    """Shape of the features of one sample; set by the constructor. The last encoder's shape is (length,)."""
 
     @abstractmethod
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
-        """Features of shape (batch, *output_shape), of the parameters' dtype. The batch may be empty."""
+        """Return features of shape (batch, *output_shape), of the parameters' dtype. The batch may be empty."""

@@ -1,4 +1,4 @@
-"""The errors a user can cause; each message says what came, what was wanted and what to do."""
+"""The errors that a user can cause; each message says what came, what was wanted and what to do."""
 
 import re
 from collections.abc import Iterable
@@ -7,12 +7,12 @@ from itertools import islice
 
 
 class UserError(Exception):
-    """Something the user can mend. Printed as a sentence, without a stack trace.
+    """An error that the user can mend. It is printed as a sentence, without a stack trace.
 
-    What steers a terminal is written out: a message may quote a file of somebody else.
+    Characters that control a terminal are escaped, because a message may quote a file of another person.
 
-    One that is raised in a worker of a `DataLoader` torch raises anew, of the same class, with the worker's stack trace
-    for a message: of that the sentence alone is kept.
+    If a worker of a `DataLoader` raises such an error, torch raises a new one of the same class whose message is the
+    worker's stack trace. Only the sentence is kept of that message.
     """
 
     def __init__(self, *said: object) -> None:
@@ -22,16 +22,16 @@ class UserError(Exception):
 
 
 def printable(text: str, kept: str = "\n\t") -> str:
-    """Return a text in which nothing steers a terminal: other letters than the `kept` are written out."""
+    """Return a text in which unprintable characters, except those in `kept`, are escaped: none controls a terminal."""
     return "".join(
         letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in encodable(text)
     )
 
 
 def encodable(text: str) -> str:
-    r"""Return a text whose bytes that are not UTF-8, as in names of files, are written out as \xe9.
+    r"""Return a text in which bytes that are not UTF-8, as in names of files, are escaped as \xe9.
 
-    Python stands for each of them by a lone surrogate (PEP 383), which no text file, font or database takes.
+    Python represents each of them by a lone surrogate (PEP 383), which no text file, font or database accepts.
     """
     return re.sub("[\ud800-\udfff]", _written_out, text)
 
@@ -42,60 +42,63 @@ def _written_out(letter: re.Match[str]) -> str:
 
 
 def _sentence(said: str, kind: type[UserError]) -> str:
-    """What the error said, out of the text that `torch._utils.ExceptionWrapper` makes of it."""
+    """Return the error's message, extracted from the text that `torch._utils.ExceptionWrapper` makes of the error."""
     if not re.match(r"Caught \w+ in .*\.\nOriginal Traceback \(most recent call last\):\n", said):
         return said
-    # an error that was raised from another comes after that one's trace
+    # The trace of an error that was raised from another one follows the other's trace.
     between = r"\n\n(?:The above|During handling of the above) exception,? .*:\n\n(?=Traceback )"
     trace = re.split(between, said)[-1].removesuffix("\n")
-    # every line before the sentence is indented; that of a class of a script names no module
+    # Every line before the sentence is indented. The line of a class defined in a script names no module.
     name = rf"(?:{re.escape(kind.__module__)}\.)?{re.escape(kind.__qualname__)}"
     found = re.search(rf"^{name}(?:: (.*))?\Z", trace, re.DOTALL | re.MULTILINE)
     return (found[1] or "") if found else said
 
 
 class ConfigError(UserError):
-    """A config names or holds something that does not exist or is out of range."""
+    """Error for a config that names something that does not exist, or holds a value out of range."""
 
 
 class DataError(UserError):
-    """Data on disk is missing, unreadable or wrong."""
+    """Error for data on disk that is missing, unreadable or wrong."""
 
 
 class CheckpointError(UserError):
-    """A checkpoint is damaged, belongs to another model, or finds no room on the disk."""
+    """Error for a checkpoint that is damaged, belongs to another model, or does not fit on the disk."""
 
 
 class NonFiniteLoss(UserError):
-    """The training loss became NaN or infinite; raised before the optimiser steps."""
+    """Error for a training loss that became NaN or infinite; raised before the optimiser steps."""
 
 
 class NonFiniteAnswer(ValueError):
-    """Numbers that a network gives a density head hold NaN or infinity."""
+    """Error for NaN or infinity in the raw parameters that a network gives to a density head."""
 
 
 def shown(damage: object, most: int = 200) -> str:
-    """What a file holds, or what a library says of it, for a message: cut, and without what steers a terminal."""
+    """Return the content of a file or the message of a library for an error message.
+
+    The text is shortened to `most` characters, and characters that control a terminal are escaped.
+    """
     text = " ".join(line.strip() for line in str(damage).splitlines())
     text = text if len(text) <= most else text[: most - 1] + "…"
     return printable(text, kept="")
 
 
 def quoted(damage: object) -> str:
-    """The same in quotation marks."""
+    """Return the same as `shown`, in quotation marks."""
     return shown(repr(damage))
 
 
 LIKE = 0.65
-"""Least likeness of a name that is suggested: 'resnet' and 'unet' have 0.6, 'mpl' and 'mlp' 0.67."""
+"""Smallest similarity of a name that is suggested: 'resnet' and 'unet' have 0.6, 'mpl' and 'mlp' 0.67."""
 LISTED_WHOLE, LISTED = 24, 8
-"""Most names that a message lists, and how many it lists of more."""
+"""Largest number of names that a message lists in full, and the number of names that it lists if there are more."""
 
 
 def nearest(word: str, known: Iterable[str], likeness: float = LIKE) -> str | None:
-    """Return the name like `word`, if there is one.
+    """Return the name most similar to `word`, or None if no name is similar.
 
-    'lr' is like learning_rate, and 'moons' like moons/everything.
+    'lr' is similar to learning_rate, and 'moons' to moons/everything.
     """
     word, names = shown(word), list(islice(known, 1000))
     near = get_close_matches(word, names, n=1, cutoff=likeness)
@@ -105,7 +108,7 @@ def nearest(word: str, known: Iterable[str], likeness: float = LIKE) -> str | No
 
 
 def listed(word: str, known: Iterable[str]) -> str:
-    """Return all names, or of many the nearest to `word` and how many more there are."""
+    """Return a list of all names or, if there are many, of those nearest to `word` and the number of the others."""
     names = list(known)
     if len(names) <= LISTED_WHOLE:
         return ", ".join(names)
@@ -120,6 +123,6 @@ def listed(word: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """' Did you mean ...?' with a leading space, or nothing where nothing is near."""
+    """Return ' Did you mean ...?' with a leading space, or "" if no name is near."""
     near = nearest(word, known)
     return f" Did you mean {quoted(near)}?" if near else ""

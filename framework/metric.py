@@ -1,4 +1,4 @@
-"""The contract of a metric: predictions in, named numbers out."""
+"""The contract of a metric: it turns predictions into named numbers."""
 
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -17,50 +17,57 @@ if TYPE_CHECKING:
 class Metric(torchmetrics.Metric, ABC):
     """A torchmetrics.Metric that reads predictions.
 
-    `full_state_update` is False. States are sums and counts (`dist_reduce_fx="sum"`), or lists of per-sample numbers
-    ("cat") where a sum does not suffice, as for a median, or have a merging function of their own (a stable variance);
-    never angles, which do not add. Sums are float64.
+    `full_state_update` is False. States are float64 sums and counts (`dist_reduce_fx="sum"`). They may be lists of
+    numbers per sample ("cat") where a sum does not suffice, as for a median, or have their own merging function (a
+    stable variance). They are never sums of angles, because angles do not add.
 
-    A constructor's keyword-only parameters are the config; it may ask for `target: Target` before `*`. It costs
-    nothing when it is not asked for: whatever several metrics share (the log-likelihood, the point prediction) lives
-    in `Prediction` and is computed on first use.
+    A constructor's keyword-only parameters are the config; it may take `target: Target` before `*`. A metric that is
+    not requested costs nothing: what several metrics share (the log-likelihood, the point prediction) lives in
+    `Prediction` and is computed at first use.
     """
 
     group: ClassVar[str] = "metric"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the method, as BibTeX."""
     full_state_update = False
     splits: ClassVar[tuple[Split, ...]] = ("test",)
-    """Whose predictions `update` is given. With "outliers" it also gets those on the test split of the config's
-    `outliers`, told apart by `prediction.split`; nothing is predicted on outliers that no metric reads."""
+    """Splits whose predictions `update` receives.
+
+    With "outliers" it also receives the predictions on the test split of the config's `outliers`; `prediction.split`
+    tells the two apart. No predictions are made on outliers that no metric reads.
+    """
     reads: ClassVar[frozenset[str]] = frozenset()
-    """Channels of `Prediction.image` that `update` asks for: those that some metric reads are drawn together, and no
-    others. Their truth is `Prediction.true_image`."""
+    """Channels of `Prediction.image` that `update` requests; the true images are `Prediction.true_image`.
+
+    The channels that the chosen metrics read are drawn together, and no others.
+    """
     columns: ClassVar[dict[str, str]]
     """Keys of `compute` that belong in the result table, with their headings, in order: {"maad_deg": "MAAD °"}.
-    A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own."""
+
+    A key "<name>_sem" is printed behind "<name>" as ± and has no heading of its own.
+    """
 
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
-    """Which way a column is better, for those of `columns` that have a better way."""
+    """Direction in which a column is better, for the keys of `columns` that have a better direction."""
 
     @abstractmethod
     def update(self, prediction: Prediction) -> None:
-        """Take in one batch."""
+        """Add the predictions of one batch to the states."""
 
     @abstractmethod
     def compute(self) -> dict[str, Tensor]:
-        """Scalars by name, with the unit in the name where it is not 1 (`maad_deg`, `log_likelihood` is in nats).
+        """Return scalars by name, with the unit in the name if it is not 1 (`maad_deg`; `log_likelihood` is in nats).
 
-        NaN where nothing was seen.
+        They are NaN if no batch was seen.
         """
 
 
 class Mean(Metric):
-    """What metrics share that are a mean over samples, of one number or several, with its standard error.
+    """Base class of metrics that are a mean over samples, of one number or several, with its standard error.
 
-    A metric of the family calls `start` in its constructor, `take_in` in `update` and `mean_and_error` in `compute`.
-    The states are sums of the numbers and of their squares: for numbers that are not negative, so that no large mean
-    hides a small spread (of scores in [0, 2] float64 resolves a spread of 1e-8).
+    A subclass calls `start` in its constructor, `take_in` in `update` and `mean_and_error` in `compute`. The states are
+    the sums of the numbers and of their squares. They suit numbers that are not negative, where no large mean hides a
+    small spread (for scores in [0, 2] float64 resolves a spread of 1e-8).
     """
 
     count: Tensor
@@ -74,24 +81,27 @@ class Mean(Metric):
             self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
 
     def take_in(self, numbers: Float[Tensor, "batch *shape"]) -> None:
+        """Add the numbers of a batch of samples, (batch, *shape), to the sums."""
         self.count += len(numbers)
         self.total += numbers.sum(0)
         self.squares += numbers.square().sum(0)
 
     def mean_and_error(self) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-        """Both are NaN of no sample, and of one the error is."""
+        """Return the mean and its standard error; both are NaN without samples, and the error is NaN for one sample."""
         mean = self.total / self.count
         spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
         return mean, (spread / (self.count - 1).clamp(min=0)).sqrt()
 
 
 class Pictured(ABC):
-    """What a metric derives from as well when it has a picture to show."""
+    """Second base of a metric that has a figure to show."""
 
     picture: ClassVar[str]
-    """Name of the picture's file, without a suffix."""
+    """Name of the figure's file, without a suffix."""
 
     @abstractmethod
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
-        """The picture of what was seen, called after `compute`. The module that draws is imported in here, so that
-        a metric that is only computed loads no Matplotlib."""
+        """Return the figure of the batches seen; called after `compute`.
+
+        The method imports the module that draws, so that a metric that is only computed loads no Matplotlib.
+        """

@@ -18,48 +18,49 @@ from framework.errors import ConfigError
 
 
 class Predictor(nn.Module, ABC):
-    """Anything that turns inputs into a density and can be trained; a model or a wrapper around one."""
+    """Base class of everything that returns a density for inputs and can be trained: models and wrappers of models."""
 
     description: object = None
-    """What the checkpoint of a loaded model says of it; its text is what the model prints as."""
+    """Description of a loaded model from its checkpoint; the model prints as its text."""
 
     def __repr__(self) -> str:
         return nn.Module.__repr__(self) if self.description is None else str(self.description)
 
     @abstractmethod
     def forward(self, inputs: Tensor) -> Distribution:
-        """The density over the target for a batch of inputs, with batch_shape (batch,)."""
+        """Return the density over the target for a batch of inputs, with batch_shape (batch,)."""
 
     @abstractmethod
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """The training loss per sample, nats."""
+        """Return the training loss per sample, nats."""
 
     @abstractmethod
     def training_densities(self, inputs: Tensor) -> Distribution:
-        """What an objective may shape by gradient: batch_shape (batch,), or (batch, member) where several are trained.
+        """Return the densities that an objective may shape by gradient.
 
-        A model's own density; of a wrapper, those of what it wraps, before anything is mixed or calibrated.
+        Their batch_shape is (batch,), or (batch, member) if several members are trained. A model returns its own
+        density. A wrapper returns the densities of what it wraps, before it mixes or calibrates them.
         """
 
     @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Fit what is not trained by gradient, on the validation set; called once after training."""
+        """Fit on the validation split what is not trained by gradient; called once after training."""
 
 
 @final
 class Model(Predictor):
-    """Encoders in a chain, a linear layer to the numbers the head reads, the head.
+    """A chain of encoders, a linear layer to the distribution parameters, and a density head.
 
-    A head that is fitted at once (`Fitted`) or `direct` reads the features themselves, flattened, without the linear
+    A head that is fitted at once (`Fitted`) or `direct` reads the flattened features themselves, without the linear
     layer.
 
     Args:
-        input_shape: of one sample; needed where there are no encoders.
-        beside: for a head with several backbones, the encoders of all but the first.
+        input_shape: shape of one sample; needed if there are no encoders.
+        beside: the encoders of all backbones but the first, for a head with several backbones.
 
     Raises:
-        ConfigError: the last encoder does not end in a vector, or, before a direct head, in as many numbers as that
-            reads; or an encoder learns in front of a head that is fitted at once.
+        ConfigError: the last encoder's features are no vector; or, before a direct head, they are not as many as the
+            head reads; or an encoder with trained parameters precedes a head that is fitted at once.
     """
 
     def __init__(
@@ -108,16 +109,19 @@ class Model(Predictor):
         self.kept: Kept[Tensor] | None = Kept() if head.direct else None
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the density over the target for a batch of inputs."""
         return self.head(self.raw(inputs))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the loss of the head per sample, nats."""
         return self.head.loss(self.raw(inputs), target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the density for a batch of inputs; objectives may shape it by gradient."""
         return self(inputs)
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
-        """What the head reads."""
+        """Return the distribution parameters that the head reads, (batch, size)."""
         return self._raw(inputs) if self.kept is None else self.kept.of(inputs, self._raw)
 
     def _raw(self, inputs: Tensor) -> Tensor:
@@ -126,6 +130,7 @@ class Model(Predictor):
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the head with the raw parameters and targets of all batches."""
         pairs = [(self.raw(batch["input"]), batch["target"]) for batch in batches]
         raws, targets = zip(*pairs, strict=True)
         self.head.calibrate(torch.cat(raws), torch.cat(targets))
@@ -133,14 +138,14 @@ class Model(Predictor):
 
 @final
 class Backbones(Encoder):
-    """Networks of one architecture with weights of their own, each with a linear layer to its part of the raw numbers.
+    """Networks of one architecture, each with its own weights and a linear layer to its part of the raw parameters.
 
     Args:
-        networks: encoders in a chain, of each.
-        sizes: how many numbers each gives.
+        networks: the chain of encoders of each network.
+        sizes: number of raw parameters that each network gives.
 
     Raises:
-        ConfigError: they do not end in vectors.
+        ConfigError: the features of the last encoders are no vectors.
     """
 
     bibtex = ""
@@ -161,6 +166,7 @@ class Backbones(Encoder):
         self.output_shape = (sum(sizes),)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
+        """Return the raw parameters of all networks, concatenated in order, (batch, size)."""
         return torch.cat([network(inputs) for network in self.networks], 1)
 
 
@@ -168,11 +174,12 @@ Computed = TypeVar("Computed")
 
 
 class Kept(Generic[Computed]):
-    """What was last computed, and of which tensor, while `one_pass` asks for it."""
+    """The last computed result and the tensor it was computed from; it keeps nothing outside of `one_pass`."""
 
     last: tuple[()] | tuple[Tensor, Computed] | None = None
 
     def of(self, inputs: Tensor, compute: Callable[[Tensor], Computed]) -> Computed:
+        """Return `compute(inputs)`, or the kept result if it was computed from the very same tensor."""
         if self.last and self.last[0] is inputs:
             return self.last[1]
         found = compute(inputs)
@@ -183,9 +190,9 @@ class Kept(Generic[Computed]):
 
 @final
 class FrozenFrontEnd(Predictor):
-    """A predictor of features that need be computed but once (`Encoder.fixed`), with the encoders that give them.
+    """A predictor and the encoders before it whose features need to be computed only once (`Encoder.fixed`).
 
-    So whatever wraps the predictor (several members, many passes) does not compute them again.
+    Wrappers around the predictor (several members, many passes) therefore do not compute the features again.
     """
 
     def __init__(self, encoders: Sequence[Encoder], predictor: Predictor) -> None:
@@ -195,29 +202,34 @@ class FrozenFrontEnd(Predictor):
         self.kept: Kept[Tensor] = Kept()
 
     def features(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
-        """What the predictor reads."""
+        """Return the features that the predictor reads."""
         return self.kept.of(inputs, self.encoders)
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the predictor's density for the features of a batch of inputs."""
         return self.predictor(self.features(inputs))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the predictor's training loss per sample, nats."""
         return self.predictor.loss(self.features(inputs), target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the densities of the predictor that an objective may shape by gradient."""
         return self.predictor.training_densities(self.features(inputs))
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the predictor with the features of all batches."""
         self.predictor.calibrate({**batch, "input": self.features(batch["input"])} for batch in batches)
 
 
 @contextmanager
 def one_pass(predictor: Predictor) -> Iterator[None]:
-    """Temporarily computes some numbers of one tensor of inputs once, however often loss and densities are asked.
+    """Compute shared results once for each tensor of inputs inside the block.
 
-    These are features that are fixed, the raw numbers of direct heads, whose encoders give images which an objective
-    compares as the loss does, and what else a module keeps in `kept`.
+    They are reused however often loss and densities are requested. The shared results are fixed features, the raw
+    parameters of direct heads, and what other modules keep in `kept`. The encoders of a direct head give images, which
+    an objective compares as the loss does.
     """
     found = (getattr(module, "kept", None) for module in predictor.modules())
     parts = [kept for kept in found if isinstance(kept, Kept)]
@@ -231,21 +243,24 @@ def one_pass(predictor: Predictor) -> Iterator[None]:
 
 
 def fitted_models(predictor: Predictor) -> list[Model]:
-    """Those with such a head, wherever they are wrapped."""
+    """Return the models whose head is fitted at once (`Fitted`), also those inside wrappers."""
     found = [module for module in predictor.modules() if isinstance(module, Model)]
     return [model for model in found if isinstance(model.head, Fitted)]
 
 
 def learns(predictor: Predictor) -> bool:
-    """Whether it is trained by gradient: it has parameters, and no head that is fitted at once."""
+    """Return whether a predictor is trained by gradient: it has such parameters, and no head that is fitted at once."""
     return not fitted_models(predictor) and any(one.requires_grad for one in predictor.parameters())
 
 
 def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
-    """A penalty per sample from that of each member, (batch,) or (batch, member): members train as if alone.
+    """Return a penalty per sample, (batch,), from the penalties of its members, so that each member trains as if alone.
 
-    Its value is the mean over members, so that it compares with that of one model; its gradient is that of the sum, so
-    that each member's own gradient is neither divided by their number nor changed by the others.
+    Its value is the mean over members, which compares with the penalty of one model. Its gradient is the gradient of
+    the sum. So the gradient of each member is neither divided by the number of members nor changed by the others.
+
+    Args:
+        values: (batch,), returned as they are, or (batch, member).
     """
     if values.dim() == 1:
         return values
@@ -254,6 +269,9 @@ def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]
 
 
 def of_its_own(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
-    """Penalties of samples each of which one member alone sees: their mean is that over all, and the gradient of that
-    mean is in each member the gradient of the mean over its own samples."""
+    """Return penalties of samples, each seen by one member only, with gradients scaled by the number of members.
+
+    Their mean is the mean of `values`. In each member the gradient of that mean is the gradient of the mean over the
+    member's own samples.
+    """
     return members * values - (members - 1) * values.detach()

@@ -1,4 +1,4 @@
-"""The contract of an objective: a term of the training loss beyond the head's own."""
+"""The contract of an objective: a term that is added to the training loss of the density head."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -13,17 +13,18 @@ from framework.data import Batch
 from framework.model import Predictor
 
 Share = Annotated[float, Field(ge=0, lt=1)]
+"""A share in [0, 1)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rival:
-    """An optimiser of Adam's family for parameters that learn against the predictor's.
+    """Optimiser of Adam's family for an adversary's parameters, which are trained against the predictor's.
 
-    Its step is taken together with the predictor's, from gradients of the same weights: as two optimisers step whose
-    losses are computed before either has moved. Its gradients are clipped apart.
+    Its step is taken together with the predictor's step, from gradients at the same weights. This equals two optimisers
+    whose losses are both computed before either has stepped. Its gradients are clipped separately.
 
     Attributes:
-        betas: decay of the moments.
+        betas: decay rates of the moments.
     """
 
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -32,25 +33,30 @@ class Rival:
 
 
 class Objective(nn.Module, ABC):
-    """A penalty added to the mean loss of every training batch: outlier exposure, adversarial smoothing and the like.
+    """Penalty on every training batch, added to its mean loss.
 
-    Keyword-only constructor parameters are the config, among them `weight: float`, the factor it applies itself.
+    Examples are outlier exposure and adversarial smoothing. Keyword-only constructor parameters are the config. One of
+    them is `weight: float`, the factor that the objective applies itself.
     """
 
     group: ClassVar[str] = "objective"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the method, as BibTeX."""
 
     rival: Rival | None = None
-    """How parameters of its own are trained where they learn against the predictor's, as a discriminator does. Their
-    loss is part of what `forward` returns; which of the two a term moves is a matter of what is detached in it. None:
-    what it has is trained as the predictor is."""
+    """Optimiser of the objective's own parameters, if they are trained against the predictor's.
+
+    A discriminator's parameters are an example. Their loss is part of the value that `forward` returns; what a term
+    detaches decides which of the two sides it trains. None: the objective's parameters are trained like the
+    predictor's.
+    """
     told: Mapping[str, Tensor] = {}
-    """Scalars of the last batch to be logged beside the loss, detached: each term by its name."""
+    """Detached scalars of the last batch that are logged beside the loss: each term by its name."""
 
     @abstractmethod
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
-        """The weighted penalty on this batch, a scalar in nats, differentiable in the predictor's parameters.
+        """Return the weighted penalty on this batch, a scalar in nats, differentiable in the predictor's parameters.
 
-        The loss and the densities of the batch's own inputs cost nothing more where the predictor gives images.
+        If the predictor gives images, the loss and the densities of the batch's own inputs are shared and cost nothing
+        more.
         """

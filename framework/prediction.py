@@ -1,4 +1,4 @@
-"""What a model predicted for one batch; whatever is derived from it is computed on first use, once."""
+"""Prediction of a model for one batch; every quantity derived from it is computed once, at first use."""
 
 import math
 from collections.abc import Collection
@@ -20,19 +20,19 @@ from framework.errors import DataError
 from framework.target import Target
 
 Split = Literal["test", "outliers"]
-"""Where inputs come from: the test split, or data that belongs to nothing the model was trained on."""
+"""Source of the inputs: the test split, or outliers, which are of a kind that training did not show."""
 
 
 class Prediction:
-    """A density over a batch, beside the batch.
+    """A batch and the density that is predicted for it.
 
     Args:
         density: with batch_shape (batch,).
         batch: the fields of the batch, on the density's device.
-        samples: draws for a point prediction that has no closed form (S of eq. 3.24).
-        split: where the batch comes from; the targets of outliers mean nothing.
-        draw: where noise comes from; None: torch's generators as they stand.
-        reads: channels of images that will be asked for, to be drawn together.
+        samples: number of samples for a point prediction that has no closed form (S of eq. 3.24).
+        split: source of the batch; the targets of outliers have no meaning.
+        draw: source of noise; None uses the current state of torch's generators.
+        reads: channels of images that will be requested, so that they are drawn together.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Prediction:
         self._draw = draw or (lambda purpose: nullcontext())
 
     def in_frame(self, frame: Frame | None) -> "Prediction":
-        """The same prediction in the user's own unit, where `Data.frame` says in which the target lies."""
+        """Return this prediction in the user's unit, given the `Data.frame` of its targets; None changes nothing."""
         if frame is None:
             return self
         density = Moved(self.density, *(part.to(self.batch["input"]) for part in frame))
@@ -61,6 +61,7 @@ class Prediction:
 
     @property
     def target(self) -> Tensor:
+        """Targets of the batch, (batch, *event)."""
         return self.batch["target"]
 
     @property
@@ -70,41 +71,53 @@ class Prediction:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """The same with its Monte Carlo error and the samples it took: 0 where nothing is drawn, NaN if not known."""
+        """Log-likelihood with its Monte Carlo error and sample count.
+
+        The error is 0 if nothing is drawn, and NaN if it is not known.
+        """
         with self._draw("estimate"):
             return estimate(self.density, self.target)
 
     @cached_property
     def class_probabilities(self) -> Tensor:
-        """Of each class, (batch, class), float64; of a density over anything else a UserError."""
+        """Probability of each class, (batch, class), float64; a density over any other target raises a UserError."""
         with self._draw("class probabilities"):
             return class_probabilities(self.density)
 
     @cached_property
     def entropy(self) -> Tensor:
-        """Of each density, (batch,), nats."""
+        """Entropy of each density, (batch,), nats."""
         with self._draw("entropy"):
             return self.density.entropy()
 
     @cached_property
     def point(self) -> Tensor:
-        """The prediction of least expected absolute deviation (eq. 3.23-3.24), shaped like the target."""
+        """Point prediction of least expected absolute deviation (eq. 3.23-3.24), shaped like the target."""
         with self._draw("point"):
             return median(self.density, self.samples)
 
     def interval(self, mass: float, draws: int = DRAWS) -> Interval:
-        """The middle `mass` of each real or angle, (batch, number) each (`framework.distributions.intervals`)."""
+        """Return the middle interval of probability `mass` for each real or angle, with ends of shape (batch, number).
+
+        `framework.distributions.intervals` defines it.
+        """
         with self._draw("interval"):
             return middle(self.density, mass, draws)
 
     def set_size(self, sets: ValueSet) -> Tensor:
-        """Size of the sets that come with the densities, (batch,); where it is drawn, always from the same draws."""
+        """Return the size of the sets that come with the densities, (batch,).
+
+        A size that is drawn always uses the same draws.
+        """
         with self._draw("set"):
             return sets.size()
 
     def deviation(self, draws: int = 999) -> Tensor:
-        """The standard deviation of each real, (batch, number). Where the density does not know its own it is that
-        of draws, of a normal density to 2 %: 1 / √(2 draws), the standard error."""
+        """Return the standard deviation of each real, (batch, number).
+
+        If the density does not know its standard deviation, it is estimated from `draws` samples. The standard error of
+        the estimate is 1 / √(2 draws) of it for a normal density, 2 % by default.
+        """
         try:
             return self.density.stddev
         except NotImplementedError:
@@ -112,7 +125,7 @@ class Prediction:
                 return self.density.sample(Size((draws,))).std(0)
 
     def marginal(self, index: int) -> Distribution:
-        """The density of one number of the target."""
+        """Return the density of the number `index` of the target."""
         return self._marginals.setdefault(index, marginal(self.density, index))
 
     @cached_property
@@ -120,9 +133,10 @@ class Prediction:
         return {}
 
     def image(self, channel: str) -> Tensor:
-        """What the point prediction looks like (`protocol.images`), (batch, height, width[, number]).
+        """Return a channel of the images of the point predictions, (batch, height, width[, number]).
 
-        The first channel that is asked for is drawn with all that `reads` names; any other with itself alone.
+        `protocol.images` draws them. The first request draws its channel together with all channels in `reads`. A later
+        request for another channel draws that channel only.
         """
         if channel not in self._images:
             with self._draw("images"):
@@ -134,12 +148,12 @@ class Prediction:
         return {}
 
     def true_image(self, channel: str) -> Tensor:
-        """The truth, shaped like `image`."""
+        """Return the true image of a channel, shaped like the result of `image`."""
         return true_image(self.batch, channel)
 
 
 def true_image(batch: Batch, channel: str) -> Tensor:
-    """The batch's field of that name.
+    """Return the batch's field of the name `channel`.
 
     Raises:
         DataError: there is no such field.
@@ -153,8 +167,10 @@ def true_image(batch: Batch, channel: str) -> Tensor:
 
 
 def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:
-    """What a table of predictions says, (batch,) each, in the user's names and units; angles in degrees. Of images the
-    entropy alone: they stand beside the table."""
+    """Return the columns of a table of predictions, (batch,) each, in the user's names and units; angles in degrees.
+
+    For images it returns the entropy only, because images are stored beside the table.
+    """
     if target.kind == "image":
         found = {}
     elif target.kind == "class":
@@ -166,7 +182,10 @@ def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:
 
 
 def named(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:
-    """Angles or reals, (batch, number), by their names; `of` says what they are, where it is not the prediction."""
+    """Return angles (in degrees) or reals, (batch, number), as columns by name.
+
+    `of` is a suffix of the names that says what the values are, if they are not the predictions.
+    """
     if target.kind == "angle":
         degrees = wrap(values) * (180 / math.pi)
         return {f"{name}{of}_deg": degrees[:, i] for i, name in enumerate(target.names)}

@@ -1,4 +1,4 @@
-"""The contract of a renderer: a scene in, an image and only the channels asked for out."""
+"""The contract of a renderer: a scene comes in, and an image with only the requested channels goes out."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
@@ -13,19 +13,21 @@ from torch import Tensor
 from framework.geometry.camera import Camera
 
 Wrap = Literal["repeat", "clamp", "mirror"]
+"""Rules for the colour of a texture beyond its image."""
 
 
 @dataclass(frozen=True)
 class Texture:
-    """Pictures laid onto faces.
+    """Images that are laid onto faces.
 
     Attributes:
-        images: linear in [0, 1], rows from top to bottom, of any sizes, all of as many channels.
-        uv: places in an image, u to the right and v upwards: (0, 0) is its lower left corner, (1, 1) its upper right.
+        images: linear in [0, 1], rows from top to bottom; their sizes may differ, their numbers of channels may not.
+        uv: positions in an image, u to the right and v upwards: (0, 0) is its lower left corner, (1, 1) its upper
+            right.
         faces: three rows of `uv` per triangle of the scene.
-        shown: which of the images each face shows, -1 for none; None: all show the first.
-        wrap: what lies beyond the image.
-        smooth: interpolate between the centres of texels; else the texel that a place lies in.
+        shown: index of the image on each face, -1 for none; None puts the first image on all faces.
+        wrap: rule for positions beyond the image.
+        smooth: True interpolates between the centres of texels; False takes the texel that holds the position.
     """
 
     images: tuple[Float[Tensor, "_height _width channels"], ...]
@@ -42,11 +44,11 @@ class Scene:
 
     Attributes:
         vertices: world coordinates, metres.
-        faces: three vertex indices per triangle, counter-clockwise seen from outside; none in a set of points.
-        colors: per vertex, linear in [0, 1], of one channel or more (red, green, blue; or 1 for a silhouette); None
-            where no colour is asked for, or the texture says it all.
-        camera: where from, and the image size.
-        texture: what faces show; where there are colours too, the product of both.
+        faces: three vertex indices per triangle, counter-clockwise seen from outside; a set of points has no faces.
+        colors: colour of each vertex, linear in [0, 1], with one or more channels (red, green, blue; or 1 for a
+            silhouette). None if no colour is requested, or if the texture alone gives the colour.
+        camera: camera pose, intrinsics and image size.
+        texture: texture of the faces. If there are vertex colours too, the image shows the product of both.
     """
 
     vertices: Float[Tensor, "vertices 3"]
@@ -58,17 +60,18 @@ class Scene:
 
 @dataclass(frozen=True)
 class Report:
-    """What one picture left out, and what was left to do.
+    """Counts of what the renderer drew, left out and reused for one image.
 
     Attributes:
-        faces: of the scene.
-        drawn: faces whose pixels were visited.
-        left_out: the other faces by the first reason that held: "outside" (no pixel centre of the image in the box
-            around it), "behind" (the near plane), "back" (seen from behind), "flat" (no area, or not finite),
-            "hidden" (behind what was drawn before); a reason that held for none is absent.
-        visited: pixels of the box around what was drawn; the others were not looked at again.
-        reused: what was kept from the last picture, since it had not changed: "places" of vertices on the screen, say.
-        channels: those that were drawn.
+        faces: number of faces of the scene.
+        drawn: number of faces whose pixels were visited.
+        left_out: number of the other faces by the first reason that held: "outside" (the box around the face holds no
+            pixel centre of the image), "behind" (the near plane), "back" (seen from behind), "flat" (no area, or not
+            finite), "hidden" (behind faces that were drawn before). A reason that held for no face is absent.
+        visited: number of pixels in the box around the drawn faces; the renderer did not visit the others again.
+        reused: names of results that were kept from the last image because they had not changed, such as "places" of
+            vertices on the screen.
+        channels: names of the channels that were drawn.
     """
 
     faces: int
@@ -80,12 +83,13 @@ class Report:
 
 
 def joined(scenes: Sequence[Scene]) -> Scene:
-    """Several subjects in one scene, seen by the camera of the first; vertices and faces in the order they came.
+    """Return one scene of several scenes, seen by the camera of the first; vertices and faces keep their order.
 
-    A subject without colours has white ones where another has some.
+    A scene without colours gets white ones if another scene has colours.
 
     Raises:
-        ValueError: no scene came, colours differ in channels, or textures in `wrap` or `smooth`.
+        ValueError: there is no scene; or colours differ in their number of channels; or textures differ in `wrap` or
+            `smooth`.
     """
     if not scenes:
         raise ValueError("no scene came; wanted one or more to join.")
@@ -114,11 +118,12 @@ def joined(scenes: Sequence[Scene]) -> Scene:
 
 
 def _moved(indices: Tensor, by: int) -> Tensor:
-    """Indices that count from elsewhere. Types that hold them may not hold their sum: 200 + 100 is 44 in uint8."""
+    """Return indices plus an offset. Small integer types become int64, since 200 + 100 is 44 in uint8."""
     return (indices if indices.is_floating_point() else indices.long()) + by
 
 
 def _joined_textures(scenes: Sequence[Scene]) -> Texture | None:
+    """Return one texture for the joined faces of several scenes, or None if no scene has a texture."""
     textures = [scene.texture for scene in scenes if scene.texture is not None]
     if not textures:
         return None
@@ -146,50 +151,66 @@ def _joined_textures(scenes: Sequence[Scene]) -> Texture | None:
 
 
 class Renderer(ABC):
-    """Draws scenes; draws only what is asked for and what the camera can see.
+    """Draws scenes; it draws only the requested channels and what the camera can see.
 
-    Keyword-only constructor parameters are the config. A renderer has no state that one call leaves for the next
-    (buffers it reuses are its own affair), so that calls may come in any order. A triangle with a coordinate that is
-    not finite or no area (at the renderer's own precision) is left out, never drawn wrong; of one that the near plane
-    cuts, what is beyond is drawn, or nothing; a scene out of view gives the background. Where two surfaces are equally
-    far, the lower face index wins.
+    Keyword-only constructor parameters are the config. No call changes the result of a later one (a renderer may reuse
+    buffers), so calls may come in any order.
 
-    "color" may have a gradient in what of the scene requires one: `differentiable` says in what it has.
+    A triangle with a coordinate that is not finite, or without area at the renderer's own precision, is left out and
+    never drawn wrongly. If the near plane cuts a triangle, the part beyond the plane is drawn, or nothing. A scene out
+    of view gives the background. If two surfaces are equally far, the lower face index wins.
+
+    "color" may have a gradient in those parts of the scene that require one; `differentiable` lists the supported
+    parts.
     """
 
     group: ClassVar[str] = "renderer"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the method, as BibTeX."""
     channels: ClassVar[frozenset[str]]
-    """What it can draw, each (height, width) or, with a number behind it here, (height, width, number): "color" of as
-    many as the scene's, float32 in [0, 1]; "depth", float32, metres along the optical axis, background
-    inf; "face", int32, index of the visible face, background -1; "mask", bool; "normal" 3, float32, of the visible
-    face, of length 1, in world axes, to the side from which its corners run counter-clockwise; "barycentric" 3,
-    float32, weights of its corners, perspective-correct; "uv" 2, float32, where in its texture, before wrapping, 0
-    where it has none; the background of the last three is 0. One that does not draw "uv" refuses "color" of a scene
-    with a texture."""
+    """Names of the channels that the renderer can draw.
+
+    Each channel is (height, width) or, with several numbers, (height, width, number).
+
+    - "color": as many numbers as the scene's colours, float32 in [0, 1].
+    - "depth": float32, metres along the optical axis; background inf.
+    - "face": int32, index of the visible face; background -1.
+    - "mask": bool.
+    - "normal": 3 numbers, float32, unit normal of the visible face in world axes, to the side from which its corners
+    run counter-clockwise.
+    - "barycentric": 3 numbers, float32, perspective-correct weights of the face's corners.
+    - "uv": 2 numbers, float32, position in the face's texture before wrapping, 0 on a face without a texture.
+
+    The background of the last three is 0. A renderer that does not draw "uv" refuses "color" of a scene with a texture.
+    """
 
     background: ClassVar[float] = 0.0
-    """What "color" is where nothing is seen, in every channel: 0, or 1 of one that paints on white."""
+    """Value of "color" in every channel where nothing is seen: 0, or 1 for a renderer that draws on white."""
 
     differentiable: frozenset[str] = frozenset()
-    """In what "color" has a gradient, that of pictures of areas and not of single points, of: "vertices", "colors",
-    "texture" (its images), "uv", "rotation", "translation", "focal", "principal"."""
+    """Names of the scene's parts in which "color" has a gradient.
+
+    The names are "vertices", "colors", "texture" (its images), "uv", "rotation", "translation", "focal" and
+    "principal". The gradient is that of pixels as areas, not as single points.
+    """
 
     report: Report | None = None
-    """Of the last picture; None where it keeps none."""
+    """Report on the last image; None if the renderer keeps none."""
 
     def batch(
         self, scenes: Sequence[Scene], channels: Collection[str] = ("color",)
     ) -> list[dict[str, Tensor]]:
-        """The same of several scenes, of any sizes; a renderer may draw them side by side."""
+        """Draw several scenes, which may differ in size, and return the channels of each.
+
+        A renderer may draw them in parallel.
+        """
         return [self(scene, channels) for scene in scenes]
 
     @abstractmethod
     def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
-        """The channels asked for, each once, keyed by name.
+        """Draw the requested channels of a scene, each once, and return them by name.
 
         Raises:
-            ValueError: a channel it cannot draw, "color" of a scene without colours, or shapes and indices that do
-                not fit; says what came and what was wanted.
+            ValueError: the renderer cannot draw a channel; or "color" is requested of a scene without colours; or
+                shapes or indices do not fit. The message says what came and what was wanted.
         """

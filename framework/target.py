@@ -1,4 +1,4 @@
-"""What is to be predicted: the kind of value, and the name of each number in it."""
+"""The predicted quantity: the kind of value, and the name of each number in it."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,25 +6,26 @@ from typing import Literal
 from framework.errors import ConfigError
 
 Kind = Literal["angle", "real", "class", "image"]
+"""Kinds of targets; `Target` describes them."""
 MOST = 40
-"""Names that a sentence lists in full."""
+"""Largest number of names that a sentence lists in full."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """The quantity a density head predicts.
+    """The quantity that a density head predicts.
 
     Attributes:
-        kind: "angle": radians, read modulo 2π; "real": any real number; "class": one of several labels; "image":
-            pictures in numbers as files hold them (sRGB), 0…1.
-        names: for angles and reals the name of each number, e.g. ("azimuth", "elevation", "tilt"), and a batch
-            of targets is a float tensor of shape (batch, len(names)); for classes the label names, and a batch
-            of targets is an int64 tensor of shape (batch,); for images the channels, ("red", "green", "blue"), and a
-            batch is a float tensor of shape (batch, height, width, len(names)).
-        location, scale: of reals, the mean and standard deviation of each number over the training split: a head
-            is scaled by them, so that its raw numbers are of the order of 1 in whatever unit. () where the numbers
-            are of that order already; the head then takes 0 and 1.
-        size: of images, (height, width) in pixels; () of everything else.
+        kind: "angle": radians, read modulo 2π; "real": any real number; "class": one of several labels; "image": images
+            with values as in files (sRGB), 0…1.
+        names: for angles and reals the name of each number, e.g. ("azimuth", "elevation", "tilt"); a batch of targets
+            is a float tensor of shape (batch, len(names)). For classes the label names; a batch of targets is an int64
+            tensor of shape (batch,). For images the channels, ("red", "green", "blue"); a batch of targets is a float
+            tensor of shape (batch, height, width, len(names)).
+        location, scale: for reals, the mean and standard deviation of each number over the training split. A head is
+            scaled by them, so that its raw parameters are of the order of 1 in any unit. () if the numbers are of that
+            order already; the head then takes 0 and 1.
+        size: for images, (height, width) in pixels; () for every other kind.
     """
 
     kind: Kind
@@ -35,18 +36,18 @@ class Target:
 
     @property
     def event_shape(self) -> tuple[int, ...]:
-        """Shape of one target, and so of one draw of its density."""
+        """Shape of one target, and so of one sample of its density."""
         return () if self.kind == "class" else (*self.size, len(self.names))
 
     @property
     def told(self) -> str:
-        """The names, for a sentence; of very many the first ones, and how many there are beside them."""
+        """Names of the target for a sentence; if there are very many, the first ones and the number of the others."""
         first = self.names if len(self.names) <= MOST else self.names[: MOST // 4]
         rest = f" and {len(self.names) - len(first)} more" if len(first) < len(self.names) else ""
         return ", ".join(first) + rest
 
     def require(self, kind: Kind, by: str) -> None:
-        """Refuse a target that `by` cannot describe.
+        """Refuse a target whose kind is not `kind`, the one that `by` can describe.
 
         Raises:
             ConfigError: the kinds differ.

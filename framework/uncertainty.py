@@ -1,4 +1,4 @@
-"""The contract of an uncertainty wrapper: a predictor in, a better calibrated predictor out."""
+"""The contract of an uncertainty wrapper: it turns a predictor into a better calibrated predictor."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,49 +14,57 @@ from framework.model import Predictor
 
 
 class Uncertainty(Predictor):
-    """Wraps one predictor: ensemble, dropout at test time, temperature and the like.
+    """Base class of wrappers around one predictor, such as ensembles, dropout at test time and temperature.
 
-    A constructor asks for `model: Callable[[], Predictor]` before `*`, which builds a fresh, differently initialised
-    copy of what is wrapped at each call. The densities it returns are mixtures of densities (the Mixture of
-    distributions.density), never densities of averaged parameters; wrapping one member gives that member's numbers to
-    the last bit. They compose: `uncertainty=[ensemble,temperature]` puts temperature around the ensemble.
+    A constructor takes `model: Callable[[], Predictor]` before `*`. Each call of `model` builds a new, differently
+    initialised copy of the wrapped predictor. The returned densities are mixtures of densities (the Mixture of
+    distributions.density), never densities of averaged parameters. Wrapping one member gives that member's numbers to
+    the last bit. Wrappers compose: `uncertainty=[ensemble,temperature]` puts temperature around the ensemble.
     """
 
     group: ClassVar[str] = "uncertainty"
     bibtex: ClassVar[str]
-    """What to cite, as BibTeX."""
+    """Citation of the method, as BibTeX."""
     knobs: Mapping[str, tuple[int, ...]] = {}
-    """Attributes that trade error for run time and may be set at any time after training, with the values worth
-    trying, ascending: {"samples": (1, 3, 10, 30)}. Empty where there is none."""
+    """Attributes that trade error for run time, each with its useful values in ascending order.
+
+    An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. Empty if there is none.
+    """
     remark: str = ""
-    """What `calibrate` found that whoever uses the model should know, a sentence that it sets; runs print it, and it
-    travels with the model. "" where there is nothing to say."""
+    """A sentence for the model's user about what `calibrate` found; "" if there is nothing to say.
+
+    `calibrate` sets it, runs print it, and it travels with the model.
+    """
 
     @abstractmethod
     def forward(self, inputs: Tensor) -> Distribution:
-        """The density over the target for a batch of inputs."""
+        """Return the density over the target for a batch of inputs."""
 
     @abstractmethod
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """The training loss per sample, nats."""
+        """Return the training loss per sample, nats."""
 
     @abstractmethod
     def training_densities(self, inputs: Tensor) -> Distribution:
-        """What an objective may shape by gradient: of what is wrapped, batch_shape (batch,) or (batch, member)."""
+        """Return the wrapped densities that an objective may shape by gradient.
+
+        Their batch_shape is (batch,) or (batch, member).
+        """
 
     @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate what is wrapped, then itself, on the validation set; called once after training."""
+        """Calibrate the wrapped predictor, then the wrapper, on the validation split; called once after training."""
 
 
 class Several(ABC):
-    """What a wrapper derives from as well when it trains several models, each as it would train alone.
+    """Second base of a wrapper that trains several models, each as it would train alone.
 
     Attributes:
-        trained: how many.
-        own_batches: whether `loss` and `training_densities` are given the batches of all of them one after the other,
-            equally many rows each, and each sees its own alone; densities have the batch_shape (rows of each, member).
-            Set while training on one device, where each then has an order of its own.
+        trained: number of models.
+        own_batches: True if `loss` and `training_densities` are given one batch per model, concatenated in the order of
+            the models and equally long, and each model sees its own batch only. Densities then have the batch_shape
+            (rows of each batch, member). It is set while training on one device, where each model has its own order of
+            samples.
     """
 
     trained: int
@@ -64,30 +72,33 @@ class Several(ABC):
 
     @abstractmethod
     def clip_each(self, most: float) -> None:
-        """Shorten the gradient of each to the norm `most` where it is longer."""
+        """Scale the gradient of each model down to the norm `most` if it is longer."""
 
 
 def remarks(predictor: Predictor) -> tuple[str, ...]:
-    """What its wrappers found when they were calibrated, the innermost last."""
+    """Return the remarks that the wrappers of a predictor made at calibration, the innermost last."""
     found = (one.remark for one in predictor.modules() if isinstance(one, Uncertainty))
     return tuple(dict.fromkeys(remark for remark in found if remark))
 
 
 def outermost(predictor: Predictor) -> Several | None:
-    """The wrapper that trains several models, of nested ones the outer; None where there is none."""
+    """Return the outermost wrapper that trains several models, or None if there is none."""
     found = (one for one in predictor.modules() if isinstance(one, Several) and one.trained > 1)
     return next(found, None)
 
 
 def rows_each(predictor: Predictor, rows: int) -> int:
-    """How many rows of a batch each model sees."""
+    """Return how many rows of a batch each model sees."""
     several = outermost(predictor)
     return rows // several.trained if several is not None and several.own_batches else rows
 
 
 @contextmanager
 def own_batches(predictor: Predictor, own: bool = True) -> Iterator[None]:
-    """Temporarily lets each of several models read its own part of a batch (`Several.own_batches`), or all read all."""
+    """Set `Several.own_batches` of the outermost wrapper inside the block.
+
+    True gives each of several models its part of a batch; False gives the whole batch to all of them.
+    """
     several = outermost(predictor)
     if several is None:
         yield
@@ -100,13 +111,13 @@ def own_batches(predictor: Predictor, own: bool = True) -> Iterator[None]:
 
 
 class Joining(ABC):
-    """What a wrapper derives from as well when models that were trained apart can become its members (mode=combine)."""
+    """Second base of a wrapper whose members can be models that were trained separately (mode=combine)."""
 
     @classmethod
     @abstractmethod
     def parameters_of(cls, count: int) -> dict[str, Any]:
-        """The config that builds such a wrapper around `count` members: {"members": count}, say."""
+        """Return the config that builds such a wrapper around `count` members, for example {"members": count}."""
 
     @abstractmethod
     def join(self, members: Sequence[Predictor]) -> None:
-        """Take over their weights, in order; each is built like what is wrapped."""
+        """Take over the weights of the members, in order; each member is built like the wrapped predictor."""
