@@ -35,7 +35,7 @@ CONVERSIONS = frozenset(("tensor", "as_tensor", "asarray"))
 """Functions whose result is where their argument is if that is a tensor, else as of FACTORIES."""
 OF_THE_FIRST = frozenset(
     ("expand_as", "view_as", "reshape_as", "copy_", "set_", "resize_as_", "__deepcopy__", "is_same_size", "align_as",
-     "_make_subclass", "backward", "register_hook", "index_fill", "index_fill_", "new_tensor", "new_zeros", "new_ones",
+     "_make_subclass", "backward", "register_hook", "new_tensor", "new_zeros", "new_ones",
      "new_full", "new_empty", "new_empty_strided", "zeros_like", "ones_like", "empty_like", "full_like", "rand_like",
      "randn_like", "randint_like")
 )  # fmt: skip

@@ -32,7 +32,8 @@ class WrappedCauchy(Distribution):
         return (torch.log(gap * (1 + length)) - near.log() - math.log(2 * math.pi)).sum(-1)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        uniform = torch.rand(*sample_shape, *self.location.shape, dtype=self.location.dtype)
+        like = {"dtype": self.location.dtype, "device": self.location.device}
+        uniform = torch.rand(*sample_shape, *self.location.shape, **like)
         scale = self.gap / (2 - self.gap)
         return self.location + 2 * torch.atan(scale * torch.tan(math.pi * (uniform - 0.5)))
 

@@ -96,7 +96,7 @@ class Silent(Distribution):
         return (0 * self.raw - math.log(2 * math.pi)).sum(-1).expand(value.shape[:-1])
 
     def sample(self, sample_shape: torch.Size = NO_SAMPLE) -> Tensor:
-        return 2 * math.pi * torch.rand(*sample_shape, *self.raw.shape)
+        return 2 * math.pi * torch.rand(*sample_shape, *self.raw.shape, device=self.raw.device)
 
     def entropy(self) -> Tensor:
         return (0 * self.raw + math.log(2 * math.pi)).sum(-1)

@@ -27,7 +27,8 @@ class Committee(Uncertainty):
 
     def forward(self, inputs: Tensor) -> Distribution:
         densities = [member(inputs) for member in self.members]
-        return Mixture(torch.zeros(*densities[0].batch_shape, len(densities)), Stacked(densities))
+        weights = torch.zeros(*densities[0].batch_shape, len(densities), device=inputs.device)
+        return Mixture(weights, Stacked(densities))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return torch.stack([member.loss(inputs, target) for member in self.members]).mean(0)
@@ -53,6 +54,7 @@ class AveragedCommittee(Uncertainty):
 
     def forward(self, inputs: Tensor) -> Distribution:
         densities = [member(inputs) for member in self.members]
+        weights = torch.zeros(*densities[0].batch_shape, len(densities), device=inputs.device)
         places = torch.stack([density.location for density in densities])
         return type(densities[0])(torch.atan2(places.sin().mean(0), places.cos().mean(0)))
 
