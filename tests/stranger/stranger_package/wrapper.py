@@ -54,7 +54,6 @@ class AveragedCommittee(Uncertainty):
 
     def forward(self, inputs: Tensor) -> Distribution:
         densities = [member(inputs) for member in self.members]
-        weights = torch.zeros(*densities[0].batch_shape, len(densities), device=inputs.device)
         places = torch.stack([density.location for density in densities])
         return type(densities[0])(torch.atan2(places.sin().mean(0), places.cos().mean(0)))
 
