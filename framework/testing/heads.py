@@ -386,9 +386,9 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
     for dtype in (torch.float32, torch.float64):
         head = subject.make().to(dtype)
         for size in (*SIZES, torch.finfo(dtype).max):
-            raw = subject.raws(16).sign().to(dtype) * size
-            raw[:4], raw[4:8] = size, -size
-            value = as_type(subject.values(16), dtype)
+            raw = subject.raws(8).sign().to(dtype) * size
+            raw[:2], raw[2:4] = size, -size
+            value = as_type(subject.values(8), dtype)
             where = f"{str(dtype)[6:]}, raw numbers of size {size:.3g}"
             with torch.no_grad():
                 density = head.eval()(raw)
