@@ -1,1 +1,1 @@
-"""Share of samples whose likeliest class is the true one."""
+"""Share of samples whose most likely class is the true one."""

@@ -1,4 +1,4 @@
-"""Accuracy and its standard error, from two counts."""
+"""Accuracy and its standard error, computed from two counts."""
 
 from typing import ClassVar, Literal
 
@@ -12,14 +12,14 @@ from framework.target import Target
 
 
 class Accuracy(Metric):
-    """Share of samples whose likeliest class is the true one (thesis Table 2.1), with its standard error.
+    """Share of samples whose most likely class is the true one (thesis Table 2.1), with its standard error.
 
-    Of classes that are equally likely the first is taken.
+    If several classes are equally likely, the first of them is taken.
 
     Raises:
-        ConfigError: the target is no class.
-        UserError: a density without class probabilities, or with NaN among them.
-        DataError: a label that is no class.
+        ConfigError: the target is not a class.
+        UserError: a density has no class probabilities, or NaN among them.
+        DataError: a label is not a class of the target.
     """
 
     bibtex = """@book{hastie2009elements,
@@ -49,6 +49,6 @@ class Accuracy(Metric):
 
     def compute(self) -> dict[str, Tensor]:
         share = self.right / self.count
-        # the sample variance of zeros and ones is n a (1 - a) / (n - 1); one sample has none: 0/0
+        # the sample variance of zeros and ones is n a (1 - a) / (n - 1); it is undefined for one sample: 0/0
         error = (share * (1 - share) / (self.count - 1).clamp(min=0)).sqrt()
         return {"accuracy": share, "accuracy_sem": error}

@@ -1,4 +1,4 @@
-"""Rows of the contract: two classes and several."""
+"""Rows of the contract: targets of two and of five classes."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -1,1 +1,1 @@
-"""Angular deviation of the point prediction, its mean and its median."""
+"""Mean and median angular deviation of the point prediction."""

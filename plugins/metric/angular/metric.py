@@ -26,8 +26,8 @@ class MeanAngularDeviation(Mean):
     """Mean absolute angular deviation (MAAD) of the point prediction, degrees, with its standard error.
 
     `maad_deg` takes the mean over the angles of a sample first, so that its standard error counts samples;
-    `maad_<angle>_deg` is that of one angle. The point is the one that minimises this very loss (thesis eq.
-    3.23 and 3.24).
+    `maad_<angle>_deg` is the deviation of one angle. The point prediction is the one that minimises this loss (thesis
+    eq. 3.23 and 3.24).
 
     Raises:
         ConfigError: the target is not made of angles.
@@ -57,11 +57,11 @@ class MeanAngularDeviation(Mean):
 
 
 class MedianAngularDeviation(Metric):
-    """Median absolute angular deviation of the point prediction, degrees: what half of the samples stay below.
+    """Median absolute angular deviation of the point prediction, degrees: half of the samples stay below it.
 
-    Of several angles a sample's deviation is their mean, as in `angular_deviation`. The median of an even number is
-    the mean of the middle two. It says how well a method does where it does well: of a density with two modes half a
-    turn apart, the mean deviation mostly says how often the point prediction took the wrong one.
+    For several angles a sample's deviation is their mean, as in `angular_deviation`. The median of an even number is
+    the mean of the middle two. The median shows how accurate a method is on its good samples. The mean deviation of a
+    density with two modes half a turn apart instead mostly shows how often the point prediction took the wrong mode.
 
     Raises:
         ConfigError: the target is not made of angles.
@@ -88,6 +88,6 @@ class MedianAngularDeviation(Metric):
 
 
 def deviations(prediction: Prediction) -> Float[Tensor, "batch angle"]:
-    """The shorter way round from the point prediction to the target, radians, float64."""
-    # float64 before the difference: two float32 angles far from 0 differ by a float32 step each
+    """Return the shorter angular distance from the point prediction to the target, radians, float64."""
+    # convert to float64 before the difference: float32 angles far from 0 are coarse
     return angular_distance(prediction.point.double(), prediction.target.double())

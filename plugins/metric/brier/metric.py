@@ -1,4 +1,4 @@
-"""Brier score: squared error of class probabilities, and its standard error."""
+"""Brier score (squared error of class probabilities) and its standard error."""
 
 from typing import ClassVar, Literal
 
@@ -15,13 +15,14 @@ from framework.target import Target
 class Brier(Mean):
     """Mean Brier score, a proper scoring rule of class probabilities (thesis eq. 2.26), with its standard error.
 
-    Of two classes the squared error of the second's probability, in [0, 1]: eq. 2.26 as a mean. Of more, the sum of
-    the squared errors of all probabilities, in [0, 2] (Brier 1950). Of two classes that sum would be twice as large.
+    For two classes it is the squared error of the second class's probability, in [0, 1]: eq. 2.26 as a mean. For more
+    classes it is the sum of the squared errors of all probabilities, in [0, 2] (Brier 1950). For two classes this sum
+    would be twice as large.
 
     Raises:
-        ConfigError: the target is no class.
-        UserError: a density without class probabilities, or with NaN among them.
-        DataError: a label that is no class.
+        ConfigError: the target is not a class.
+        UserError: a density has no class probabilities, or NaN among them.
+        DataError: a label is not a class of the data set.
     """
 
     bibtex = """@article{brier1950verification,
@@ -53,7 +54,9 @@ class Brier(Mean):
 def brier(
     probability: Float64[Tensor, "batch class"], label: Int[Tensor, "batch"]
 ) -> Float64[Tensor, "batch"]:
-    """Of each sample (y - p(y = 1))² for two classes (eq. 2.26), Σ_k (p_k - 1[y = k])² for more (Brier 1950, eq. 2)."""
+    """Return (y - p(y = 1))² for two classes (eq. 2.26), Σ_k (p_k - 1[y = k])² for more (Brier 1950, eq. 2), per
+    sample.
+    """
     classes = probability.shape[-1]
     error = probability - torch.nn.functional.one_hot(label, classes)
     return error[:, 1].square() if classes == 2 else error.square().sum(-1)

@@ -19,37 +19,41 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NEAR = 2.0**-20
-"""Confidences so near to each other count as equal where bins are chosen: float32 gives the same probability by a few
-times 2^-24 more or less on another device."""
+"""Difference of confidences that count as equal where bins are chosen.
+
+The same probability in float32 differs by a few times 2^-24 from one device to another.
+"""
 
 
 class CalibrationError(Metric, Pictured):
-    """How far stated confidence is from the share that is right, over bins of confidence (thesis eq. 2.28-2.31).
+    """Difference between confidence and the share of right predictions in bins of confidence (thesis eq. 2.28-2.31).
 
     - `ece`: expected calibration error in bins of equal width.
-    - `ece_positive`: of two classes, in such bins of p(y = 1) against y = 1 whatever `probability` says: the letter of
-      eq. 2.28-2.29, in which a class that is predicted with confidence 0.9 and one with 0.1 do not share a bin.
-    - `ece_equal_mass`: in bins of equally many samples; confidences within 2^-20 of each other share a bin, whatever
-      their order.
+    - `ece_positive`: for two classes, the error in bins of equal width of p(y = 1) against y = 1, whatever
+      `probability` is. This is eq. 2.28-2.29 to the letter: a class predicted with probability 0.9 and one with 0.1 do
+      not share a bin.
+    - `ece_equal_mass`: error in bins of equally many samples; confidences within 2^-20 of each other share a bin,
+      whatever their order.
     - `mce`: the largest gap of a bin of equal width that is not empty.
-    - `squared_ce_debiased`: the squared calibration error in bins of equal mass less the part that chance adds to it,
-      which may leave it negative. Bins of one sample tell nothing of chance and are left out; NaN where all are.
+    - `squared_ce_debiased`: the squared calibration error in bins of equal mass, less the part that chance adds to it;
+      the result may be negative. Bins of one sample do not allow the correction and are left out; NaN where all are
+      left out.
     - `ece_debiased`: its root, 0 where it is negative.
 
-    Each is NaN where nothing was seen. A confidence of 1 belongs to the last bin, which the half-open intervals of
-    eq. 2.28 would leave out, and one that misses the lower edge of a bin by 2^-21 or less to that bin. Only the bins
-    are chosen so: the sums are of the confidences as they are.
+    Each is NaN where nothing was seen. A confidence of 1, which the half-open intervals of eq. 2.28 would leave out,
+    belongs to the last bin. A confidence that misses the lower edge of a bin by 2^-21 or less belongs to that bin.
+    These rules only choose the bins: the sums are of the unchanged confidences.
 
     Args:
-        bins: L of eq. 2.31, of either kind.
-        probability: what is binned. "predicted": the largest class probability, against whether that class is right,
-            the first of equally likely ones (Guo et al. 2017); "positive": p(y = 1) of two classes against y = 1, as
-            eq. 2.28-2.29 have it.
+        bins: number of bins, L of eq. 2.31, for both kinds of bins.
+        probability: the probability that is binned. "predicted" is the largest class probability, compared with whether
+            that class is right, the first of equally likely ones (Guo et al. 2017). "positive" is p(y = 1) of two
+            classes, compared with y = 1, as in eq. 2.28-2.29.
 
     Raises:
-        ConfigError: the target is no class, or "positive" of more than two.
-        UserError: a density without class probabilities, or with NaN among them.
-        DataError: a label that is no class.
+        ConfigError: the target is not a class, or `probability` is "positive" and there are more than two classes.
+        UserError: a density has no class probabilities, or NaN among them.
+        DataError: a label is not a class of the data set.
     """
 
     bibtex = """@inproceedings{guo2017calibration,
@@ -95,8 +99,7 @@ class CalibrationError(Metric, Pictured):
             self.better = dict.fromkeys(self.columns, "lower")  # pyright: ignore[reportAttributeAccessIssue]
         self.bins = bins
         self.positive = probability == "positive"
-        # (confidence, right) of each sample, of two classes also (p(y = 1), y): bins of equal mass are not known before
-        # all are seen
+        # (confidence, right) of each sample, for two classes also (p(y = 1), y): bins of equal mass need all samples
         self.add_state("samples", [], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction) -> None:
@@ -146,7 +149,9 @@ class CalibrationError(Metric, Pictured):
         return in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
 
     def _seen(self, first: int = 0) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
-        """Confidences, ascending, so that no sum depends on the order in which they came; and which are right."""
+        """Return the confidences in ascending order, so that no sum depends on the order of the samples, and which are
+        right.
+        """
         samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 4, dtype=torch.float64)
         confidence, order = samples[:, first].contiguous().sort()
         return confidence, samples[order, first + 1]
@@ -154,7 +159,7 @@ class CalibrationError(Metric, Pictured):
 
 @dataclass(frozen=True)
 class Bins:
-    """Of each bin how many samples it has (|B_l|), and the sums of their confidences and of those right; float64."""
+    """Number of samples of each bin (|B_l|), the sum of their confidences, and the number that are right; float64."""
 
     count: Float64[Tensor, "bin"]
     confidence: Float64[Tensor, "bin"]
@@ -162,7 +167,7 @@ class Bins:
 
     @property
     def seen(self) -> "Bins":
-        """Those that are not empty."""
+        """Bins that are not empty."""
         return self.with_at_least(1)
 
     def with_at_least(self, samples: int) -> "Bins":
@@ -171,21 +176,22 @@ class Bins:
 
 
 def equal_width(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Return bin l - 1 where (l - 1)/L ≤ confidence < l/L (eq. 2.28), edges lowered by NEAR/2; the last for 1."""
+    """Return bin l - 1 where (l - 1)/L ≤ confidence < l/L (eq. 2.28), edges lowered by NEAR/2; the last bin for 1."""
     edges = torch.arange(1, bins, dtype=torch.float64, device=confidence.device) / bins
     return torch.bucketize(confidence, edges - NEAR / 2, right=True)
 
 
 def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Return bins of as equal numbers of samples as can be (Nguyen & O'Connor 2015).
+    """Return the bin of each sample, with sample counts as equal as possible (Nguyen & O'Connor 2015).
 
     Confidences of one group of `least_of_near` stay together.
 
-    Of n samples in order of confidence the one of rank r = 0, 1, ... belongs to bin ⌊L (r + ½) / n⌋, and equal ones to
-    that of their middle.
+    With n samples in order of confidence, the sample of rank r = 0, 1, ... belongs to bin ⌊L (r + ½) / n⌋, and equal
+    samples belong to the bin of their middle.
 
     Args:
-        confidence: in any order.
+        confidence: confidences in any order.
+        bins: number of bins L.
     """
     confidence = least_of_near(confidence)
     ordered = confidence.sort().values
@@ -196,10 +202,11 @@ def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, 
 
 
 def least_of_near(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sample"]:
-    """Return the least confidence of each one's group.
+    """Return, for each sample, the least confidence of its group.
 
-    From below, a group is the least confidence that is in none yet and all up to NEAR above it. Rounding to a grid
-    would part equal confidences that lie about the middle between two of its points.
+    Groups are formed from below: a group is the least confidence that is in no group yet, with all confidences up to
+    NEAR above it. Rounding to a grid instead would separate equal confidences that lie near the middle between two grid
+    points.
     """
     ordered, order = confidence.sort()
     count = len(ordered)
@@ -223,29 +230,34 @@ def in_bins(
     index: Int[Tensor, "sample"],
     bins: int,
 ) -> Bins:
-    """Counts and sums by bin, `index` being that of each sample."""
+    """Return counts and sums by bin, where `index` is the bin of each sample."""
     columns = torch.stack([torch.ones_like(right), confidence, right], -1)
     return Bins(*columns.new_zeros(bins, 3).index_add_(0, index, columns).unbind(-1))
 
 
 def expected_error(bins: Bins) -> Float64[Tensor, ""]:
-    """Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31) = Σ_l |Σ conf - Σ right| / Q: empty bins add 0. NaN of nothing."""
+    """Return Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31) = Σ_l |Σ conf - Σ right| / Q; NaN without samples.
+
+    Empty bins add 0.
+    """
     return (bins.confidence - bins.right).abs().sum() / bins.count.sum()
 
 
 def largest_error(bins: Bins) -> Float64[Tensor, ""]:
-    """max_l |conf(B_l) - acc(B_l)| over bins that are not empty (Guo et al. 2017, eq. 5); NaN of nothing."""
+    """Return max_l |conf(B_l) - acc(B_l)| over the bins that have samples (Guo et al. 2017, eq. 5); NaN without
+    samples.
+    """
     seen = bins.seen
     gaps = (seen.confidence - seen.right).abs() / seen.count
     return gaps.max() if len(gaps) else gaps.new_tensor(torch.nan)
 
 
 def squared_error_debiased(bins: Bins) -> Float64[Tensor, ""]:
-    """Σ_l |B_l|/Q [(conf - acc)² - acc (1 - acc) / (|B_l| - 1)], over bins of two samples or more.
+    """Return Σ_l |B_l|/Q [(conf - acc)² - acc (1 - acc) / (|B_l| - 1)], over bins of two samples or more.
 
-    The plug-in squared error less an unbiased estimate of the variance of acc, which it contains (Bröcker 2012;
-    Kumar et al. 2019, §5). Unbiased where the confidences of a bin are equal; where they spread it is low by about
-    their variance over |B_l|.
+    This is the plug-in squared error less an unbiased estimate of the variance of acc, which it contains (Bröcker 2012;
+    Kumar et al. 2019, §5). It is unbiased where the confidences of a bin are equal; where they differ, it is too low by
+    about their variance over |B_l|.
     """
     several = bins.with_at_least(2)
     confidence, right = several.confidence / several.count, several.right / several.count

@@ -1,4 +1,4 @@
-"""The reliability curve below the confidence histogram (thesis Figure 2.4)."""
+"""Figure of the reliability curve below the confidence histogram (thesis Figure 2.4)."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from framework.figures.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, titl
 
 Numbers = Float[np.ndarray, "bin"]
 QUANTILE = 1.959963984540054
-"""Of the standard normal at 97.5 %: bars hold 95 %."""
+"""Quantile of the standard normal at 97.5 %; bars of this many standard errors hold 95 %."""
 
 
 def reliability(
@@ -23,11 +23,16 @@ def reliability(
     synthetic: bool,
     least: float = 0.0,
 ) -> Figure:
-    """Above how many samples have which confidence, below how often they are right; empty bins stay blank.
+    """Return a figure with the histogram of confidences above and the reliability curve below; empty bins stay blank.
 
     Args:
-        count, confidence, right: of each bin of equal width the number of samples, and the sums of their confidences
-            and of those right.
+        count: number of samples of each bin of equal width.
+        confidence: sum of the confidences of each bin.
+        right: number of right samples of each bin.
+        confidence_label: name of the axis of confidence.
+        accuracy_label: name of the axis of the share that is right.
+        title: title of the figure.
+        synthetic: whether the data are synthetic, which the figure then says.
         least: the lowest confidence that is possible, where the axis begins.
     """
     figure = titled_figure((5.8, 7.6), title, synthetic)
@@ -103,7 +108,9 @@ def _curve(axes: Axes, count: Numbers, confidence: Numbers, right: Numbers) -> N
 
 
 def wilson(right: Numbers, count: Numbers) -> tuple[Numbers, Numbers]:
-    """Ends of the 95 % score interval of a share (Wilson 1927); proper also for none or all of few."""
+    """Return the ends of the 95 % score interval of a share (Wilson 1927); it is proper also for none or all of few
+    samples.
+    """
     share, spread = right / count, QUANTILE**2 / count
     centre = (share + spread / 2) / (1 + spread)
     half = np.sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)

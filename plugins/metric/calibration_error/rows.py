@@ -1,4 +1,4 @@
-"""Rows of the contract: confidence in the predicted class, and in the positive one."""
+"""Rows of the contract: confidence in the predicted class, and in the positive class."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -1,4 +1,4 @@
-"""The highest-density region that a target lies on the border of, and the size of the one with a given mass."""
+"""Highest-density region with the target on its border, and size of the highest-density region of a given mass."""
 
 import math
 from collections.abc import Callable
@@ -15,26 +15,25 @@ from framework.distributions.class_probabilities import class_probabilities, req
 from framework.distributions.protocol import mahalanobis, normals
 
 EQUAL = {torch.float32: 1e-6, torch.float64: 1e-12}
-"""Densities that differ by a smaller part are equally dense, by their number type: rounding must not decide on a
-plateau."""
+"""Relative difference below which densities count as equal, by number type; rounding must not decide on a plateau."""
 FINER = 8
-"""Angles on which regions are cut out, for each one at which the density is evaluated."""
+"""Number of angles on which regions are cut out, per angle at which the density is evaluated."""
 BLOCK = 2**18
-"""Angles cut out at once: enough that calls cost little, and few enough for a cache."""
+"""Number of angles that are processed at once: large enough to make calls cheap, small enough for a cache."""
 HALVINGS = 40
-"""Of a cell in which a border lies: to its 1e-12th part."""
+"""Bisection steps within the cell in which a border lies; they locate it to 1e-12 of the cell."""
 SECANTS = 2
-"""Steps to the level of a region with a given mass, from one that the grid brackets to some ten per cent."""
+"""Secant steps to the level of a region of a given mass; the grid brackets the level to some ten per cent."""
 
 
 class Border(NamedTuple):
-    """Of each item, (batch,), float64.
+    """Masses and size of highest-density regions, one for each item, (batch,), float64.
 
     Attributes:
-        low, high: mass strictly denser than the target, and at least as dense. Where the truth is drawn from the
-            density, a number drawn evenly between the two is uniform on [0, 1].
-        size: of the region of highest density with the mass asked for: labels, radians or the unit of the real; NaN of
-            several numbers.
+        low, high: mass that is strictly denser than the target, and mass that is at least as dense. Where the truth is
+            drawn from the density, a number drawn uniformly between the two is uniform on [0, 1].
+        size: size of the highest-density region with the given mass, in labels, radians or the unit of the real; NaN
+            for a target of several numbers.
     """
 
     low: Tensor
@@ -43,14 +42,17 @@ class Border(NamedTuple):
 
 
 def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """Exact for classes, normals and an angle that a grid resolves; otherwise from `samples` draws.
+    """Return the masses and the size of highest-density regions.
 
-    Among draws the target's rank is as random as they are, yet uniform where the density is the truth's.
+    The result is exact for classes, for normals, and for an angle that a grid resolves; otherwise it is estimated from
+    `samples` draws. The target's rank among draws is as random as the draws are; still it is uniform where the density
+    is the true one.
 
     Args:
         density: batch_shape (batch,).
         value: (batch, *event).
-        mass: of the region whose size is told, in (0, 1).
+        mass: mass of the region whose size is returned, in (0, 1).
+        samples: number of draws.
     """
     if density.has_enumerate_support:
         return of_classes(density, value, mass)
@@ -65,7 +67,7 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
     distance = mahalanobis(density, value)
     if distance is None:
         return of_draws(density, value, mass, samples)
-    # the squared distance of a normal's own draws is χ² with as many degrees of freedom as numbers
+    # the squared Mahalanobis distance of draws of a normal is χ² with one degree of freedom for each number
     inside = torch.special.gammainc(torch.full_like(distance, density.event_shape[0] / 2), distance / 2)
     known = normals(density)
     if known is None:
@@ -75,7 +77,7 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
 
 
 def of_classes(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Border:
-    """By enumeration; the size counts the last label as the part of it that is needed."""
+    """Return the result for classes by enumeration; the last label counts in the size only by its needed part."""
     probability = class_probabilities(density).T
     at = probability.gather(0, require_labels(value.long(), len(probability)).unsqueeze(0))
     equal = EQUAL[torch.float32]
@@ -85,7 +87,9 @@ def of_classes(density: Distribution, value: Int[Tensor, "batch"], mass: float) 
 
 
 def of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    """On a grid finer than the moments', between whose points the density is a cubic with its values and slopes."""
+    """Return the result for an angle by cubic interpolation of density and slope on a grid finer than the moments'
+    grid.
+    """
     rows = max(1, BLOCK // (2 * FINER * len(seen.moments)))
     parts = zip(seen.moments.split(rows, 1), seen.resolved.split(rows), log_prob.split(rows), strict=True)
     found = [_of_angle(CircularMoments(moments, known), at, mass) for moments, known, at in parts]
@@ -108,12 +112,12 @@ def _of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: flo
 
 
 class Cubic(NamedTuple):
-    """The density on the circle as a cubic in each cell of a grid (Hermite's), which has an error of the cell's fourth
+    """Density on the circle as a cubic Hermite polynomial in each cell of a grid; its error is of the cell's fourth
     power.
 
     Attributes:
-        density: at the grid's points, (point, batch), per radian.
-        slope: its change over a cell if it went on as at the point.
+        density: density at the points of the grid, (point, batch), per radian.
+        slope: derivative at each point times the width of a cell.
     """
 
     density: Float[Tensor, "point batch"]
@@ -125,18 +129,18 @@ class Cubic(NamedTuple):
         return cls(density, seen.density(FINER, slope=True) * (2 * math.pi / len(density)))
 
     def rows(self, chosen: Tensor) -> "Cubic":
-        """Those of some items of the batch."""
+        """Return the densities of the chosen items of the batch."""
         return Cubic(self.density[:, chosen], self.slope[:, chosen])
 
     def above(self, level: Float[Tensor, "batch"]) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:
-        """Mass where the density is at least the level, and the length of that region, radians."""
+        """Return the mass where the density is at least the level, and the length of that region, radians."""
         left, right = self.density, self.density.roll(-1, 0)
         rise, fall = self.slope, self.slope.roll(-1, 0)
         first, second = left >= level, right >= level
         whole = first & second
         mass = torch.where(whole, (left + right) / 2 + (rise - fall) / 12, 0.0).sum(0)
         length = whole.sum(0).double()
-        # cells with one border, and those whose top or bottom may be beyond the level though neither end is
+        # cells with one border, and cells whose extremum may cross the level although neither end does
         for chosen, turning in (
             (first ^ second, False),
             ((rise > 0) & (fall < 0) & ~first & ~second, True),
@@ -153,10 +157,11 @@ class Cubic(NamedTuple):
         return mass * step, length * step
 
     def size(self, mass: float) -> Float[Tensor, "batch"]:
-        """Length of the region of highest density with a mass, radians.
+        """Return the length of the highest-density region of the given mass, radians.
 
-        The level is interpolated between two that the grid's points suggest, and those are drawn together. What mass
-        is then missing is divided by the level: as it falls, mass grows by the level times what the length grows by.
+        The level is interpolated between two levels that the grid's points suggest, and this bracket is narrowed. The
+        mass that is then still missing is divided by the level, because the mass grows by the level times the growth of
+        the length.
         """
         step = 2 * math.pi / len(self.density)
         ordered = self.density.clamp(min=0).sort(0, descending=True).values
@@ -181,11 +186,12 @@ class Cubic(NamedTuple):
 def _part(
     ends: Float[Tensor, "4 cell"], level: Float[Tensor, "cell"], *, turning: bool
 ) -> tuple[Float[Tensor, "cell"], Float[Tensor, "cell"]]:
-    """Of cells with a border what mass and length, in cells, lie above the level, beyond what is counted already.
+    """Return the mass and length above the level in cells with a border, in cells, less what has been counted already.
 
     Args:
-        ends: density left and right, slopes left and right.
-        turning: whether the border, if there is one, is on both sides of a turning point; else there is one.
+        ends: density at the left and right end, slopes at the left and right end.
+        level: density of the border.
+        turning: whether the cell may hold two borders, one on each side of a turning point; otherwise it holds one.
     """
     left, right, rise, fall = ends
     square, cube = 3 * (right - left) - 2 * rise - fall, 2 * (left - right) + rise + fall
@@ -211,7 +217,7 @@ def _part(
 
 
 def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Tensor:
-    """Where a function changes its sign, by halving; anywhere between where it does not."""
+    """Return the place where a function changes its sign, by bisection; any place in between if it does not."""
     start = function(low).sign()
     for _ in range(HALVINGS):
         middle = (low + high) / 2
@@ -221,7 +227,9 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
 
 
 def of_draws(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """By the target's rank in density among draws; the size of one number's region as E[1{p(X) ≥ t} / p(X)]."""
+    """Return the result from the target's rank in density among draws; the size is E[1{p(X) ≥ t} / p(X)] for one
+    number.
+    """
     drawn = density.sample(torch.Size((samples,)))
     log_prob, at = density.log_prob(drawn).double(), density.log_prob(value).double()
     equal = EQUAL[torch.float32]
@@ -240,7 +248,7 @@ def _sum_where(chosen: Tensor, probability: Tensor) -> Tensor:
 
 
 def _counted(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tensor, "batch"]:
-    """How many cells, the heaviest first and the last one in part, hold a mass."""
+    """Return how many cells hold the mass `wanted`, taking the heaviest first and a part of the last one."""
     ordered = mass.sort(0, descending=True).values
     before = ordered.cumsum(0) - ordered
     share = torch.where(ordered > 0, (wanted - before) / ordered, 0.0)
@@ -248,9 +256,9 @@ def _counted(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tensor, 
 
 
 def covered(low: Tensor, high: Tensor, levels: Float[Tensor, "level"]) -> Float[Tensor, "batch level"]:
-    """Probability that a number drawn evenly between low and high is at most each level.
+    """Return the probability that a number drawn uniformly between low and high is at most each level.
 
-    So nothing need be drawn to break ties (the nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2).
+    Ties are therefore broken without drawing (the nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2).
     """
     low, high = low.unsqueeze(-1), high.unsqueeze(-1)
     width = high - low

@@ -23,26 +23,27 @@ REGION = 0.9
 
 
 class Coverage(Metric, Pictured):
-    """How many targets lie in the regions of highest density that should hold a given share of them.
+    """Share of targets that lie in the highest-density regions of given masses.
 
-    The mass h(x, y) of all that is at least as dense as the target is uniform on [0, 1] where densities are those of
-    the truth, whatever they are over: classes, reals, angles, rotations.
+    The mass h(x, y) of all values that are at least as dense as the target is uniform on [0, 1] where the densities are
+    the true ones. This holds for targets of every kind: classes, reals, angles, rotations.
 
     - `coverage_50`, `coverage_90`: share of targets within the regions of mass 0.5 and 0.9.
     - `coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
     - `region_90_labels`, `region_90_deg` or `region_90` (in the unit of the target): mean size of the region of mass
-      0.9, of classes, one angle and one real; what a forecaster that covers rightly should keep small.
+      0.9, for classes, one angle and one real. Of two forecasters with the right coverage, the one with smaller regions
+      is better.
 
-    Where many values are equally dense, classes above all, h is anything between two masses, and a target counts with
-    the probability that a number drawn between them would.
+    Where many values are equally dense, as classes often are, h is any number between two masses; a target then counts
+    with the probability that a number drawn uniformly between them lies below the level.
 
     Args:
-        samples: draws for a density whose regions are not known: several angles, rotations, mixtures over reals. They
-            take log_prob of that many values.
+        samples: draws for a density whose regions are not known: several angles, rotations, mixtures over reals. Each
+            needs log_prob of that many values.
 
     Raises:
-        UserError: densities that are NaN; says how many.
-        DataError: a target that is no class.
+        UserError: densities are NaN; the message says how many.
+        DataError: a target is not a class of the data set.
     """
 
     bibtex = """@article{hyndman1996computing,
@@ -106,5 +107,5 @@ class Coverage(Metric, Pictured):
         return curve(self._levels().cpu().numpy(), share, int(self.count), title, synthetic=synthetic)
 
     def _levels(self) -> Tensor:
-        """Nominal masses."""
+        """Return the nominal masses 0.05, 0.10, ..., 0.95."""
         return torch.arange(1, LEVELS + 1, dtype=torch.float64, device=self.count.device) / (LEVELS + 1)

@@ -1,4 +1,4 @@
-"""Empirical against nominal coverage."""
+"""Figure of empirical against nominal coverage."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,12 +8,16 @@ from framework.figures.style import BLUE, GREY, titled_figure
 
 
 def curve(levels: np.ndarray, share: np.ndarray, count: int, title: str, *, synthetic: bool) -> Figure:
-    """Share of targets within highest-density regions of each mass, with the band of a calibrated forecaster.
+    """Return a figure of the share of targets within highest-density regions of each mass, with a calibrated band.
+
+    The band holds 95 % of calibrated forecasters.
 
     Args:
         levels: masses, ascending in (0, 1).
-        share: of targets; NaN of nothing seen, and is not drawn.
-        count: of targets.
+        share: share of targets in the region of each mass; NaN, which is not drawn, if there were no targets.
+        count: number of targets.
+        title: title of the figure.
+        synthetic: whether the data are synthetic, which the figure then says.
     """
     figure = titled_figure((5.0, 5.0), title, synthetic)
     axes = figure.subplots()

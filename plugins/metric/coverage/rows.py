@@ -1,4 +1,4 @@
-"""Rows of the contract: every kind of target."""
+"""Rows of the contract: targets of every kind."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -1,4 +1,4 @@
-"""Mean continuous ranked probability score, of all numbers of the target and of each apart."""
+"""Mean continuous ranked probability score, over all numbers of the target and for each number."""
 
 import math
 from typing import Annotated, ClassVar, Literal
@@ -18,19 +18,19 @@ from plugins.metric.crps.score import REPLICATES, crps
 class CRPS(Mean):
     """Continuous ranked probability score (CRPS): a proper scoring rule in the unit of the target; lower is better.
 
-    `crps` of reals, `crps_deg` of angles in degrees: the mean over the numbers of a sample, each by its marginal
-    density, then over samples, with a standard error; `crps_<name>` of one number where there are several. Of a
-    density that is a point it is the absolute deviation of that point.
+    `crps` of reals, or `crps_deg` of angles in degrees, is the mean over the numbers of a sample, each under its
+    marginal density, and then over samples; it has a standard error. `crps_<name>` is the score of one number where
+    there are several. For a density that is a point mass the score is the absolute deviation of that point.
 
-    Where a score had to be estimated from draws (`score.py`) also `crps_mc_error`, the standard error that the
-    sampling alone gives `crps`.
+    Where a score had to be estimated from draws (`score.py`), `crps_mc_error` is the standard error of `crps` that is
+    due to the sampling alone.
 
     Args:
         samples: draws for a density that has no exact score.
 
     Raises:
         ConfigError: the target is made of classes.
-        UserError: scores that are NaN; says how many.
+        UserError: scores are NaN; the message says how many.
     """
 
     bibtex = """@article{grimit2006continuous,
@@ -79,7 +79,7 @@ class CRPS(Mean):
         score = torch.cat([each.mean(-1, keepdim=True), each], -1)
         refuse_nan(score[:, 0], "scores")
         self.take_in(score)
-        # each marginal is drawn from anew: variances add
+        # the draws of the marginals are independent: variances add
         self.variance += error.square().sum() / len(self.names) ** 2
 
     def compute(self) -> dict[str, Tensor]:

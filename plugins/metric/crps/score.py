@@ -1,4 +1,4 @@
-"""The continuous ranked probability score of densities of one real or one angle; a density may register its own."""
+"""Continuous ranked probability score of densities of one real or one angle; a density may register its own formula."""
 
 import math
 from functools import singledispatch
@@ -15,17 +15,17 @@ from framework.distributions.density import CHUNK
 from framework.distributions.protocol import Normals, normals
 
 MOST = 1024
-"""Components of a mixture of normals whose pairs are summed, a million; of more, draws cost less than their pairs."""
+"""Largest number of components of a mixture of normals whose pairs are summed; beyond it, draws are cheaper."""
 REPLICATES = 8
-"""Independent parts of the draws, from which the error of an estimate is taken."""
+"""Number of independent parts of the draws, from whose spread the error of an estimate is taken."""
 
 
 class Score(NamedTuple):
-    """Of each item, (*batch), float64, in the unit of the target (angles: radians).
+    """Score of each item, (*batch), float64, in the unit of the target (angles: radians).
 
     Attributes:
         mean: the score.
-        error: its standard error by sampling; 0 of an exact one.
+        error: its standard error by sampling; 0 if the score is exact.
     """
 
     mean: Tensor
@@ -34,16 +34,17 @@ class Score(NamedTuple):
 
 @singledispatch
 def crps(density: Distribution, value: Tensor, samples: int) -> Score:
-    """E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21), at a target y: 0 is best, |X - y| that of a point.
+    """Return E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) at a target y; 0 is best, |X - y| for a point
+    mass.
 
-    Of an angle the distance is the angular one (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). Exact for mixtures
-    of up to MOST normals and for angles that a grid resolves (`circular_moments`). Otherwise the fair estimate
-    (unbiased) from `samples` draws, in `REPLICATES` parts whose spread gives its error.
+    For an angle the distance is the angular one (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact
+    for mixtures of up to MOST normals and for angles that a grid resolves (`circular_moments`). Otherwise it is the
+    fair (unbiased) estimate from `samples` draws, in `REPLICATES` parts whose spread gives its error.
 
     Args:
-        density: of one real or one angle, event_shape (1,).
+        density: density of one real or one angle, event_shape (1,).
         value: (*batch, 1).
-        samples: 2 · REPLICATES or more.
+        samples: number of draws, 2 · REPLICATES or more.
     """
     at = value.double().squeeze(-1)
     if isinstance(density.support, Circular):
@@ -65,11 +66,11 @@ def _draws(density: Distribution, samples: int) -> Tensor:
 
 
 def of_normals(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Of a mixture of K normals, in closed form (Grimit et al. 2006, eq. 8), O(K²)."""
+    """Return the score of a mixture of K normals in closed form (Grimit et al. 2006, eq. 8), in O(K²)."""
     weights = density.log_weights.exp()
     to_value = _weighted(weights, absolute_mean(value.unsqueeze(-1) - density.mean, density.scale)).sum(-1)
     if density.mean.shape[-1] == 1:
-        # E|X - X'| = 2σ/√π, so that a large mean takes no digits
+        # E|X - X'| = 2σ/√π in closed form, so that a large mean costs no digits
         return (to_value - density.scale.squeeze(-1) / math.sqrt(math.pi)).clamp(min=0)
     count = density.mean.shape[-1]
     rows = [number.flatten(0, -2) for number in (weights, density.mean, density.scale)]
@@ -79,7 +80,7 @@ def of_normals(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor
 
 
 def _between(weights: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
-    """ΣΣ w_i w_j E|X_i - X_j|, each argument (rows, component)."""
+    """Return ΣΣ w_i w_j E|X_i - X_j|; each argument is (rows, component)."""
     apart = mean.unsqueeze(-1) - mean.unsqueeze(-2)
     both = torch.hypot(scale.unsqueeze(-1), scale.unsqueeze(-2))
     pairs = weights.unsqueeze(-1) * weights.unsqueeze(-2)
@@ -87,19 +88,19 @@ def _between(weights: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
 
 
 def _weighted(weights: Tensor, numbers: Tensor) -> Tensor:
-    """A weight of 0 counts nothing, whatever it weighs."""
+    """Return weights · numbers, with 0 where the weight is 0, even if the number is infinite or NaN."""
     return torch.where(weights == 0, 0.0, weights * numbers)
 
 
 def absolute_mean(mean: Tensor, scale: Tensor) -> Tensor:
-    """E|Z| of Z ~ N(μ, σ²): 2σφ(μ/σ) + μ(2Φ(μ/σ) - 1) (Grimit et al. 2006, after eq. 8); |μ| where σ = 0."""
+    """Return E|Z| for Z ~ N(μ, σ²): 2σφ(μ/σ) + μ(2Φ(μ/σ) - 1) (Grimit et al. 2006, after eq. 8); |μ| where σ = 0."""
     standard = torch.where(mean == 0, mean, mean / scale)
     bell = torch.exp(-standard.square() / 2) * math.sqrt(2 / math.pi)
     return scale * bell + mean * torch.erf(standard / math.sqrt(2))
 
 
 def fair(drawn: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"], *, circular: bool) -> Score:
-    """The mean of the unbiased estimates from REPLICATES parts of the draws, and its standard error."""
+    """Return the mean of the unbiased estimates from REPLICATES parts of the draws, and its standard error."""
     size = len(drawn) // REPLICATES
     parts = drawn[: size * REPLICATES].unflatten(0, (REPLICATES, size)).transpose(0, 1)
     if circular:
@@ -110,9 +111,9 @@ def fair(drawn: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"],
 
 
 def mean_distance(drawn: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
-    """Of all pairs of reals, in O(S log S)."""
+    """Return the mean distance over all pairs of reals, in O(S log S)."""
     count = len(drawn)
-    ordered = (drawn - drawn[0]).sort(0).values  # about one of them, so that a large mean takes no digits
+    ordered = (drawn - drawn[0]).sort(0).values  # relative to one draw, so that a large mean costs no digits
     # Σ_{i<j} (x_j - x_i): the i-th is subtracted S-1-i times and added i times
     factor = 2 * torch.arange(count, dtype=drawn.dtype, device=drawn.device) - (count - 1)
     total = (factor.reshape(-1, *(1,) * (drawn.dim() - 1)) * ordered).sum(0)
@@ -120,16 +121,16 @@ def mean_distance(drawn: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*bat
 
 
 def mean_angular_distance(drawn: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
-    """Of all pairs of angles, radians, in O(S log S).
+    """Return the mean angular distance over all pairs of angles, radians, in O(S log S).
 
-    The distance of two angles is the measure of the diameters, at t in [0, π), that separate them. Of n(t) angles on
-    one side of a diameter, n (S - n) pairs are separated, and n changes by one at each angle modulo π.
+    The distance of two angles is the measure of the diameters, at t in [0, π), that separate them. If n(t) angles are
+    on one side of a diameter, n (S - n) pairs are separated, and n changes by one at each angle modulo π.
     """
     count = len(drawn)
     angle = wrap(drawn)
     place, order = torch.remainder(angle, math.pi).sort(0)
     upper = (angle >= 0).gather(0, order)  # on the side (t, t + π) of the diameter at t = 0
-    # crossing one of that side loses it, crossing an antipode gains one
+    # passing an angle of that side removes it from the side; passing an antipode adds one
     side = upper.sum(0) + torch.where(upper, -1, 1).cumsum(0)
     gap = torch.cat([place[1:], place[:1] + math.pi]) - place
     return (side * (count - side) * gap).sum(0) * 2 / (count * (count - 1))

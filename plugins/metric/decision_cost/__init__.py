@@ -1,1 +1,1 @@
-"""What it costs to act on the predicted densities."""
+"""Cost of actions that are chosen by the predicted densities."""

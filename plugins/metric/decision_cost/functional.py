@@ -14,17 +14,19 @@ from framework.distributions.circular_moments import circular_moments
 from framework.distributions.protocol import arc, cdf, turn
 
 NOTHING = 1e-9
-"""Masses of arcs from a grid below this are rounding, and count as 0: no cost is so large that it may decide."""
+"""Threshold below which the mass of an arc from a grid is rounding and counts as 0, so that an infinite cost ignores
+it.
+"""
 
 
 def decide(expected: Float[Tensor, "*batch action"]) -> Int[Tensor, "*batch"]:
-    """The action of least expected cost, the first of equals.
+    """Return the index of the action of least expected cost, the first one of equals.
 
     Raises:
-        UserError: costs that are NaN, under which nothing can be decided; says how many.
+        UserError: costs are NaN, so that no decision is possible; the message says how many.
     """
     refuse_nan(expected.amax(-1).reshape(-1), "expected costs")
-    # argmin may give any of equals
+    # argmin may return any one of equal costs
     least = expected == expected.amin(-1, keepdim=True)
     return least.int().argmax(-1)
 
@@ -32,7 +34,7 @@ def decide(expected: Float[Tensor, "*batch action"]) -> Int[Tensor, "*batch"]:
 def expected_costs(
     probability: Float[Tensor, "*batch truth"], costs: Float[Tensor, "truth action"]
 ) -> Float[Tensor, "*batch action"]:
-    """Σ_truth p(truth) cost(truth, action), float64; what has probability 0 costs 0, though its cost be infinite."""
+    """Return Σ_truth p(truth) cost(truth, action), float64; a truth of probability 0 adds 0, even at infinite cost."""
     probability = probability.double().unsqueeze(-1)
     return torch.where(probability == 0, 0.0, probability * costs.double()).sum(-2)
 
@@ -44,14 +46,16 @@ def decide_by_draws(
     actions: Sequence[str],
     samples: int = 1000,
 ) -> tuple[Int[Tensor, "*batch"], Float[Tensor, "*batch action"]]:
-    """Decisions under any cost function, and the expected costs: means over `samples` draws of the density.
+    """Return the decisions under any cost function, and the expected costs: means over `samples` draws of the density.
 
     Args:
-        density: of any kind, batch_shape (*batch).
+        density: a density of any kind, batch_shape (*batch).
         cost: (action, targets of shape (samples, *batch, *event)) → costs (samples, *batch). Angles are radians.
+        actions: names of the actions.
+        samples: number of draws.
 
     Raises:
-        ValueError: no actions, no samples, or costs of another shape.
+        ValueError: there are no actions or no samples, or the costs have another shape.
     """
     if not actions or samples < 1:
         raise ValueError(f"wanted an action and a sample at least, got {len(actions)} and {samples}.")
@@ -72,13 +76,15 @@ def decide_by_draws(
 def region_probabilities(
     density: Distribution, edges: Float[Tensor, "edge"], samples: int
 ) -> Float[Tensor, "batch region"]:
-    """Masses of the regions that edges cut a line or a circle into, float64; see `regions`.
+    """Return the masses of the regions into which edges cut a line or a circle, float64; see `regions`.
 
-    Exact where `protocol.cdf`, `protocol.arc` or `circular_moments` are, otherwise shares of `samples` draws.
+    The masses are exact where `protocol.cdf`, `protocol.arc` or `circular_moments` are exact; otherwise they are shares
+    of `samples` draws.
 
     Args:
-        density: of one real or one angle, batch_shape (batch,).
-        edges: ascending; of an angle radians, within one turn.
+        density: density of one real or one angle, batch_shape (batch,).
+        edges: edges in ascending order; for an angle in radians, within one turn.
+        samples: number of draws.
     """
     around = isinstance(density.support, Circular)
     found = _arcs(density, edges) if around else _intervals(density, edges)
@@ -92,14 +98,14 @@ def region_probabilities(
 
 
 def regions(value: Tensor, edges: Float[Tensor, "edge"], *, around: bool) -> Int[Tensor, "*shape"]:
-    """Which region each value lies in, an edge belonging to the region above it.
+    """Return the index of the region in which each value lies; an edge belongs to the region above it.
 
-    Of a line below the first edge is region 0. Of a circle region 0 begins at the first edge, counter-clockwise, and
-    the last ends there.
+    On a line, region 0 is below the first edge. On a circle, region 0 begins at the first edge, counter-clockwise, and
+    the last region ends there.
     """
     if not around:
         return torch.bucketize(value.double().contiguous(), edges, right=True)
-    # radians in float32 may stand a rounding before the edge that they were made of
+    # an angle that was set to an edge may lie below that edge after rounding to float32
     ahead = torch.remainder(turn(edges[0], value) + 1e-7, 2 * math.pi)
     return torch.bucketize(ahead, edges - edges[0] + 1e-12, right=True) - 1
 
@@ -114,7 +120,7 @@ def _intervals(density: Distribution, edges: Tensor) -> Tensor | None:
 
 
 def _arcs(density: Distribution, edges: Tensor) -> Tensor:
-    """Infinite where a density is too narrow for the grid."""
+    """Return the masses of the arcs; infinite where a density is too narrow for the grid."""
     shape = torch.Size((len(edges), *density.batch_shape))
     start, end = (
         e.reshape(-1, *(1,) * len(density.batch_shape)).expand(shape) for e in (edges, edges.roll(-1))

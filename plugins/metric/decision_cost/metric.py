@@ -1,4 +1,4 @@
-"""What it costs to act on the predicted densities, where the user says what each mistake costs."""
+"""Cost of acting on the predicted densities, with the cost of each mistake stated by the user."""
 
 import math
 from itertools import pairwise
@@ -23,32 +23,32 @@ from plugins.metric.decision_cost.functional import (
 
 
 class DecisionCost(Metric):
-    """Mean cost of taking, for each density, the action of least expected cost (Savage 1954; Berger 1985, §1.3).
+    """Mean cost of taking the action of least expected cost under each density (Savage 1954; Berger 1985, §1.3).
 
-    - `decision_cost`: of these actions, once the truth is known.
-    - `decision_cost_fixed`: of the one action that would have cost least had it always been taken.
-    - `decision_cost_oracle`: of the best action for each truth.
-    - `share_<action>`: how often each was taken.
+    - `decision_cost`: mean cost of these actions under the true target.
+    - `decision_cost_fixed`: mean cost of the one action that would have cost least if it had always been taken.
+    - `decision_cost_oracle`: mean cost of the best action for each truth.
+    - `share_<action>`: share of samples for which the action was taken.
 
-    A cost may be infinite (a forbidden action), or negative (a gain). What has probability 0 costs 0; anything above
-    it forbids an action of infinite cost. The first of equally good actions is taken.
+    A cost may be infinite (a forbidden action) or negative (a gain). A truth of probability 0 adds no cost; any higher
+    probability forbids an action of infinite cost. The first one of equally good actions is taken.
 
     Args:
-        costs: truth × action: row i what each action costs where class or region i is true, in any unit; by default 0
-            for the right class or region and 1 for every other.
-        actions: names of the columns; by default those of the classes or regions. There may be more of them than
-            truths: "ask a person".
-        edges: of a real: where the line is cut into regions, ascending; the first is below the first edge.
-        edges_deg: of an angle: where the circle is cut, degrees, ascending within one turn; the first region begins at
-            the first edge, counter-clockwise, and the last ends there.
-        number: which number of the target the edges cut, where it has several.
+        costs: table truth × action: row i holds the cost of each action where class or region i is true, in any unit;
+            by default 0 for the right class or region and 1 for every other.
+        actions: names of the columns; by default the names of the classes or regions. There may be more actions than
+            truths, for example "ask a person".
+        edges: for a real: values that cut the line into regions, ascending; the first region is below the first edge.
+        edges_deg: for an angle: angles that cut the circle, degrees, ascending within one turn; the first region begins
+            at the first edge, counter-clockwise, and the last ends there.
+        number: name of the number of the target that the edges cut, where the target has several.
         samples: draws for a density whose masses are not known.
 
     Raises:
-        ConfigError: the table does not fit the target, its edges or its names; a NaN, or a truth of which every action
-            is forbidden.
-        UserError: densities that are NaN; says how many.
-        DataError: a target that is no class.
+        ConfigError: the table does not fit the target, its edges or its names; it holds a NaN; or every action is
+            forbidden for some truth.
+        UserError: densities are NaN; the message says how many.
+        DataError: a target is not a class of the data set.
     """
 
     bibtex = """@book{berger1985statistical,
@@ -154,7 +154,7 @@ def _index(target: Target, number: str | None) -> int:
 
 
 def _cuts(target: Target, edges: list[float] | None, edges_deg: list[float] | None) -> list[float]:
-    """The edges that the kind of target wants, radians of an angle; none of classes."""
+    """Return the edges for the kind of target, in radians for an angle; an empty list for classes."""
     wanted = {"class": None, "real": "edges", "angle": "edges_deg"}[target.kind]
     for name, given in (("edges", edges), ("edges_deg", edges_deg)):
         if given is not None and name != wanted:
@@ -184,7 +184,7 @@ def _cuts(target: Target, edges: list[float] | None, edges_deg: list[float] | No
 
 
 def _names(kind: str, edges: list[float] | None, edges_deg: list[float] | None) -> list[str]:
-    """Of regions, by their ends."""
+    """Return names of the regions, made of their ends."""
     if kind == "angle":
         cuts = edges_deg or []
         ends = zip(cuts, [*cuts[1:], *cuts[:1]], strict=True)
@@ -195,7 +195,7 @@ def _names(kind: str, edges: list[float] | None, edges_deg: list[float] | None) 
 
 
 def _check(table: list[list[float]], actions: list[str] | None, truths: list[str]) -> list[str]:
-    """The names of the actions, of a table that fits them and the truths."""
+    """Return the names of the actions, after checking that the table fits them and the truths."""
     if len(table) != len(truths) or not table[0] or len({len(row) for row in table}) > 1:
         raise ConfigError(
             f"decision_cost.costs has rows of {[len(row) for row in table]} numbers; wanted {len(truths)} rows, one "

@@ -1,4 +1,4 @@
-"""Rows of the contract: classes, with an action more than there are, a real, and an angle among three."""
+"""Rows of the contract: classes, with more actions than classes too; reals; and angles, alone and one of three."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Errors of the point prediction of reals, in their own unit."""
+"""Errors of the point prediction of reals, in the unit of the target."""
 
 from abc import abstractmethod
 from typing import ClassVar, Literal, final
@@ -12,11 +12,11 @@ from framework.prediction import Prediction
 from framework.target import Target
 
 FIRST = 6
-"""Of more numbers than this only their mean is reported."""
+"""Largest number of reals for which the error of each is reported too; of more reals only the mean is reported."""
 
 
 class Errors(Mean):
-    """What the errors share: the mean of a power of each number's error, reported together and for each number.
+    """Base class of errors: the mean of a power of each number's error, for all numbers together and for each.
 
     Raises:
         ConfigError: the target is not made of reals.
@@ -33,14 +33,16 @@ class Errors(Mean):
 
     @abstractmethod
     def power(self, error: Float[Tensor, "batch number"]) -> Float[Tensor, "batch number"]:
-        """What the mean is taken of."""
+        """Return the power of the error whose mean is taken."""
 
     @abstractmethod
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-        """The number to report and its standard error, from the mean's."""
+        """Return the reported number and its standard error, from the mean of the powers and the standard error of that
+        mean.
+        """
 
     def update(self, prediction: Prediction) -> None:
-        # in double precision before the difference rounds
+        # convert to float64 first, so that the difference is not rounded to float32
         each = self.power(prediction.point.double() - prediction.target.double())
         self.take_in(torch.cat([each.mean(-1, keepdim=True), each[:, : len(self.names) - 1]], -1))
 
@@ -55,7 +57,7 @@ class Errors(Mean):
 class MeanAbsoluteError(Errors):
     """Mean absolute error of the point prediction in the target's unit, with its standard error over samples.
 
-    Of several reals `mae` is the mean over them, `mae_<name>` that of one.
+    For several reals, `mae` is the mean over them and `mae_<name>` the error of one real.
     """
 
     key = "mae"
@@ -73,8 +75,8 @@ class MeanAbsoluteError(Errors):
 class RootMeanSquareError(Errors):
     """Root of the mean squared error of the point prediction in the target's unit, with its standard error.
 
-    Of several reals `rmse` is the root of the mean over them, `rmse_<name>` that of one. The standard error is that of
-    the mean square s² divided by 2 s (delta method).
+    For several reals, `rmse` is the root of the mean over them and `rmse_<name>` the error of one real. The standard
+    error is that of the mean square s², divided by 2 s (delta method).
     """
 
     key = "rmse"
@@ -86,11 +88,11 @@ class RootMeanSquareError(Errors):
 
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
         root = mean.sqrt()
-        # without an error there is none to be uncertain of
+        # if every error is 0, so is its standard error; do not divide by 0
         return root, torch.where(root == 0, error, error / (2 * root))
 
 
 def names(metric: str, target: Target) -> list[str]:
-    """What the results are called: of all numbers together, then of each where there are several, but not very many."""
+    """Return the names of the results: of all numbers together, then of each where there are 2 to FIRST numbers."""
     several = target.names if 1 < len(target.names) <= FIRST else ()
     return [metric, *(f"{metric}_{name}" for name in several)]

@@ -1,4 +1,4 @@
-"""Rows of the metric contract."""
+"""Rows of the contract: targets of one and of three reals."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -1,1 +1,1 @@
-"""How far predicted flights are from where the ball went, and where they land."""
+"""Distance of predicted flights from the true ones, and accuracy of predicted landing places."""

@@ -1,4 +1,4 @@
-"""Figures of predicted flights: how the error grows, bundles of flights in space, and where they land."""
+"""Figures of predicted flights: error against time, bundles of flights in space, and landing places."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from framework.figures.style import BLUE, COLOURS, GREY, RED, titled_figure
 from plugins.metric.flight_error.landing import Shown, crossing
 
 BUNDLE = 30
-"""Flights of a bundle that are drawn."""
+"""Number of flights of a bundle that are drawn."""
 
 
 def flights(
@@ -24,12 +24,15 @@ def flights(
     *,
     synthetic: bool,
 ) -> Figure:
-    """Error against time into the future; two predictions in space; where all that are shown land.
+    """Return a figure of the error against time, of up to three predictions in space, and of all shown landing places.
 
     Args:
-        moments: milliseconds.
-        growth: mean error at these, cm.
-        height: of the plane through which landing balls come down, m.
+        moments: times into the future, milliseconds.
+        growth: mean error at these times, cm.
+        shown: the predictions to draw.
+        height: height of the plane through which landing balls come down, m.
+        title: title of the figure.
+        synthetic: whether the data are synthetic, which the figure then says.
     """
     figure = titled_figure((13.5, 4.8), title, synthetic)
     grid = figure.add_gridspec(1, 3, width_ratios=(1, 1.35, 1))
@@ -53,7 +56,7 @@ def flights(
 
 
 def bundle(axes: Any, one: Shown, color: str) -> None:
-    """One prediction in space."""
+    """Draw one prediction in space."""
     axes.plot(*one.read.numpy().T, linestyle="", marker="o", markersize=2.5, color=GREY)
     for draw in one.draws[:BUNDLE].numpy():
         axes.plot(*draw.T, color=color, alpha=0.25, linewidth=0.7)
@@ -61,7 +64,7 @@ def bundle(axes: Any, one: Shown, color: str) -> None:
 
 
 def landing_places(axes: Any, shown: Sequence[Shown], height: float) -> None:
-    """Seen from above: the true places as crosses, those of the draws as dots with the ellipse that holds 90 %."""
+    """Draw the landing places from above: true places as crosses, draws as dots with the ellipse that holds 90 %."""
     some = False
     for number, one in enumerate(shown):
         last = one.read[-1:]

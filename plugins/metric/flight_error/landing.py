@@ -1,4 +1,4 @@
-"""Where paths come down through a plane, and how well drawn paths say where the true one does."""
+"""Places where paths come down through a plane, and how well drawn paths predict the true place."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from framework.flights.frames import PARTS
 
 
 class Shown(NamedTuple):
-    """What the picture says of one prediction, metres: frames read and seen (frame, 3), future (time, 3), draws."""
+    """One prediction that the figure shows, metres: seen positions that were read (frame, 3), true future, draws."""
 
     read: Float[Tensor, "frame 3"]
     future: Float[Tensor, "time 3"]
@@ -18,7 +18,7 @@ class Shown(NamedTuple):
 
 
 def last_seen(inputs: Tensor | None, truth: Float[Tensor, "batch time 3"]) -> Float[Tensor, "batch 3"]:
-    """Where inputs of `PARTS` saw the ball last; NaN where they are others, or saw it never."""
+    """Return where the ball was seen last, metres; NaN where inputs lack the fields `PARTS` or never saw the ball."""
     nowhere = torch.full_like(truth[:, 0], torch.nan)
     if inputs is None or inputs.dim() != 2 or inputs.shape[1] % len(PARTS):
         return nowhere
@@ -30,7 +30,7 @@ def last_seen(inputs: Tensor | None, truth: Float[Tensor, "batch time 3"]) -> Fl
 
 
 def from_start(start: Float[Tensor, "batch 3"], path: Float[Tensor, "*draw batch time 3"]) -> Tensor:
-    """The path with one place more before it."""
+    """Return the path with the start put before its first place."""
     first = start.expand(*path.shape[:-3], -1, -1).unsqueeze(-2)
     return torch.cat([first.to(path), path], -2)
 
@@ -38,7 +38,7 @@ def from_start(start: Float[Tensor, "batch 3"], path: Float[Tensor, "*draw batch
 def crossing(
     path: Float[Tensor, "*batch time 3"], height: float
 ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-    """x and y where a path first comes down through a plane, straight between two frames; and whether it does."""
+    """Return x and y where a path first comes down through a plane, linear between two frames; and whether it does."""
     z = path[..., 2]
     down = (z[..., :-1] > height) & (z[..., 1:] <= height)
     first = down.double().argmax(-1, keepdim=True)
@@ -55,10 +55,10 @@ def crossing(
 def landings(
     draws: Float[Tensor, "draw batch time 3"], truth: Float[Tensor, "batch time 3"], height: float
 ) -> Float[Tensor, "4"]:
-    """Over the windows whose truth lands: how many, sum of CRPS (m), how many are in the ellipse, and shares missed.
+    """Return sums over the windows whose truth lands: their number, CRPS (m), number inside the ellipse, shares missed.
 
-    CRPS of draws x_i: mean |x_i - y| - 1/2 mean |x_i - x_j|, i ≠ j (Gneiting & Raftery 2007, eq. 21). The ellipse is
-    that of a normal's 90 %, (y - m)ᵀ C⁻¹ (y - m) ≤ χ²(0.9) = 4.605 with mean and covariance of the draws.
+    The CRPS of draws x_i is mean |x_i - y| - 1/2 mean |x_i - x_j|, i ≠ j (Gneiting & Raftery 2007, eq. 21). The ellipse
+    holds 90 % of a normal with the mean and covariance of the draws: (y - m)ᵀ C⁻¹ (y - m) ≤ χ²(0.9) = 4.605.
     """
     place, lands = crossing(truth, height)
     drawn, there = crossing(draws, height)
@@ -68,7 +68,7 @@ def landings(
     for row in lands.nonzero()[:, 0].tolist():
         found[3] += 1 - there[:, row].double().mean()
         if not enough[row]:
-            # nobody draws it there: as far off as the draws' last places are
+            # too few draws land: take the mean distance of the draws' last places instead
             found[1] += (draws[:, row, -1, :2] - place[row]).abs().mean()
             continue
         points = drawn[there[:, row], row]

@@ -1,4 +1,4 @@
-"""How far predicted flights are from where the ball went, frame by frame, and where it lands."""
+"""Distance of predicted flights from the true ones, frame by frame, and accuracy of predicted landing places."""
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -17,24 +17,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DRAWS = 199
-"""Of each density; the truth's rank among them is one of 200, of which the middle 180 are 90 %."""
+"""Number of draws of each density; the truth has one of 200 ranks among them, of which the middle 180 are 90 %."""
 SHOWN = 8
-"""Predictions that the picture shows at most."""
+"""Largest number of predictions that the figure shows."""
 
 
 class FlightError(Metric, Pictured):
     """Distance between predicted and true positions, centimetres, against time into the future (thesis Figure 4.3).
 
-    - `error_cm`, `error_near_cm`, `error_far_cm`: mean over all predicted frames, at the first, and at the last; of the
-      point prediction, from the batch's "truth" where there is one (a simulated flight without noise).
+    - `error_cm`, `error_near_cm`, `error_far_cm`: mean error of the point prediction over all predicted frames, at the
+      first frame, and at the last. The true positions are the batch's "truth" where there is one (a simulated flight
+      without noise).
     - `interval_90`: share of the recorded coordinates within the middle 90 % of their draws.
     - `landing_crps_cm`: continuous ranked probability score of the place where the ball comes down through the plane at
-      `height`, mean of x and y; `landing_cover_90`: share of the true places within the ellipse that holds 90 % of the
-      drawn ones; `landing_missed`: share of the draws that do not come down there. Over windows whose truth does.
-      Flights begin where the ball was seen last: it may come down before the first predicted frame.
+      `height`, mean of x and y. `landing_cover_90`: share of the true places within the ellipse that holds 90 % of the
+      drawn ones. `landing_missed`: share of the draws that do not come down there. All three are over windows whose
+      true flight comes down through the plane. Flights begin where the ball was seen last: it may come down before the
+      first predicted frame.
 
     Args:
-        height: of that plane, m: somewhat above the table, so that no bounce is between two frames.
+        height: height of that plane, m. It should be somewhat above the table, so that no bounce lies between two
+            frames.
     """
 
     bibtex = """@article{gomez2020real,

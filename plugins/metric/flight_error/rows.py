@@ -1,4 +1,4 @@
-"""Rows of the contract: a ball's places at the next two frames."""
+"""Rows of the contract: positions of a ball at the next two frames."""
 
 from collections.abc import Mapping
 

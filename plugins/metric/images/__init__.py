@@ -1,1 +1,1 @@
-"""How much predicted images look like the true ones: colours, silhouettes and depths."""
+"""Similarity of predicted and true images: colours, silhouettes and depths."""

@@ -10,9 +10,9 @@ from torch.nn.functional import avg_pool2d, pad
 WINDOW, SIGMA = 11, 1.5
 """Side and standard deviation of SSIM's Gaussian window, pixels (Wang et al. 2004, §III.C)."""
 C1, C2 = 0.01**2, 0.03**2
-"""(K1 L)² and (K2 L)² for a range L of 1 (Wang et al. 2004, §III.C)."""
+"""Constants (K1 L)² and (K2 L)² for a range L of 1 (Wang et al. 2004, §III.C)."""
 WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-"""Of MS-SSIM's scales, the finest first (Wang, Simoncelli & Bovik 2003, §3.2)."""
+"""Weights of the scales of MS-SSIM, the finest scale first (Wang, Simoncelli & Bovik 2003, §3.2)."""
 
 Image = Float[Tensor, "height width number"]
 Pixels = Float[Tensor, "*pixels number"]
@@ -20,21 +20,22 @@ Mask = Bool[Tensor, "height width"]
 
 
 def psnr(predicted: Pixels, true: Pixels, ceiling: float) -> Float[Tensor, ""]:
-    """10 log₁₀(1 / mean squared error), dB, at most `ceiling`; NaN of no pixel."""
+    """Return 10 log₁₀(1 / mean squared error), dB, at most `ceiling`; NaN if there is no pixel."""
     error = (predicted.double() - true.double()).square().mean()
     return (-10 * error.log10()).clamp(max=ceiling)
 
 
 class Similarity(NamedTuple):
-    """Of every window that lies in the image, (number, height - 10, width - 10): SSIM, and its contrast and structure
-    alone."""
+    """SSIM of every window that lies in the image, and its factor for contrast and structure, (number, height - 10,
+    width - 10).
+    """
 
     whole: Tensor
     contrast: Tensor
 
 
 def similarity(predicted: Float[Tensor, "number height width"], true: Tensor) -> Similarity:
-    """Structural similarity (Wang et al. 2004, eq. 13) about every place."""
+    """Return the structural similarity (Wang et al. 2004, eq. 13) of every window that lies in the image."""
     one, other = predicted.double(), true.double()
     planes = torch.stack([one, other, one * one, other * other, one * other])
     mean, mean_other, square, square_other, product = blurred(planes)
@@ -46,7 +47,7 @@ def similarity(predicted: Float[Tensor, "number height width"], true: Tensor) ->
 
 
 def blurred(planes: Float[Tensor, "... height width"]) -> Float[Tensor, "... height_10 width_10"]:
-    """Means under the window, rows first and then columns: only where it lies in the image."""
+    """Return the means under the Gaussian window, only for windows that lie in the image; rows first, then columns."""
     place = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
     weights = torch.exp(-place.square() / (2 * SIGMA**2))
     weights = weights / weights.sum()
@@ -58,10 +59,14 @@ def blurred(planes: Float[Tensor, "... height width"]) -> Float[Tensor, "... hei
 
 
 def ssim(predicted: Image, true: Image, mask: Mask | None) -> list[Float[Tensor, ""]]:
-    """Mean structural similarity over the image and, with a mask, over windows about its pixels; NaN where none is.
+    """Return the mean structural similarity over the image and, with a mask, over the windows centred on its pixels.
+
+    The second number is NaN where the mask has no such pixel.
 
     Args:
-        predicted, true: of at least 11 pixels a side.
+        predicted: image of at least 11 pixels a side.
+        true: image of the same size.
+        mask: pixels whose windows are averaged for the second number; None for the first number alone.
     """
     found = similarity(predicted.movedim(-1, 0), true.movedim(-1, 0)).whole
     if mask is None:
@@ -71,13 +76,16 @@ def ssim(predicted: Image, true: Image, mask: Mask | None) -> list[Float[Tensor,
 
 
 def ms_ssim(predicted: Image, true: Image, scales: int) -> Float[Tensor, ""]:
-    """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003, eq. 7), each number apart and then their mean.
+    """Return the multi-scale structural similarity (Wang, Simoncelli & Bovik 2003, eq. 7), the mean over colour
+    channels.
 
-    Of fewer than five scales the weights of the finest ones, made to sum to what all five do. A mean contrast below 0,
-    of which no power is known, counts as 0.
+    With fewer than five scales the weights of the finest ones are taken, scaled to the sum of all five weights. A
+    negative mean contrast counts as 0, because its power is not defined.
 
     Args:
-        predicted, true: of at least `least_side(scales)` pixels a side.
+        predicted: image of at least `least_side(scales)` pixels a side.
+        true: image of the same size.
+        scales: number of scales, 1 to 5.
     """
     one, other = predicted.double().movedim(-1, 0), true.double().movedim(-1, 0)
     weights = torch.tensor(WEIGHTS[:scales], dtype=one.dtype, device=one.device) * (
@@ -93,26 +101,33 @@ def ms_ssim(predicted: Image, true: Image, scales: int) -> Float[Tensor, ""]:
 
 
 def halved(planes: Float[Tensor, "number height width"]) -> Tensor:
-    """Means of 2 × 2 pixels. The last of an odd number of rows or columns is mirrored, as by the authors' code
-    (Wang, Simoncelli & Bovik 2003; `imfilter(..., 'symmetric')` with a window of 2 × 2, of which every second stays,
-    the first included: the window of an even size lies about its pixel and the next)."""
+    """Return the means of 2 × 2 pixels.
+
+    The last one of an odd number of rows or columns is mirrored, as in the authors' code (Wang, Simoncelli & Bovik
+    2003): `imfilter(..., 'symmetric')` with a window of 2 × 2, of whose results every second is kept, the first
+    included; a window of even size covers its pixel and the next one.
+    """
     odd = planes.shape[-1] % 2, planes.shape[-2] % 2
     return avg_pool2d(pad(planes, (0, odd[0], 0, odd[1]), mode="replicate"), 2)
 
 
 def least_side(scales: int) -> int:
-    """Pixels of the smallest image in whose coarsest scale a window lies: 176 of five."""
+    """Return the side, in pixels, of the smallest image in whose coarsest scale a window lies: 176 for five scales."""
     return WINDOW * 2 ** (scales - 1)
 
 
 def silhouette_iou(predicted: Mask, true: Mask) -> Float[Tensor, ""]:
-    """Pixels in both masks, of those in either; NaN where both are empty."""
+    """Return the number of pixels in both masks divided by that in either mask; NaN where both are empty."""
     return (predicted & true).sum().double() / (predicted | true).sum()
 
 
 def depth_error(predicted: Float[Tensor, "height width"], true: Tensor) -> list[Float[Tensor, ""]]:
-    """Mean |difference| over pixels where both see something, metres, and of the pixels where either does the share
-    where only one does; each NaN where there are none. Nothing is seen where the depth is infinite."""
+    """Return the mean absolute depth error in metres, and the share of unmatched pixels.
+
+    The error is over the pixels where both images have a finite depth. The share is that of the pixels where only one
+    of them has, among those where at least one has. Each is NaN where there is no such pixel. A depth is infinite where
+    nothing is seen.
+    """
     seen, there = predicted.isfinite(), true.isfinite()
     both = seen & there
     gap = (predicted.double()[both] - true.double()[both]).abs()

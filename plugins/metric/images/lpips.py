@@ -14,22 +14,24 @@ from plugins.metric.images.perceptual import LEAST_SIDE, Backbone, Distance
 
 
 class LPIPS(PerImage):
-    """Learned perceptual distance of each image (Zhang et al. 2018, version 0.1), then the mean over images.
+    """Learned perceptual distance of each image (Zhang et al. 2018, version 0.1), as a mean over images.
 
-    In float32, of colours as 8-bit files hold them, not rounded. `lpips_masked` is that of the images with all outside
-    of the true mask made white in both; an image with an empty mask has none and does not count.
+    It is computed in float32 from colours as 8-bit files hold them, but not rounded. For `lpips_masked`, everything
+    outside of the true mask is made white in both images; an image with an empty mask has no such number and does not
+    count.
 
-    Its networks were trained on photographs, by weights that are not shipped: without a file of them there is no
-    number, and the table says "not available". Never is it one of random weights.
+    The networks were trained on photographs, and their weights are not shipped. Without a file of weights there is no
+    number, and the table says "not available"; random weights are never used.
 
     Args:
-        backbone: "alex", which the authors recommend for comparing methods, and papers report; or "vgg".
+        backbone: "alex", which the authors recommend for comparing methods and which papers report; or "vgg".
         weights: a local file of the backbone in torchvision's format: alexnet-owt-7be5be79.pth, vgg16-397923af.pth.
-        masked: also inside the true mask, which batches then need.
+        masked: also compute the distance inside the true mask, which batches must then have.
 
     Raises:
-        ConfigError, CheckpointError: no such file, or not of the backbone.
-        DataError: images that are not of three colours, or smaller than 31 ("vgg": 16) pixels a side.
+        ConfigError: the file of weights does not exist.
+        CheckpointError: the file holds the weights of another network.
+        DataError: images do not have three colours, or are smaller than 31 ("vgg": 16) pixels a side.
     """
 
     bibtex = """@inproceedings{zhang2018unreasonable,

@@ -12,16 +12,20 @@ from plugins.metric.images import functional
 from plugins.metric.images.per_image import PerImage
 
 Encoding = Literal["srgb", "linear"]
-"""In which numbers colours are compared: those of 8-bit files, though not rounded, as in the literature; or light."""
+"""Numbers in which colours are compared: sRGB as in 8-bit files, but not rounded (as in papers); or linear RGB."""
 
 
 def compared(light: Float[Tensor, "height width number"], encoding: Encoding) -> Tensor:
-    """Colours in [0, 1], float64, what lies outside cut off, as a file would."""
+    """Return the colours in the given encoding, clipped to [0, 1] as a file would clip them, float64."""
     return encoded(light.double()) if encoding == "srgb" else light.double().clamp(0, 1)
 
 
 def require_side(image: Tensor, least: int, remedy: str) -> None:
-    """Refuse an image in which no window of SSIM lies; raises DataError."""
+    """Refuse an image that is smaller than the window of SSIM.
+
+    Raises:
+        DataError: the shorter side has fewer than `least` pixels.
+    """
     height, width = image.shape[:2]
     if min(height, width) < least:
         raise DataError(
@@ -31,17 +35,18 @@ def require_side(image: Tensor, least: int, remedy: str) -> None:
 
 
 class PSNR(PerImage):
-    """Peak signal-to-noise ratio of each image, 10 log₁₀(1 / mean squared error) dB, and then the mean over images.
+    """Peak signal-to-noise ratio of each image, 10 log₁₀(1 / mean squared error) dB, as a mean over images.
 
-    So it is never the ratio of a mean error: decibels of images are averaged, as in the literature. `psnr_masked_db` is
-    over the pixels of the true mask alone, since a white frame flatters every image; an image with an empty mask has
-    none and does not count.
+    Decibels of images are averaged, as in the literature; the result is not the ratio of a mean error. `psnr_masked_db`
+    is over the pixels of the true mask alone, because a white background raises the number of every image; an image
+    with an empty mask has no such number and does not count.
 
     Args:
-        encoding: of the colours compared: "srgb" numbers as files hold them, or "linear" light.
-        masked: also inside the true mask, which batches then need.
-        ceiling_db: what an image without error counts as, whose ratio is infinite, and at most what any counts as. 100
-            dB is an error of 1e-5, a four-hundredth of a step of 8 bits; `psnr_exact` is the share of images there.
+        encoding: encoding of the compared colours: "srgb" as files hold them, or "linear" RGB.
+        masked: also compute the ratio inside the true mask, which batches must then have.
+        ceiling_db: the largest ratio that is counted; an image without error, whose ratio is infinite, counts as this.
+            100 dB is an error of 1e-5, a four-hundredth of a step of 8 bits. `psnr_exact` is the share of images at the
+            ceiling.
     """
 
     bibtex = """@article{huynhthu2008scope,
@@ -78,17 +83,18 @@ class PSNR(PerImage):
 
 
 class SSIM(PerImage):
-    """Mean structural similarity of each image, at most 1, and then the mean over images.
+    """Mean structural similarity of each image, at most 1, as a mean over images.
 
-    As its authors measure it: Gaussian windows of 11 pixels with σ = 1.5 pixels, only where they lie in the image;
-    red, green and blue apart, then their mean. `ssim_masked` is the mean over windows about the pixels of the true
-    mask, which reach 5 pixels beyond it; an image without any does not count.
+    It is measured as its authors do: with Gaussian windows of 11 pixels with σ = 1.5 pixels that lie in the image, for
+    red, green and blue separately, and then averaged over the three. `ssim_masked` is the mean over the windows centred
+    on pixels of the true mask, which reach 5 pixels beyond the mask; an image without such a pixel does not count.
 
     Args:
-        encoding, masked: as of PSNR.
+        encoding: encoding of the compared colours: "srgb" as files hold them, or "linear" RGB.
+        masked: also compute the similarity inside the true mask, which batches must then have.
 
     Raises:
-        DataError: images of fewer than 11 pixels a side.
+        DataError: images have fewer than 11 pixels a side.
     """
 
     bibtex = """@article{wang2004image,
@@ -117,15 +123,15 @@ class SSIM(PerImage):
 
 
 class MSSSIM(PerImage):
-    """Multi-scale structural similarity of each image over the full frame, in [0, 1], and then the mean over images.
+    """Multi-scale structural similarity of each image over the full frame, in [0, 1], as a mean over images.
 
     Args:
-        encoding: as of PSNR.
-        scales: each halves the image. Five are the authors', and need 176 pixels a side; four 88, three 44, two 22.
-            Numbers of different scales cannot be compared.
+        encoding: encoding of the compared colours: "srgb" as files hold them, or "linear" RGB.
+        scales: number of scales; each next one halves the image. The authors use five, which need 176 pixels a side;
+            four need 88, three 44, two 22. Results with different numbers of scales cannot be compared.
 
     Raises:
-        DataError: images too small for the scales.
+        DataError: images are too small for the scales.
     """
 
     bibtex = """@inproceedings{wang2003multiscale,
@@ -155,9 +161,9 @@ class MSSSIM(PerImage):
 
 
 class SilhouetteIoU(PerImage):
-    """Intersection over union of predicted and true masks of each image, in [0, 1], and then the mean over images.
+    """Intersection over union of predicted and true masks of each image, in [0, 1], as a mean over images.
 
-    An image with nothing in it and nothing predicted has none and does not count.
+    An image whose predicted and true masks are both empty has no such number and does not count.
     """
 
     bibtex = """@article{everingham2010pascal,
@@ -183,10 +189,10 @@ class SilhouetteIoU(PerImage):
 
 
 class DepthError(PerImage):
-    """Mean absolute error of depths over the pixels of each image that both see, metres, then the mean over images.
+    """Mean absolute depth error of each image over the pixels that both images see, metres, as a mean over images.
 
-    `depth_unmatched` is, of the pixels that either sees, the share that only one does. An image in which both see no
-    pixel in common has no error, so that only the two together say how good depths are.
+    `depth_unmatched` is the share of pixels that only one image sees, among the pixels that at least one sees. An image
+    pair without a common pixel has no error; therefore only both numbers together say how good the depths are.
     """
 
     bibtex = """@inproceedings{eigen2014depth,

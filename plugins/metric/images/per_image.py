@@ -1,4 +1,4 @@
-"""What the metrics of this folder share: numbers of each image, their means, and a sheet of a few of the images."""
+"""Base class of metrics over single images: numbers of each image, their means, and a figure of some images."""
 
 import math
 from abc import abstractmethod
@@ -18,40 +18,51 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEPT = 8
-"""Images that are kept beside the worst and the best: the one next to the median of all is shown."""
+"""Number of random images that are kept beside the worst and the best; the one closest to the median is shown."""
 
 
 class PerImage(Metric, Pictured):
-    """A metric of one channel, which `reads` names: `judge` gives the numbers of each image, by the first of which
-    images are ranked.
+    """Base class of metrics that judge images one by one, in the one channel that `reads` names.
 
-    A number is NaN where an image has none; its mean and standard error are over the others. The numbers of all images
-    are held until the end, and pictures of at most KEPT + 2. Images are looked at one by one, so that no batch size
-    changes a bit or needs more memory.
+    `judge` returns the numbers of one image; images are ranked by the first number. A number is NaN where an image has
+    none; mean and standard error are over the other images. The numbers of all images are held until the end, and at
+    most KEPT + 2 images. Images are judged one by one, so that the batch size changes neither a bit of the result nor
+    the memory that is needed.
 
     Raises:
-        DataError: a batch without the true image, or images that do not fit or hold NaN.
+        DataError: a batch has no true image, or images do not fit or hold NaN.
     """
 
     keys: tuple[str, ...]
     masked: bool
-    """Whether `judge` is given the true masks."""
+    """Flag that `judge` is given the true masks."""
     numbers: list[Tensor]
     pairs: list[Tensor]
     facts: list[Tensor]
 
     def start(self, *keys: str, masked: bool = False) -> None:
-        """Declare the states, by the names of the numbers; called by the constructor."""
+        """Declare the metric's states; the constructor of a subclass calls this method.
+
+        Args:
+            keys: names of the numbers that `judge` returns, in its order.
+            masked: whether `judge` is given the true masks.
+        """
         self.keys, self.masked = keys, masked
         self.columns = {key: heading for key, heading in self.columns.items() if key in keys}  # type: ignore[misc]
         self.better = {key: way for key, way in self.better.items() if key in keys}  # type: ignore[misc]
-        # numbers (image, key); of images kept (1, predicted or true, height, width[, number]), and (1, score, index)
+        # shapes: numbers (image, key); each kept pair (1, predicted or true, height, width[, number]); its facts (1, 2)
         for name in ("numbers", "pairs", "facts"):
             self.add_state(name, [], dist_reduce_fx="cat")
 
     @abstractmethod
     def judge(self, predicted: Tensor, true: Tensor, mask: Tensor | None) -> list[Float[Tensor, ""]]:
-        """The numbers of one image, in the order of the keys; `mask`, (height, width), where `masked`."""
+        """Return the numbers of one image, in the order of the keys.
+
+        Args:
+            predicted: the predicted image, (height, width[, number]).
+            true: the true image, of the same shape.
+            mask: the true mask, (height, width); None unless `masked`.
+        """
 
     def update(self, prediction: Prediction) -> None:
         channel, name = self._channel, type(self).__name__
@@ -77,7 +88,7 @@ class PerImage(Metric, Pictured):
         self._keep([*self.facts, *facts.split(1)], predicted, true)
 
     def _keep(self, facts: list[Tensor], predicted: Tensor, true: Tensor) -> None:
-        """Of the images kept and those of a batch, whose facts follow, those that may be shown."""
+        """Choose the images to hold, among those held before and those of a batch, whose facts come last in `facts`."""
         old, pairs = len(self.pairs), []
         stay = kept(torch.cat(facts))
         for place in stay:
@@ -123,8 +134,14 @@ class PerImage(Metric, Pictured):
 
 
 def kept(facts: Float[Tensor, "image 2"]) -> list[int]:
-    """Which of images with (score, index) may have to be shown: the lowest, the highest, and KEPT at random, the same
-    ones in whatever order they came. None without a score."""
+    """Return the places of the images that may have to be shown, in ascending order.
+
+    They are the image with the lowest score, that with the highest, and KEPT images at random; the choice does not
+    depend on the order of the images. Images without a score (NaN) are left out.
+
+    Args:
+        facts: score and index of each image.
+    """
     told = facts.tolist()
     known = sorted((place for place, (score, _) in enumerate(told) if score == score), key=told.__getitem__)
     # Knuth's multiplicative hash
@@ -136,7 +153,8 @@ def require(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
     """Refuse images that cannot be compared.
 
     Raises:
-        DataError: shapes or number types that do not fit, or numbers that no image holds.
+        DataError: shapes or number types do not fit, or the images hold NaN or infinite numbers (+inf is allowed in
+            depths).
     """
     dimensions = 4 if channel == "color" else 3
     wanted = "(batch, height, width, number)" if channel == "color" else "(batch, height, width)"
@@ -148,7 +166,7 @@ def require(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
             f"{wanted}, {'bool' if channel == 'mask' else 'of real numbers (light, not 8-bit)'}."
         )
     for whose, image in {"predicted": predicted, "true": true}.items():
-        # background is +inf of depths; light may be anything finite
+        # the background of a depth image is +inf; linear RGB may be any finite number
         wrong = ~(image > -math.inf) | ((image == math.inf) & (channel != "depth"))
         if wrong.any():
             first = int(wrong.flatten(1).any(1).nonzero()[0])
@@ -160,5 +178,5 @@ def require(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
 
 
 def told(image: Tensor) -> str:
-    """Number type and shape, for a sentence."""
+    """Return number type and shape of an image, for a message."""
     return f"{str(image.dtype).removeprefix('torch.')} {tuple(image.shape)}"

@@ -1,4 +1,4 @@
-"""How far apart two images are in the features of a network that learned to name things (Zhang et al. 2018)."""
+"""Distance of two images in the features of an image classification network (Zhang et al. 2018)."""
 
 from pathlib import Path
 from typing import Literal
@@ -12,24 +12,25 @@ from framework.storage.weights import fill_from_file, read_weights
 
 Backbone = Literal["alex", "vgg"]
 TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
-"""Layers whose outputs are compared: of AlexNet after every convolution, of VGG16 the last of each size."""
+"""Indices of the layers whose outputs are compared: AlexNet after every convolution, VGG16 the last of each size."""
 LEAST_SIDE = {"alex": 31, "vgg": 16}
-"""Pixels of the smallest images of which the last of these layers has an output."""
+"""Side, in pixels, of the smallest images for which the last of these layers has an output."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""What the authors' scaling layer subtracts from images in [-1, 1], and divides by: ImageNet's mean and deviation."""
+"""Mean and standard deviation of ImageNet for images in [-1, 1], by which the authors' scaling layer normalises."""
 
 
 class Distance(nn.Module):
-    """Eq. 1 of Zhang et al. 2018, with the authors' weights of features, version 0.1, as torchmetrics brings them.
+    """LPIPS distance (Zhang et al. 2018, eq. 1) with the authors' feature weights, version 0.1, which torchmetrics
+    ships.
 
     Args:
         backbone: AlexNet, or VGG16.
-        weights: the user's file of the backbone trained on ImageNet, with torchvision's names: of all layers or of the
-            features alone; no such file is shipped.
+        weights: the user's file of the backbone trained on ImageNet, with torchvision's names, either of all layers or
+            of the features alone; no such file is shipped.
 
     Raises:
-        ConfigError: there is no such file.
-        CheckpointError: it cannot be read, or is of another network.
+        ConfigError: the file does not exist.
+        CheckpointError: the file cannot be read, or is of another network.
     """
 
     shift: Tensor
@@ -50,13 +51,16 @@ class Distance(nn.Module):
         self.requires_grad_(False).eval()
 
     def __deepcopy__(self, memo: object) -> "Distance":
-        return self  # nobody changes it, and a metric is copied for every group of samples
+        return self  # the weights never change, and a metric is copied for every group of samples
 
     def forward(
         self, predicted: Float[Tensor, "batch 3 height width"], true: Float[Tensor, "batch 3 height width"]
     ) -> Float[Tensor, "batch"]:
-        """Args:
-        predicted, true: in [0, 1] as files hold colours, not light.
+        """Return the distance of each pair of images.
+
+        Args:
+            predicted: colours in [0, 1] as files hold them, not linear RGB.
+            true: colours of the true images, likewise.
         """
         maps = (2 * torch.cat([predicted, true]) - 1 - self.shift) / self.scale
         total = maps.new_zeros(len(predicted))
@@ -70,11 +74,11 @@ class Distance(nn.Module):
 
 
 def _of_length_one(maps: Float[Tensor, "batch channel height width"]) -> Tensor:
-    return maps / (maps.norm(dim=1, keepdim=True) + 1e-10)  # where all features are 0 they stay 0
+    return maps / (maps.norm(dim=1, keepdim=True) + 1e-10)  # features that are all 0 stay 0
 
 
 class AlexNet(nn.Sequential):
-    """Its convolutions (Krizhevsky 2014), numbered as torchvision's, up to the last layer compared."""
+    """Convolutions of AlexNet (Krizhevsky 2014) up to the last compared layer, numbered as in torchvision."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -94,7 +98,9 @@ class AlexNet(nn.Sequential):
 
 
 class VGG16(nn.Sequential):
-    """Likewise of configuration D of Simonyan & Zisserman 2015."""
+    """Convolutions of configuration D (Simonyan & Zisserman 2015) up to the last compared layer, numbered as in
+    torchvision.
+    """
 
     def __init__(self) -> None:
         layers: list[nn.Module] = []

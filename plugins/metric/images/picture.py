@@ -1,4 +1,4 @@
-"""A sheet of images: each as it should be, as it was predicted, and the difference."""
+"""Figure that shows true images, predicted images and their differences."""
 
 from collections.abc import Mapping
 
@@ -11,20 +11,23 @@ from matplotlib.figure import Figure
 from framework.figures.style import BLUE, GREY, RED, titled_figure
 
 NOTHING = "0.85"
-"""Where nothing is seen."""
+"""Grey of pixels where nothing is seen."""
 ALONE = "0.35"
 WIDTH = 2.6
-"""Of a panel, inches."""
+"""Width of a panel, inches."""
 
 
 def sheet(
     channel: str, pairs: Mapping[str, np.ndarray], title: str, summary: str, *, synthetic: bool
 ) -> Figure:
-    """A row for each caption, and the summary below.
+    """Return a figure with one row of panels for each pair of images, and the summary below them.
 
     Args:
         channel: "color" (8-bit), "mask" or "depth" (metres, infinite where nothing is seen).
-        pairs: predicted and true image, (2, height, width[, number]); none of nothing seen.
+        pairs: caption → predicted and true image, (2, height, width[, number]); empty if no image was seen.
+        title: title of the figure.
+        summary: the line below the panels.
+        synthetic: whether the data are synthetic, which the figure then says.
     """
     if not pairs:
         figure = titled_figure((5.0, 1.6), title, synthetic)
@@ -48,7 +51,7 @@ def sheet(
 
 def _colours(line: list[Axes], predicted: np.ndarray, true: np.ndarray) -> None:
     for axes, image in zip(line, (true, predicted), strict=False):
-        # red, green and blue; of any other number of channels the first, in grey
+        # an image of three channels is shown as red, green and blue; of any other the first channel, in grey
         axes.imshow(image if image.shape[-1] == 3 else image[..., 0], cmap="gray", vmin=0, vmax=255)
     gap = np.abs(predicted.astype(float) - true.astype(float)).mean(-1)
     shown = line[2].imshow(gap, cmap="magma", vmin=0, vmax=max(gap.max(), 1))

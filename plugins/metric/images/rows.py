@@ -1,4 +1,4 @@
-"""Rows of the contract: pictures of balls."""
+"""Rows of the contract: images of balls."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

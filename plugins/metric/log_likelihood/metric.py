@@ -1,4 +1,4 @@
-"""Mean log-likelihood, of either sign, and its standard error: a running mean and sum of squared deviations."""
+"""Mean log-likelihood or its negative, with the standard error, from a running mean and sum of squared deviations."""
 
 from typing import ClassVar, Literal
 
@@ -13,7 +13,7 @@ from framework.prediction import Prediction
 
 
 class Moments(Metric):
-    """What the two metrics share: the moments of log-likelihoods, and what sampling did to them."""
+    """Base class of both metrics: moments of log-likelihoods, and sums that describe the error due to sampling."""
 
     moments: Tensor
     sampling: Tensor
@@ -32,12 +32,13 @@ class Moments(Metric):
 class LogLikelihood(Moments):
     """Mean log-likelihood of the targets, nats, with its standard error (thesis Tables 3.1 to 3.3).
 
-    A target the density rules out has log-likelihood -inf; the mean is then -inf and the error NaN.
+    A target that the density rules out has log-likelihood -inf; the mean is then -inf and the standard error NaN.
 
-    Of densities whose log_prob is a Monte Carlo estimate also: the mean without its first-order bias, the standard
-    error that the sampling alone gives it, the samples an item took (mean and most), and how many items did not reach
-    the tolerance asked for. Where a single replicate says nothing of its error, both are NaN. Of a density that has
-    not said whether its log_prob draws, the error alone, NaN.
+    Where log_prob is a Monte Carlo estimate, the metric also reports the mean without its first-order bias, the
+    standard error due to the sampling alone, the mean and the largest number of samples per item, and how many items
+    did not reach the requested tolerance. Debiased mean and sampling error are NaN where they cannot be estimated from
+    a single replicate. For a density that has not declared whether its log_prob draws samples, only the sampling error
+    is reported, as NaN.
     """
 
     bibtex = """@article{gneiting2007strictly,
@@ -62,11 +63,12 @@ class LogLikelihood(Moments):
 class NegativeLogLikelihood(Moments):
     """Mean negative log-likelihood of the targets, nats, with its standard error (thesis eq. 2.25 as a mean).
 
-    The negative of `log_likelihood`, for tables in which lower is better, with the same further numbers of densities
-    whose log_prob is an estimate. A target the density rules out makes the mean infinite and the error NaN.
+    It is the negative of `log_likelihood`, for tables in which lower is better, with the same further numbers for
+    densities whose log_prob is an estimate. A target that the density rules out makes the mean infinite and the
+    standard error NaN.
 
     Raises:
-        UserError: log-likelihoods that are NaN; says how many.
+        UserError: log-likelihoods are NaN; the message says how many.
     """
 
     bibtex = """@article{good1952rational,
@@ -86,19 +88,19 @@ class NegativeLogLikelihood(Moments):
 
     def compute(self) -> dict[str, Tensor]:
         found = summary("nll", self.moments, self.sampling)
-        # from 0, so that the NLL of certain and right predictions is no -0
+        # subtract from 0, so that the NLL of certain and right predictions is not -0
         return found | {name: 0 - found[name] for name in ("nll", "nll_debiased") if name in found}
 
 
 def summary(
     name: str, moments: Float[Tensor, "3"], sampling: Float[Tensor, "5"]
 ) -> dict[str, Float[Tensor, ""]]:
-    """Mean and standard error called `name`; where something was estimated, also what that did to them."""
+    """Return mean and standard error under `name`; where log_prob was estimated, also the effect of the sampling."""
     count, mean, squares = moments
     seen = count > 0
     found = {
         name: torch.where(seen, mean, torch.nan),
-        # σ/√n with the sample deviation σ² = Σ(x - x̄)² / (n - 1); one sample has none: 0/0
+        # σ/√n with the sample variance σ² = Σ(x - x̄)² / (n - 1); it is undefined for one sample: 0/0
         f"{name}_sem": torch.where(seen, (squares / (count - 1) / count).sqrt(), torch.nan),
     }
     debiased, variance, samples, above, most = sampling
@@ -106,7 +108,7 @@ def summary(
         return found if variance == 0 or not seen else found | {f"{name}_mc_error": variance}
     return found | {
         f"{name}_debiased": debiased / count,
-        # the items' points are independent: the variance of a mean
+        # the items are sampled independently: this is the variance of a mean
         f"{name}_mc_error": variance.sqrt() / count,
         "samples_mean": samples / count,
         "samples_max": most,
@@ -115,7 +117,7 @@ def summary(
 
 
 def moments_of(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
-    """(n, mean, Σ(x - mean)²) in float64; zeros of nothing."""
+    """Return (n, mean, Σ(x - mean)²) in float64; zeros if there are no values."""
     values = values.detach().double()
     count = values.new_tensor(len(values))
     if len(values) == 0:
@@ -125,7 +127,7 @@ def moments_of(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
 
 
 def sampling_of(found: Estimate) -> Float[Tensor, "5"]:
-    """Σ debiased log-likelihoods, Σ squared errors, Σ samples, items above tolerance, most samples; float64."""
+    """Return Σ debiased log-likelihoods, Σ squared errors, Σ samples, items above tolerance, most samples; float64."""
     if found.samples.numel() == 0:
         return torch.zeros(5, dtype=torch.float64, device=found.samples.device)
     return torch.stack(
@@ -140,21 +142,21 @@ def sampling_of(found: Estimate) -> Float[Tensor, "5"]:
 
 
 def merged_sampling(parts: Float[Tensor, "parts 5"]) -> Float[Tensor, "5"]:
-    """The same of all items from those of disjoint parts."""
+    """Return the sampling numbers of all items, from those of disjoint parts."""
     return torch.cat([parts[:, :4].sum(0), parts[:, 4:].amax(0)])
 
 
 def merged_moments(parts: Float[Tensor, "parts 3"]) -> Float[Tensor, "3"]:
-    """The moments of all samples from those of disjoint parts (Chan, Golub & LeVeque 1983, eq. 2.1).
+    """Return the moments of all samples, from those of disjoint parts (Chan, Golub & LeVeque 1983, eq. 2.1).
 
-    Exact where a sum of squares loses the variance: when the mean is large against it.
+    The method stays exact where the mean is large against the deviation and a sum of squares would lose the variance.
     """
     parts = parts[parts[:, 0] > 0]
     count, mean, squares = parts.unbind(-1)
     total = count.sum()
     if total == 0:
         return parts.new_zeros(3)
-    # a weighted mean, not mean + correction: of -inf and a number it is -inf, not NaN
+    # a weighted mean, not mean + correction: it is -inf, not NaN, if one part is -inf
     middle = (count * mean).sum() / total
     between = (count * (mean - middle).square()).sum()
     return torch.stack([total, middle, squares.sum() + between])

@@ -1,1 +1,1 @@
-"""How a model behaves on data that belongs to nothing it was trained on."""
+"""Behaviour of a model on outliers, which belong to none of its training classes."""

@@ -1,4 +1,4 @@
-"""Entropy on outliers, and how well a score tells them from the test split."""
+"""Entropy on outliers, and how well a score separates outliers from the test split."""
 
 from typing import ClassVar, Literal
 
@@ -15,24 +15,27 @@ from framework.prediction import Prediction, Split
 
 
 class OutOfDistribution(Metric):
-    """Mean entropy on outliers (thesis eq. 2.32 as a mean), nats, and how well a score tells them from the test split.
+    """Mean entropy on outliers (thesis eq. 2.32), nats, and how well a score separates them from the test split.
+
+    The entropy is eq. 2.32 as a mean.
 
     - `ood_entropy`, `ood_entropy_sem`: mean entropy on outliers and its standard error; `entropy_test`: mean entropy on
-      the test split. An infinite entropy makes them infinite.
-    - `auroc`: chance that an outlier has a higher score than a test sample, an equal one counted half.
-    - `aupr`: average precision. Outliers are the positives here, so that it depends on their share.
-    - `fpr95`: share of test samples taken for outliers at the highest threshold that finds 95 % of the outliers; a
-      score equal to the threshold counts as above it (Hendrycks et al. 2019; where a paper takes the test split for
-      the positives, its number is another).
+      the test split. One infinite entropy makes the mean infinite.
+    - `auroc`: probability that an outlier has a higher score than a test sample; equal scores count half.
+    - `aupr`: average precision. Outliers are the positives, so the number depends on their share.
+    - `fpr95`: share of test samples that are taken for outliers at the highest threshold that finds 95 % of the
+      outliers. A score equal to the threshold counts as above it (Hendrycks et al. 2019). Papers that take the test
+      split as the positives report a different number.
 
     The last three are NaN where outliers or test samples are missing.
 
     Args:
-        score: what is high on outliers. "entropy": of the density; "confidence", negated: of classes the largest
-            probability (Hendrycks & Gimpel 2017), of other targets the log-density at the mode.
+        score: score that is high on outliers. "entropy" is the entropy of the density. "confidence" is the negative
+            confidence: of classes the largest probability (Hendrycks & Gimpel 2017), of other targets the log-density
+            at the mode.
 
     Raises:
-        UserError: entropies or scores that are NaN; says how many.
+        UserError: entropies or scores are NaN; the message says how many.
     """
 
     bibtex = """@inproceedings{hendrycks2019deep,
@@ -60,7 +63,7 @@ class OutOfDistribution(Metric):
     def __init__(self, *, score: Literal["entropy", "confidence"] = "entropy") -> None:
         super().__init__()
         self.score = score
-        # (entropy, score) of each sample: a ranking is not known before all are seen
+        # (entropy, score) of each sample: a ranking needs all samples
         self.add_state("test", [], dist_reduce_fx="cat")
         self.add_state("outliers", [], dist_reduce_fx="cat")
 
@@ -79,7 +82,7 @@ class OutOfDistribution(Metric):
     def compute(self) -> dict[str, Tensor]:
         test, outliers = _joined(self.test), _joined(self.outliers)
         entropy = outliers[:, 0]
-        # the sample deviation of one is NaN, of which torch would warn
+        # the sample deviation of one value is NaN, and torch would warn
         spread = entropy.std() if len(entropy) > 1 else entropy.new_tensor(torch.nan)
         return {
             "ood_entropy": entropy.mean(),
@@ -90,10 +93,10 @@ class OutOfDistribution(Metric):
 
 
 def doubt(density: Distribution) -> Float64[Tensor, "batch"]:
-    """High where a density is unsure: of classes 1 - max_k p_k, of other targets minus the log-density at the mode.
+    """Return a score that is high where a density is unsure.
 
-    1 - p is taken as the sum of the other classes, which keeps its digits where p rounds to 1 and so the order of
-    samples that are all but certain.
+    For classes it is 1 - max_k p_k, for other targets the negative log-density at the mode. 1 - p is computed as the
+    sum over the other classes, which keeps its digits where p rounds to 1, and so the order of almost certain samples.
     """
     if density.has_enumerate_support:
         return class_probabilities(density).sort(-1).values[:, :-1].sum(-1)
@@ -103,7 +106,9 @@ def doubt(density: Distribution) -> Float64[Tensor, "batch"]:
 def ranking(
     outliers: Float[Tensor, "outlier"], test: Float[Tensor, "sample"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """`auroc`, `aupr` and `fpr95` of two sets of scores, outliers being the positives; NaN where one is empty."""
+    """Return `auroc`, `aupr` and `fpr95` of two sets of scores, with outliers as the positives; NaN where one set is
+    empty.
+    """
     samples, strangers = len(test), len(outliers)
     if samples == 0 or strangers == 0:
         nothing = outliers.new_tensor(torch.nan, dtype=torch.float64)

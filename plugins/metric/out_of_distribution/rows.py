@@ -1,4 +1,4 @@
-"""Rows of the contract: either score, on classes, reals and angles."""
+"""Rows of the contract: both scores, on classes, reals and angles."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

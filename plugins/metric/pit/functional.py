@@ -1,4 +1,4 @@
-"""The probability integral transform of one number, and how far transforms are from uniform."""
+"""Probability integral transform of one number, and distances of such transforms from the uniform distribution."""
 
 import math
 
@@ -13,11 +13,12 @@ from framework.distributions.protocol import arc, cdf, turn
 
 
 def transform(density: Distribution, value: Float[Tensor, "batch 1"], samples: int) -> Float[Tensor, "batch"]:
-    """F(y) of a density of one real or one angle, float64 in [0, 1], uniform where the density is the truth's.
+    """Return F(y) under a density of one real or one angle, float64 in [0, 1]; it is uniform if the density is the true
+    one.
 
-    Of an angle, F is the mass from the antipode of the density's mean direction counter-clockwise to y; where the
-    mean has no direction, from ±π. Exact where `cdf` or `circular_moments` are, otherwise the rank
-    of y among `samples` draws, (r + ½)/(S + 1).
+    For an angle, F is the mass from the antipode of the density's mean direction counter-clockwise to y; where the mean
+    has no direction, it is the mass from ±π. The result is exact where `cdf` or `circular_moments` are exact; otherwise
+    it is the rank of y among `samples` draws, (r + ½)/(S + 1).
     """
     if isinstance(density.support, Circular):
         return _circular(density, value.double(), samples)
@@ -45,14 +46,14 @@ def _circular(density: Distribution, value: Tensor, samples: int) -> Tensor:
 
 
 def _rank(ahead: Float[Tensor, "samples batch"]) -> Float[Tensor, "batch"]:
-    """Where zero stands among numbers, ties half below it."""
+    """Return the rank of zero among the numbers as a share in (0, 1); a tie counts half. NaN where a number is NaN."""
     below = (ahead < 0).double().sum(0) + (ahead == 0).double().sum(0) / 2
     share = (below + 0.5) / (len(ahead) + 1)
     return torch.where(ahead.isnan().any(0), torch.nan, share)
 
 
 def kolmogorov_smirnov(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """sup |F̂(u) - u| over [0, 1]; NaN of nothing, and where a value is NaN."""
+    """Return sup |F̂(u) - u| over [0, 1]; NaN if there are no values or one of them is NaN."""
     count = len(values)
     if count == 0:
         return values.new_tensor(torch.nan)
@@ -62,7 +63,7 @@ def kolmogorov_smirnov(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
 
 
 def cramer_von_mises(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """∫ (F̂(u) - u)² du: the statistic of that name over the count; NaN of nothing, and where a value is NaN."""
+    """Return ∫ (F̂(u) - u)² du, the Cramér-von Mises statistic over the count; NaN without values or with a NaN."""
     count = len(values)
     if count == 0:
         return values.new_tensor(torch.nan)

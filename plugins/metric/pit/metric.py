@@ -19,25 +19,26 @@ if TYPE_CHECKING:
 
 
 class PIT(Metric, Pictured):
-    """Probability integral transform (PIT): F(y) of each number, which is uniform on [0, 1] of a calibrated forecaster.
+    """Probability integral transform (PIT) F(y) of each number of the target; it is uniform if forecasts are
+    calibrated.
 
     - `pit_ks`: largest distance of the distribution of F(y) from uniform (Kolmogorov-Smirnov), in [0, 1].
-    - `pit_cvm`: mean squared distance of the same (Cramér-von Mises).
-    - `pit_mean`: ½ where forecasts are unbiased; above, where targets lie higher.
-    - `pit_spread`: 12 times the mean square of F(y) - ½: 1 where calibrated, above 1 where densities are too narrow,
-      below 1 where they are too broad.
+    - `pit_cvm`: mean squared distance of the distribution of F(y) from uniform (Cramér-von Mises).
+    - `pit_mean`: mean of F(y). It is ½ where forecasts are unbiased and higher where targets lie above the forecasts.
+    - `pit_spread`: 12 times the mean square of F(y) - ½. It is 1 where forecasts are calibrated, above 1 where
+      densities are too narrow, and below 1 where they are too broad.
 
-    The numbers of a target are taken each by its marginal density, and together. Angles are counted from the antipode
-    of the density's mean direction, counter-clockwise. The picture is the histogram with the band that holds each bin
-    of a calibrated forecaster with probability 0.95.
+    Each number of a target is transformed by its marginal density, and the transforms of all numbers are pooled. Angles
+    are counted from the antipode of the density's mean direction, counter-clockwise. The figure is the histogram of
+    F(y) with the band that holds each bin of a calibrated forecaster with probability 0.95.
 
     Args:
-        bins: of the histogram.
+        bins: number of bins of the histogram.
         samples: draws for a density whose distribution function is not known.
 
     Raises:
         ConfigError: the target is made of classes.
-        UserError: transforms that are NaN; says how many.
+        UserError: transforms are NaN; the message says how many.
     """
 
     bibtex = """@article{diebold1998evaluating,

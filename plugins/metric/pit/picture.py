@@ -1,4 +1,4 @@
-"""The PIT histogram."""
+"""Figure of the PIT histogram."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,11 +8,14 @@ from framework.figures.style import BLUE, GREY, titled_figure
 
 
 def histogram(values: np.ndarray, bins: int, numbers: int, title: str, *, synthetic: bool) -> Figure:
-    """Share of targets by the mass of their density below them, over that of a calibrated forecaster.
+    """Return the histogram of F(y), scaled so that a calibrated forecaster's density is 1.
 
     Args:
         values: F(y), (count,).
-        numbers: of a target, pooled in `values`.
+        bins: number of bins of equal width.
+        numbers: how many numbers of a target are pooled in `values`.
+        title: title of the figure.
+        synthetic: whether the data are synthetic, which the figure then says.
     """
     figure = titled_figure((6.0, 4.2), title, synthetic)
     axes = figure.subplots()

@@ -1,1 +1,1 @@
-"""Whether predicted images say how far off each pixel may be."""
+"""Calibration of the uncertainty that is predicted for each pixel of an image."""

@@ -1,4 +1,4 @@
-"""Of the numbers of an image: central intervals that hold them, and ranks of errors against predicted scales."""
+"""Coverage of central intervals of an image's numbers, and rank correlation of errors with predicted scales."""
 
 from typing import NamedTuple
 
@@ -12,19 +12,25 @@ from framework.errors import UserError
 
 
 class Transform(NamedTuple):
-    """F just below each stored number and just above it, (*batch, *event), float64: its probability integral transform
-    is any number between the two."""
+    """F just below and just above each stored number, (*batch, *event), float64.
+
+    The probability integral transform of a rounded number is any number between the two.
+    """
 
     low: Tensor
     high: Tensor
 
 
 def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
-    """A stored number stands for all that are rounded to it: half a step to either side, at 0 and 1 all beyond.
+    """Return the distribution function at both ends of the interval that is rounded to each stored number.
+
+    A stored number stands for all numbers that are rounded to it: half a step to either side, and everything beyond at
+    0 and 1.
 
     Args:
+        density: a density whose distribution function is known for each number.
         value: (*batch, *event), in [0, 1].
-        steps: between 0 and 1; 0: nothing was rounded.
+        steps: number of steps of the stored numbers between 0 and 1; 0 if nothing was rounded.
 
     Raises:
         UserError: the density knows no distribution function of each number.
@@ -43,11 +49,11 @@ def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
 
 
 def coverage(found: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, "level"]:
-    """Share of the numbers in their central intervals of each mass; NaN of no number.
+    """Return the share of the numbers in their central intervals of each mass; NaN without numbers.
 
-    A number counts with the probability that one drawn evenly between `low` and `high` lies in the interval of
-    transforms (1 ± level) / 2: then nothing need be drawn (the nonrandomized transform of Czado, Gneiting & Held 2009,
-    eq. 2), and where densities are those of the truth before it was rounded the share is the level.
+    A number counts with the probability that a number drawn uniformly between `low` and `high` lies in the interval of
+    transforms (1 ± level) / 2. Nothing need be drawn (the nonrandomized transform of Czado, Gneiting & Held 2009, eq.
+    2), and where the densities are those of the truth before it was rounded, the share is the level.
     """
     low, high = (part.flatten() for part in found)
     width = high - low
@@ -61,12 +67,14 @@ def coverage(found: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, 
 
 
 def rank_correlation(one: Float[Tensor, "count"], other: Tensor) -> Float[Tensor, ""]:
-    """Spearman's: Pearson's correlation of the ranks, ties sharing their mean; NaN where either is constant."""
+    """Return Spearman's correlation: Pearson's correlation of the ranks, ties sharing their mean; NaN where one is
+    constant.
+    """
     first, second = (part - part.mean() for part in (ranks(one), ranks(other)))
     return (first * second).sum() / (first.square().sum() * second.square().sum()).sqrt()
 
 
 def ranks(values: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
-    """From 1, float64; equal values have the mean of theirs."""
+    """Return the ranks from 1, float64; equal values have the mean of their ranks."""
     _, place, count = values.unique(return_inverse=True, return_counts=True)
     return (count.cumsum(0) - (count - 1).double() / 2)[place]

@@ -1,4 +1,4 @@
-"""Calibration of densities over images, number by number, and whether their scales tell where errors are."""
+"""Calibration of densities over images, number by number, and correlation of predicted scales with errors."""
 
 import math
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -20,36 +20,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LEVELS = 19
-"""Nominal masses 0.05, 0.10, ..., 0.95."""
+"""Number of nominal masses 0.05, 0.10, ..., 0.95."""
 KEPT = 8
-"""Images that are kept beside the least and the most certain: the one next to the median of all is shown."""
+"""Number of random images kept beside the least and the most certain; the one closest to the median is shown."""
 
 
 class PixelUncertainty(Metric, Pictured):
-    """Whether the pixels of images lie in their intervals, and whether the widest are the most wrong.
+    """Coverage of the predicted intervals of pixels, and rank correlation of errors with predicted scales.
 
-    Each image is judged by itself; then means over images, with standard errors:
+    Each image is judged by itself; the results are means over images, with standard errors:
 
     - `pixel_coverage_90`: share of numbers between their 5 % and 95 % quantiles.
     - `pixel_coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
-    - `spearman`: rank correlation of the pixels' mean |error|, of the point prediction rounded as files are, and their
-      root mean variance; exact, within an image, so that no image counts for being harder than another; NaN where one
-      scale stands for all pixels.
+    - `spearman`: rank correlation, over the pixels of an image, of the mean |error| with the predicted root mean
+      variance. The error is of the point prediction, rounded as files are. The correlation is exact, and taken within
+      an image so that a harder image has no more weight than an easier one; it is NaN where all pixels have one scale.
     - `pixel_scale`: mean over pixels of that root mean variance.
 
-    Each is over the frame and, with `_masked`, over the pixels of the true mask. **Read those inside.** Background that
-    is exactly white flatters the frame twice: its small scales and small errors go together, and a number that is 1 in
-    the file may have been anything from there up: of a density that puts all its mass there every number between 0
-    and 1 is a transform, and each interval holds it with just its own mass. So it is calibrated, and tells nothing.
+    Each is over the full frame and, with `_masked`, over the pixels of the true mask. **Read the masked numbers.** A
+    background that is exactly white makes those of the frame too good in two ways. Its small scales and small errors go
+    together. And a number that is 1 in the file may stand for any higher number: for a density that puts all its mass
+    there, every transform between 0 and 1 is possible, and each interval holds the number with exactly its own mass.
+    Such a density is calibrated, but tells nothing.
 
     Args:
-        steps: of the stored numbers, which are on a grid; 0: they are not.
-        masked: also inside the true mask, which batches then need.
+        steps: number of steps of the stored numbers' grid between 0 and 1; 0 if they are not on a grid.
+        masked: also compute the numbers inside the true mask, which batches must then have.
 
     Raises:
-        ConfigError: the target is no image.
-        DataError: batches without a mask.
-        UserError: a density without a distribution function, or a variance, of each number; transforms that are NaN.
+        ConfigError: the target is not an image.
+        DataError: batches have no mask.
+        UserError: a density has no distribution function, or no variance, of each number; or transforms are NaN.
     """
 
     bibtex = """@article{czado2009predictive,
@@ -85,7 +86,7 @@ class PixelUncertainty(Metric, Pictured):
         self.regions = ("", "_masked") if masked else ("",)
         self.columns = {key: name for key, name in self.columns.items() if masked or "masked" not in key}  # type: ignore[misc]
         self.better = {key: way for key, way in self.better.items() if key in self.columns}  # type: ignore[misc]
-        # (image, region × (level + 2)); of images kept (1, scale and index), (1, height, width, 2 · number + 2)
+        # shapes: (image, region × (level + 2)); each kept image: (1, 2), (1, height, width, 2 · number + 2)
         for name in ("numbers", "facts", "panels"):
             self.add_state(name, [], dist_reduce_fx="cat")
 
@@ -103,7 +104,9 @@ class PixelUncertainty(Metric, Pictured):
         refuse_nan(
             (found.low + found.high).sum((1, 2, 3)) + scale.sum((1, 2)), "images' transforms and scales"
         )
-        if self.steps:  # as a file would hold it: no error is smaller than what rounding hides
+        if (
+            self.steps
+        ):  # round the prediction as a file would, so that it has no error smaller than the rounding
             point = (point.clamp(0, 1) * self.steps).round() / self.steps
         error = (point - true).abs().mean(-1)
         everywhere = torch.ones_like(true[..., 0], dtype=torch.bool)
@@ -155,7 +158,7 @@ class PixelUncertainty(Metric, Pictured):
         return sheet(shown, self._levels().cpu().numpy(), shares, len(numbers), title, synthetic=synthetic)
 
     def _seen(self) -> dict[str, Tensor]:
-        """The numbers of every image, (image, level + 2), by region."""
+        """Return the numbers of every image, (image, level + 2), by region."""
         width = LEVELS + 2
         seen = dim_zero_cat(self.numbers) if len(self.numbers) else self._levels().new_zeros(0, 2 * width)
         return dict(zip(self.regions, seen.split(width, 1), strict=False))
@@ -165,15 +168,21 @@ class PixelUncertainty(Metric, Pictured):
 
 
 def with_error(name: str, each: Float[Tensor, "image"]) -> dict[str, Tensor]:
-    """Mean and standard error over the images that have the number."""
+    """Return mean and standard error over the images that have the number."""
     known = each[~each.isnan()]
     error = known.std() / math.sqrt(len(known)) if len(known) > 1 else known.new_tensor(math.nan)
     return {name: known.mean(), f"{name}_sem": error}
 
 
 def kept(facts: Float[Tensor, "image 2"]) -> list[int]:
-    """Which of images with (scale, index) may have to be shown: the least, the largest, and KEPT at random, the same
-    ones in whatever order they came. None without a scale."""
+    """Return the places of the images that may have to be shown, in ascending order.
+
+    They are the image with the smallest scale, that with the largest, and KEPT images at random; the choice does not
+    depend on the order of the images. Images without a scale (NaN) are left out.
+
+    Args:
+        facts: scale and index of each image.
+    """
     told = facts.tolist()
     known = sorted((at for at, (scale, _) in enumerate(told) if scale == scale), key=told.__getitem__)
     random = sorted(

@@ -1,4 +1,4 @@
-"""Images with their errors and predicted scales side by side, and empirical against nominal coverage."""
+"""Figure of images with their errors and predicted scales, and of empirical against nominal coverage."""
 
 from collections.abc import Mapping
 
@@ -8,7 +8,7 @@ from matplotlib.figure import Figure, SubFigure
 from framework.figures.style import BLUE, GREY, RED, titled_figure
 
 WIDTH = 2.3
-"""Of a panel, inches."""
+"""Width of a panel, inches."""
 
 
 def sheet(
@@ -20,13 +20,17 @@ def sheet(
     *,
     synthetic: bool,
 ) -> Figure:
-    """A row for each caption, with one bar of colours for all errors and one for all scales; below the coverage.
+    """Return a figure with one row of panels for each image and the coverage curve below.
+
+    All errors share one colour bar, and all scales share another.
 
     Args:
-        panels: (height, width, 2 · number + 2): truth, point prediction, error and scale of each pixel.
+        panels: caption → (height, width, 2 · number + 2): truth, point prediction, error and scale of each pixel.
         levels: masses, ascending in (0, 1).
-        shares: of numbers in intervals of those masses, by region.
-        count: of images.
+        shares: region → share of numbers in the intervals of those masses.
+        count: number of images.
+        title: title of the figure.
+        synthetic: whether the data are synthetic, which the figure then says.
     """
     tall = [min(WIDTH * one.shape[0] / one.shape[1], 2 * WIDTH) for one in panels.values()]
     below = 3.2
@@ -61,7 +65,7 @@ def _images(figure: SubFigure, panels: Mapping[str, np.ndarray], tall: list[floa
     ):
         axes.set_title(heading, fontsize=10)
     for column, place in ((2, -2), (3, -1)):
-        # a few pixels beyond the bar's end would darken all others
+        # the bar ends at a percentile: if it reached a few extreme pixels, all others would be dark
         most = max(float(np.percentile(np.stack([one[..., place] for one in every]), 99.5)), 1e-3)
         for axes, one in zip(grid[:, column], every, strict=True):
             shown = axes.imshow(one[..., place], cmap="magma", vmin=0, vmax=most)
@@ -70,7 +74,7 @@ def _images(figure: SubFigure, panels: Mapping[str, np.ndarray], tall: list[floa
     for line, (caption, one) in zip(grid, panels.items(), strict=True):
         number = one.shape[-1] // 2 - 1
         for axes, image in zip(line, (one[..., :number], one[..., number : 2 * number]), strict=False):
-            # of other than three channels the first, in grey
+            # an image that does not have three channels is shown by its first channel, in grey
             picture = image.clip(0, 1) if number == 3 else image[..., 0]
             axes.imshow(picture, cmap="gray", vmin=0, vmax=1)
         line[0].set_ylabel(caption, fontsize=9)

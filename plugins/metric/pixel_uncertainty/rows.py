@@ -1,4 +1,4 @@
-"""Rows of the contract: small pictures, with a mask and without."""
+"""Rows of the contract: small images, with a mask and without."""
 
 import torch
 
@@ -9,7 +9,7 @@ COLOURED = Target("image", ("red", "green", "blue"), size=(6, 5))
 
 
 def masks(count: int) -> torch.Tensor:
-    """Another one for each image; the last is empty."""
+    """Return a different mask for each image; the last one is empty."""
     mask = torch.arange(30).view(6, 5) % (2 + torch.arange(count).view(-1, 1, 1) % 3) == 0
     return mask & (torch.arange(count) < count - 1).view(-1, 1, 1)
 

@@ -1,1 +1,1 @@
-"""How often prediction sets hold the target, and how large they are."""
+"""Coverage and size of prediction sets."""

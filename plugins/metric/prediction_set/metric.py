@@ -14,16 +14,16 @@ from framework.target import Target
 
 
 class PredictionSetMetric(Metric):
-    """How often the predicted set holds the target, how large it is, and how often it is empty.
+    """Coverage and mean size of the predicted sets, and the share of empty sets.
 
     - `set_coverage`: share of targets in their sets, with its standard error; 1 - miscoverage is best.
-    - `set_size`: mean number of labels; of reals mean length or volume in the target's unit; of several angles volume
-      in radians to their number. Of one angle `set_size_deg`, mean length of the arcs, degrees. Infinite where a set
-      is unbounded.
-    - `set_empty`: share of empty sets, which say that the input is like nothing known.
+    - `set_size`: mean number of labels; for reals the mean length or volume in the target's unit; for several angles
+      the mean volume in radians to the power of their number. For one angle it is `set_size_deg`, the mean length of
+      the arcs in degrees. It is infinite where a set is unbounded.
+    - `set_empty`: share of empty sets. An empty set says that the input is unlike the calibration data.
 
     Raises:
-        UserError: the predicted densities have no sets, or are NaN (the samples are named).
+        UserError: the predicted densities have no sets, or are NaN (the message names the samples).
     """
 
     bibtex = """@book{vovk2005algorithmic,
@@ -80,7 +80,7 @@ class PredictionSetMetric(Metric):
         coverage = self.covered / self.count
         return {
             "set_coverage": coverage,
-            # of a share p of n: sqrt(p (1 - p) / (n - 1)), unbiased in its square
+            # the standard error of a share p of n is sqrt(p (1 - p) / (n - 1)); its square is unbiased
             "set_coverage_sem": (coverage * (1 - coverage) / (self.count - 1)).sqrt()
             if self.count > 1
             else coverage.new_tensor(math.nan),

@@ -1,5 +1,7 @@
-"""Rows of the contract. Its densities have no sets: what needs them is shown in test_prediction_set_metric.py, by the
-same checks on sets."""
+"""Rows of the contract.
+
+The contract's densities have no sets: test_prediction_set_metric.py runs the checks that need them, on sets.
+"""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

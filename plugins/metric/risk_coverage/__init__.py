@@ -1,1 +1,1 @@
-"""Selective prediction: risk against coverage."""
+"""Selective prediction: error against the share of predictions that are kept."""

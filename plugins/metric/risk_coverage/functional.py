@@ -1,4 +1,4 @@
-"""Risk-coverage curves whose ties are averaged over their orders."""
+"""Risk-coverage curves, averaged over the orders of equally confident predictions."""
 
 import math
 
@@ -8,10 +8,10 @@ from torch import Tensor
 
 
 def curve(confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
-    """Mean risk of the k most confident, k = 1 ... n, in expectation over the orders of equally confident ones.
+    """Return the mean risk of the k most confident predictions, k = 1 ... n, averaged over the orders of ties.
 
-    Of a run of ties that starts after a samples of summed risk A and has mean risk g, any j have summed risk j·g in
-    expectation: the mean risk of a + j is (A + j·g)/(a + j).
+    If a run of ties starts after a samples of summed risk A and has mean risk g, any j of the run have summed risk j·g
+    in expectation; the mean risk of the first a + j is then (A + j·g)/(a + j).
     """
     count = len(risk)
     risk = risk.double()
@@ -22,14 +22,17 @@ def curve(confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"]) -> F
 
 
 def area(curve: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """Under the curve: its mean over the coverages 1/n, ..., 1 (Geifman, Uziel & El-Yaniv 2019, eq. 3); NaN of none."""
+    """Return the area under the curve: the mean over coverages 1/n, ..., 1 (Geifman, Uziel & El-Yaniv 2019, eq. 3).
+
+    It is NaN without predictions.
+    """
     return curve.mean()
 
 
 def at_coverage(curve: Float[Tensor, "count"], coverage: float) -> Float[Tensor, ""]:
-    """Risk of the smallest number of samples that is at least that share; NaN of none."""
+    """Return the risk of the smallest number of predictions that is at least the given share; NaN if there are none."""
     if len(curve) == 0:
         return curve.new_tensor(torch.nan)
-    # 0.95 · 20 is 19, whatever the binary fraction nearest 0.95 says
+    # 0.95 · 20 must give 19, although 0.95 has no exact binary fraction
     kept = math.ceil(coverage * len(curve) - 1e-9)
     return curve[max(kept, 1) - 1]

@@ -1,4 +1,4 @@
-"""Selective prediction: what error remains when the least confident predictions are left out."""
+"""Selective prediction: the error that remains when the least confident predictions are left out."""
 
 import math
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -23,27 +23,28 @@ RISKS = {
     "real": ("", "mean absolute error"),
     "angle": ("_deg", "mean angular deviation (°)"),
 }
-"""Kind of target → suffix of the keys, and what the risk is."""
+"""Kind of target → suffix of the keys, and name of the risk."""
 
 
 class RiskCoverage(Metric, Pictured):
     """Error of the most confident share of predictions, against that share.
 
-    The risk is the error rate of classes, the mean absolute error of reals (in their unit, over the numbers of a
-    target) and the mean angular deviation of angles in degrees: then the keys end in `_deg`.
+    The risk is the error rate for classes, the mean absolute error for reals (in their unit, over the numbers of a
+    target), and the mean angular deviation in degrees for angles, for which the keys end in `_deg`.
 
-    - `aurc`: area under the curve: mean risk over all shares.
-    - `e_aurc`: how much of it a perfect order of confidence would save; 0 where mistakes are the least confident.
+    - `aurc`: area under the curve, the mean risk over all shares.
+    - `e_aurc`: the part of it that a perfect order of confidence would save; 0 where the mistakes are the least
+      confident.
     - `risk_80`, `risk_95`: risk of the most confident 80 % and 95 %.
 
-    Equally confident predictions count by their mean risk, so that their order is no matter.
+    Equally confident predictions count by their mean risk, so that their order has no effect.
 
     Args:
-        confidence: "entropy": minus the predictive entropy; "mode": the (log-)probability of the mode.
+        confidence: "entropy" for minus the predictive entropy; "mode" for the (log-)probability of the mode.
 
     Raises:
-        ConfigError: targets are images.
-        UserError: confidences or errors that are NaN; says how many.
+        ConfigError: the targets are images.
+        UserError: confidences or errors are NaN; the message says how many.
     """
 
     bibtex = """@inproceedings{geifman2017selective,

@@ -1,4 +1,4 @@
-"""The risk-coverage curve."""
+"""Figure of the risk-coverage curve."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,12 +9,14 @@ from framework.figures.style import BLUE, GREEN, GREY, titled_figure
 def risk_coverage(
     own: np.ndarray, oracle: np.ndarray, risk_name: str, title: str, *, synthetic: bool
 ) -> Figure:
-    """Risk of the most confident share of predictions, against that share.
+    """Return a figure of the risk of the most confident share of predictions, against that share.
 
     Args:
-        own: mean risk of the k most confident, k = 1 ... n.
-        oracle: the same in order of the risk itself.
-        risk_name: what stands at the axis, with its unit.
+        own: mean risk of the k most confident predictions, k = 1 ... n.
+        oracle: mean risk of the k predictions of least risk, k = 1 ... n.
+        risk_name: label of the risk axis, with its unit.
+        title: title of the figure.
+        synthetic: whether the data are synthetic, which the figure then says.
     """
     figure = titled_figure((6.0, 4.4), title, synthetic)
     axes = figure.subplots()

@@ -1,1 +1,1 @@
-"""The predicted azimuth density against the known symmetry of the object."""
+"""Comparison of the predicted azimuth density with the known symmetry of the object."""

@@ -1,4 +1,4 @@
-"""The azimuth density against what is truly known of the azimuth of a symmetric object."""
+"""Comparison of the predicted azimuth density with the true posterior of the azimuth of a symmetric object."""
 
 import math
 from typing import Annotated, ClassVar, Literal
@@ -20,31 +20,31 @@ CHUNK = 16  # azimuths evaluated at once: CHUNK × batch × components numbers s
 
 
 class TruePosterior(Metric):
-    """How the predicted azimuth density agrees with the known symmetry of the object.
+    """Agreement of the predicted azimuth density with the known symmetry of the object.
 
-    Reads the batch field "symmetry", int64: 1 for an object without symmetry; n ≥ 2 where the azimuth is
-    known only up to 2π/n, so that the true posterior has n modes, at the annotated azimuth + 2πk/n, of mass
-    1/n each; 0 where the object looks the same from all sides and the true posterior is uniform.
+    The metric reads the batch field "symmetry", int64. It is 1 for an object without symmetry. It is n ≥ 2 where the
+    azimuth is known only up to 2π/n, so that the true posterior has n modes, at the annotated azimuth + 2πk/n, of mass
+    1/n each. It is 0 where the object looks the same from all sides and the true posterior is uniform.
 
     - `azimuth_entropy`: mean entropy of the azimuth, nats, over all samples.
     - `mode_mass_<k>_of_<n>`: mass within ±π/(2n) of mode k, mean over the samples with n modes; 1/n is best.
-    - `mode_mass_min`: the smallest of those means: near 0 when a mode is missed. 1/(largest n) is best.
+    - `mode_mass_min`: the smallest of those means. It is near 0 when a mode is missed; 1/(largest n) is best.
     - `uniform_gap`: log 2π minus the entropy, nats, mean over the samples with symmetry 0; 0 is best.
 
-    Each is NaN where no sample speaks of it. Integrals are sums over `points` equally spaced azimuths, so a
-    sample costs that many evaluations of the azimuth marginal, and nothing of the other angles. A density
-    so narrow that the grid misses it (its sum there is not 1 within 1e-4) is judged from
-    `prediction.samples` draws.
+    Each result is NaN where no sample has the symmetry that it is about. Integrals are sums over `points` equally
+    spaced azimuths, so a sample costs that many evaluations of the azimuth marginal, and none of the other angles. A
+    density that is too narrow for the grid (its sum there is not 1 within 1e-4) is judged from `prediction.samples`
+    draws.
 
     Args:
-        target: with an angle called azimuth.
-        points: azimuths on the grid; resolves concentrations up to points²/40.
-        largest_symmetry: the largest n the metric keeps apart.
+        target: a target with an angle called azimuth.
+        points: number of azimuths on the grid; the grid resolves concentrations up to points²/40.
+        largest_symmetry: the largest n that is accepted in the field "symmetry".
 
     Raises:
-        ConfigError: no azimuth in the target; at the first update, no "symmetry" in the data.
-        DataError: a symmetry below 0 or above `largest_symmetry`.
-        UserError: entropies that are NaN; says how many.
+        ConfigError: the target has no azimuth; or, at the first update, the data have no field "symmetry".
+        DataError: a symmetry is below 0 or above `largest_symmetry`.
+        UserError: entropies are NaN; the message says how many.
     """
 
     bibtex = """@inproceedings{prokudin2018deep,
@@ -90,7 +90,7 @@ class TruePosterior(Metric):
         self.add_state("count", zero, dist_reduce_fx="sum")
         self.add_state("entropy", zero.clone(), dist_reduce_fx="sum")
         self.add_state("gap", zero.clone(), dist_reduce_fx="sum")
-        # by symmetry n, and by n and mode k
+        # `samples_with` is indexed by symmetry n, `mass` by n and mode k
         self.add_state("samples_with", zero.new_zeros(rows), dist_reduce_fx="sum")
         self.add_state("mass", zero.new_zeros(rows, self.largest), dist_reduce_fx="sum")
 
@@ -152,12 +152,14 @@ def entropy_and_mode_mass(
     points: int,
     samples: int,
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch modes"]]:
-    """Entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, column k < n.
+    """Return the entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, column k <
+    n.
 
-    The trapezium rule on the circle; a grid cell that a window's edge cuts counts with the part inside.
+    Both are integrated by the trapezium rule on the circle. A grid cell that is cut by a window's edge counts with the
+    part inside.
     """
     step = 2 * math.pi / points
-    # around the annotated azimuth, so that windows and modes lie alike on every sample's grid
+    # the grid starts at the annotated azimuth, so that windows and modes lie at the same grid points for every sample
     relative = grid(points, dtype=torch.float64, device=azimuth.device)
     angles = wrap(azimuth.double() + relative.unsqueeze(-1)).to(azimuth.dtype)
     angles = angles.unsqueeze(-1)  # (points, batch, 1)

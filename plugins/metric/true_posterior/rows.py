@@ -1,4 +1,4 @@
-"""Rows of the contract: objects without, with twofold and with full symmetry."""
+"""Rows of the contract: objects without symmetry, with twofold symmetry and with full symmetry."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from framework.testing.rows import MetricRow
 
 
 def symmetry(count: int) -> Tensor:
-    """0, 1, 2 in turn."""
+    """Return the symmetries 0, 1, 2 in turn."""
     return torch.arange(count) % 3
 
 

@@ -1,1 +1,1 @@
-"""How far predicted vertices are from the true ones, and correspondences through them from where they should be."""
+"""Distances of predicted vertices from the true ones, and errors of the correspondences that predicted meshes give."""

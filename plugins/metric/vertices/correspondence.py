@@ -1,4 +1,4 @@
-"""Dense correspondences between scans through registered templates, and how far off they are."""
+"""Errors of dense correspondences between scans through registered templates."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,10 @@ from framework.geometry.nearest import nearest
 
 
 class Correspondence(NamedTuple):
-    """Mean error over pairs of different scans of one person, and of two people, centimetres; NaN without any."""
+    """Mean errors in centimetres over pairs of different scans: of one person (intra) and of two people (inter).
+
+    Each is NaN where there is no such pair.
+    """
 
     intra_cm: Tensor
     inter_cm: Tensor
@@ -21,21 +24,21 @@ def correspondence(
     registered: Float[Tensor, "scan vertex 3"],
     subject: Int[Tensor, "scan"],
 ) -> Correspondence:
-    """Errors of all ordered pairs of scans.
+    """Return the errors of the correspondences between all ordered pairs of scans.
 
-    A point of one scan goes to the nearest vertex of the template registered to it, the same vertex of the template
-    registered to the other scan is where it is thought to be there, and the error is the distance from there to where
-    it is (Bogo et al. 2014, §5; thesis §6.5.2).
+    A point of one scan is assigned to the nearest vertex of the template registered to that scan. Its predicted place
+    on the other scan is the same vertex of the template registered to the other scan. The error is the distance from
+    that predicted place to the true one (Bogo et al. 2014, §5; thesis §6.5.2).
 
     Args:
         truth: points that correspond across scans, metres: vertices of the true registrations, which lie on the scans.
-        registered: predicted meshes, metres, of any one topology.
-        subject: who each scan is of.
+        registered: predicted meshes, metres, all of one topology, which may be any.
+        subject: number of the person on each scan.
     """
     place = nearest(registered.float(), truth.float()).index
     total, count = torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     for one in range(len(truth)):
-        # (scan, point, 3): where every other scan's template has those vertices
+        # (scan, point, 3): places of those vertices on the template of every scan
         thought = registered[:, place[one]].double()
         error = 100 * torch.linalg.vector_norm(thought - truth.double(), dim=-1).mean(1)
         for kind, same in enumerate((True, False)):

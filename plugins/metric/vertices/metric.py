@@ -16,7 +16,7 @@ from framework.target import Target
 from plugins.metric.vertices.correspondence import correspondence
 
 BINS, LOWEST, HIGHEST = 2_000, 1e-4, 1e4
-"""Of the histogram of distances, centimetres: equal steps of the logarithm, 0.9 % each."""
+"""Number of bins and limits (centimetres) of the histogram of distances: equal steps of the logarithm, 0.9 % each."""
 FAUST = """@inproceedings{bogo2014faust,
   title = {{FAUST}: Dataset and Evaluation for {3D} Mesh Registration},
   author = {Bogo, Federica and Romero, Javier and Loper, Matthew and Black, Michael J.},
@@ -28,12 +28,13 @@ FAUST = """@inproceedings{bogo2014faust,
 class VertexError(Mean):
     """Euclidean distance between predicted and true vertices, centimetres (thesis §6.5.2).
 
-    The target is x, y, z of each vertex in turn; a batch's "scale" (batch,), metres per unit of the target, leads to
-    centimetres. Each body's mean over its vertices is averaged over bodies, with its standard error; median and 95th
-    percentile are those of all vertices of all bodies, from a histogram and so to 1 %.
+    The target is x, y, z of each vertex in turn. The batch field "scale" (batch,), in metres per unit of the target,
+    converts distances to centimetres. Each body's mean over its vertices is averaged over bodies and has a standard
+    error over bodies. Median and 95th percentile are over all vertices of all bodies; they come from a histogram and
+    are therefore exact to 1 %.
 
     Raises:
-        ConfigError: the target is no vertices.
+        ConfigError: the target is not made of vertices.
         DataError: a batch has no "scale".
     """
 
@@ -69,14 +70,14 @@ class VertexError(Mean):
 
 
 class CorrespondenceError(Metric):
-    """Error of correspondences through predicted meshes, centimetres, over all ordered pairs of test scans (Table 6.4).
+    """Error of correspondences through predicted meshes, cm, over all ordered pairs of test scans (Table 6.4).
 
-    `intra_cm` is of scans of one person, `inter_cm` of two people; the target is the true registration. Holds every
-    predicted and true mesh until the end.
+    `intra_cm` is the mean over pairs of scans of one person, `inter_cm` over pairs of two people. The target is the
+    true registration. The metric holds every predicted and true mesh until the end.
 
     Raises:
-        ConfigError: the target is no vertices.
-        DataError: a batch without "centre", "scale" or "subject".
+        ConfigError: the target is not made of vertices.
+        DataError: a batch has no "centre", "scale" or "subject".
     """
 
     bibtex = FAUST
@@ -111,7 +112,11 @@ class CorrespondenceError(Metric):
 
 
 def require_vertices(target: Target, name: str) -> None:
-    """Refuse a target that is not x, y, z of every vertex; raises ConfigError."""
+    """Refuse a target that is not x, y, z of every vertex.
+
+    Raises:
+        ConfigError: the target is not of reals, or their number is not a multiple of 3.
+    """
     target.require("real", by=f"metric {name}")
     if len(target.names) % 3:
         raise ConfigError(
@@ -121,7 +126,16 @@ def require_vertices(target: Target, name: str) -> None:
 
 
 def fields(prediction: Prediction, name: str, wanted: Mapping[str, str]) -> list[Tensor]:
-    """The fields of a batch that a metric reads, given with what they mean; DataError where one is not there."""
+    """Return the batch fields that a metric reads, in the order of `wanted`.
+
+    Args:
+        prediction: the prediction whose batch is read.
+        name: name of the metric, for the message.
+        wanted: field name → its meaning, for the message.
+
+    Raises:
+        DataError: the batch has no such field.
+    """
     for field, meaning in wanted.items():
         if field not in prediction.batch:
             raise DataError(
@@ -134,13 +148,16 @@ def fields(prediction: Prediction, name: str, wanted: Mapping[str, str]) -> list
 def distances(
     point: Float[Tensor, "batch number"], target: Float[Tensor, "batch number"], scale: Float[Tensor, "batch"]
 ) -> Float[Tensor, "batch vertex"]:
-    """Of each vertex, centimetres, float64."""
+    """Return the distance of each predicted vertex from the true one, centimetres, float64."""
     gap = (point.double() - target.double()).unflatten(1, (-1, 3))
     return 100 * scale.double()[:, None] * torch.linalg.vector_norm(gap, dim=-1)
 
 
 def bins(distance: Float[Tensor, "batch vertex"]) -> Tensor:
-    """The bin of each; what is nearer or further than the histogram reaches is in the first or last; NaN too."""
+    """Return the histogram bin of each distance.
+
+    Distances beyond the limits of the histogram are counted in its first or last bin, NaN in the last.
+    """
     place = (distance.clamp(min=LOWEST) / LOWEST).log() * (
         BINS / torch.tensor(HIGHEST / LOWEST).double().log()
     )
@@ -148,7 +165,9 @@ def bins(distance: Float[Tensor, "batch vertex"]) -> Tensor:
 
 
 def quantile(histogram: Float[Tensor, "bins"], share: float) -> Float[Tensor, ""]:
-    """The middle of the bin below whose upper end this share of all lies; 0 of the first bin, NaN of nothing."""
+    """Return the middle of the bin in which the cumulated share is reached; 0 for the first bin, NaN of an empty
+    histogram.
+    """
     total = histogram.sum()
     place = torch.searchsorted(histogram.cumsum(0), share * total).clamp(max=BINS - 1)
     middle = LOWEST * (HIGHEST / LOWEST) ** ((place.double() + 0.5) / BINS)

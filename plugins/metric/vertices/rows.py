@@ -1,4 +1,4 @@
-"""Rows of the contract: meshes of one vertex, of four, and of five in scans of three people."""
+"""Rows of the contract: meshes of one vertex, of four, and of five vertices in scans of three people."""
 
 import torch
 from torch import Tensor

@@ -1,1 +1,1 @@
-"""Viewpoint accuracy and median error on the rotation of the object."""
+"""Viewpoint accuracy and median error of the rotation of the object."""

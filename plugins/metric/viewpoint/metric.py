@@ -1,4 +1,4 @@
-"""Acc_π/6 and MedErr of Tulsiani & Malik (2015) on the geodesic distance between rotations."""
+"""Viewpoint accuracy Acc_π/6 and median error MedErr of Tulsiani & Malik (2015), by geodesic distance of rotations."""
 
 import math
 from typing import ClassVar, Literal
@@ -19,9 +19,9 @@ ANGLES = ("azimuth", "elevation", "tilt")
 class Viewpoint(Metric):
     """Acc_π/6 and MedErr: share within 30° of the true rotation, and the median error in degrees.
 
-    Both on Δ(R₁, R₂) = ||log(R₁ᵀR₂)||_F / √2 between the rotation matrices of the true and the predicted
-    viewpoint (Tulsiani & Malik 2015; thesis Table 3.3). The median of an even number of errors is the mean
-    of the middle two.
+    Both use the distance Δ(R₁, R₂) = ||log(R₁ᵀR₂)||_F / √2 between the rotation matrices of the true and the predicted
+    viewpoint (Tulsiani & Malik 2015; thesis Table 3.3). The median of an even number of errors is the mean of the
+    middle two.
 
     Raises:
         ConfigError: the target is not the three angles azimuth, elevation and tilt.
@@ -65,7 +65,7 @@ class Viewpoint(Metric):
 
 
 def _median(values: Tensor) -> Tensor:
-    """Mean of the middle two; NaN of nothing, or where one value is NaN."""
+    """Return the median, the mean of the middle two for an even count; NaN without values or where one value is NaN."""
     if len(values) == 0 or values.isnan().any():
         return values.new_tensor(torch.nan)
     ordered, count = values.sort().values, len(values)
