@@ -16,14 +16,13 @@ Channels = Annotated[int, Field(gt=0)]
 class BiternionVGG(Encoder):
     """Six 3×3 convolutions with batch norm and one fully connected layer, for small images.
 
-    The layers are those of Beyer et al. 2015: convolutions without padding, each followed by batch norm;
-    2×2 max-pooling after every second convolution but the last; dropout; a fully connected layer; ReLU;
-    dropout. ReLU comes after the pooling where there is one, as in their code: both orders give the same
-    numbers, this one reads a quarter of the values. Convolutions carry no bias, which the batch norm behind
-    them would subtract.
+    The layers are those of Beyer et al. 2015: convolutions without padding, each followed by batch norm; 2×2
+    max-pooling after every second convolution except the last; dropout; a fully connected layer; ReLU; dropout. ReLU
+    comes after the pooling where there is one, as in their code: both orders give the same numbers, and this order
+    computes ReLU on a quarter of them. Convolutions have no bias, since the batch norm after them would subtract it.
 
-    Images are read in [0, 1] and not normalised further: nothing is padded, so the first batch norm undoes
-    whatever scale and offset they have.
+    Images are read in [0, 1] and not normalised further. Nothing is padded, so that the first batch norm removes any
+    scale and offset that they have.
 
     Args:
         input_shape: (channels, height, width), 1 or 3 channels; at least 32 × 32 pixels for six convolutions.
@@ -84,6 +83,7 @@ class BiternionVGG(Encoder):
         self.output_shape = (features,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch features"]:
+        """Return the features of the images."""
         dtype = self.fully_connected.weight.dtype
         images = inputs.to(dtype, memory_format=torch.channels_last)
         if not inputs.is_floating_point():
@@ -93,7 +93,7 @@ class BiternionVGG(Encoder):
 
 
 def _smallest(convolutions: int) -> int:
-    """Side of the smallest image that leaves one pixel, in pixels: the layers undone one by one."""
+    """Return the side, pixels, of the smallest image that leaves one pixel, by inverting the layers one by one."""
     side = 1
     for index in reversed(range(convolutions)):
         side = (side * 2 if index in range(1, convolutions - 1, 2) else side) + 2

@@ -12,8 +12,8 @@ from torch import Tensor
 from framework.errors import ConfigError
 
 Strategy = Literal["ball_uniform", "grid", "ball_grid", "hexagonal"]
-# Where the origin may lie in the cell of a lattice: at a point, in the middle of a cell, an edge, a face; and at last
-# off every symmetry (irrational), where no two points are equally far and any number of them fits in a ball.
+# Positions of the origin in the cell of a lattice: at a point, in the middle of a cell, an edge, a face. The last
+# position is on no symmetry (irrational): no two points are equally far from it, so that a ball can hold any number.
 CENTRES = (
     (0, 0, 0),
     (1 / 2, 1 / 2, 1 / 2),
@@ -21,19 +21,19 @@ CENTRES = (
     (1 / 2, 1 / 2, 0),
     (2**0.5 - 1.3, 3**0.5 - 1.5, 5**0.5 - 1.9),
 )
-GAP = 1e-10  # norms that differ by less are equal
+GAP = 1e-10  # norms that differ by less count as equal
 
 
 def basis(strategy: Strategy, count: int, radius: float, seed: int) -> Float[Tensor, "count 3"]:
-    """Basis points about the origin, float64.
+    """Return basis points around the origin, float64.
 
-    "ball_uniform": drawn from the uniform density over the ball, from `seed` and nothing else; the first of many are
-    those of few. "grid": on a rectangular grid over the cube [-radius, radius]³, its faces included, x slowest.
-    "ball_grid", "hexagonal": those points of a cubic lattice, or of hexagonal close packing, that lie in the ball,
-    the lattice scaled so that they are `count`.
+    "ball_uniform": drawn from the uniform density over the ball; they depend on `seed` alone, and a larger set begins
+    with the points of a smaller one. "grid": a rectangular grid over the cube [-radius, radius]³, its faces included, x
+    slowest. "ball_grid", "hexagonal": the points of a cubic lattice, or of hexagonal close packing, that lie in the
+    ball; the lattice is scaled so that their number is `count`.
 
     Raises:
-        ConfigError: `count` is no cube and the strategy "grid"; or no lattice can be scaled so.
+        ConfigError: `count` is no cube and the strategy is "grid"; or no lattice can be scaled to `count`.
     """
     if strategy == "ball_uniform":
         return torch.from_numpy(_ball_uniform(count, seed) * radius)
@@ -44,10 +44,10 @@ def basis(strategy: Strategy, count: int, radius: float, seed: int) -> Float[Ten
 
 
 def side(count: int) -> int:
-    """Points along each edge of a cubic grid of `count`.
+    """Return the number of points along each edge of a cubic grid of `count` points.
 
     Raises:
-        ConfigError: it is no cube; names the nearest.
+        ConfigError: `count` is no cube; the message names the nearest ones.
     """
     below = round(count ** (1 / 3))
     while below**3 > count:
@@ -61,8 +61,9 @@ def side(count: int) -> int:
 
 
 def _ball_uniform(count: int, seed: int) -> np.ndarray:
-    """A normal direction at a radius u^(1/3), since the volume within a radius grows with its cube."""
-    # NumPy promises the bits of its legacy generator for good; two of them, so that the first of many are those of few
+    """Return random directions at radii u^(1/3), since the volume within a radius grows with its cube."""
+    # NumPy guarantees that its legacy generator always gives the same bits. There are two generators, so that a larger
+    # set begins with the points of a smaller one.
     direction = np.random.RandomState(seed).normal(size=(count, 3))
     share = np.random.RandomState([seed, 1]).random_sample(count)
     return direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(share)[:, None]
@@ -74,16 +75,16 @@ def _grid(side: int) -> np.ndarray:
 
 
 def _cubic(reach: int) -> np.ndarray:
-    """Points of distance 1 from their neighbours, from -reach to reach along each axis."""
+    """Return a cubic lattice with distance 1 between neighbours, from -reach to reach along each axis."""
     axis = np.arange(-reach, reach + 1.0)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
 
 def _hexagonal(reach: int) -> np.ndarray:
-    """Hexagonal close packing (Conway & Sloane 1999, §1.3 of ch. 5) of points at distance 1 from their neighbours.
+    """Return hexagonal close packing with distance 1 between neighbours (Conway & Sloane 1999, §1.3 of ch. 5).
 
-    Rows along x at distance √3/2 make a layer, layers lie √(2/3) above another, every second one shifted so that its
-    points lie above the gaps of the one below.
+    Rows along x at distance √3/2 make a layer. Layers have distance √(2/3). Every second layer is shifted so that its
+    points lie above the gaps of the layer below.
     """
     wide, deep, high = reach, math.ceil(reach / math.sqrt(3 / 4)), math.ceil(reach / math.sqrt(2 / 3))
     axes = [np.arange(-end - 1, end + 2.0) for end in (wide, deep, high)]
@@ -95,16 +96,16 @@ def _hexagonal(reach: int) -> np.ndarray:
 
 
 def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> np.ndarray:
-    """Those `count` points of a lattice that lie in the unit ball when it is scaled so that exactly so many do.
+    """Return the `count` points of a lattice that lie in the unit ball, for the scale at which exactly `count` do.
 
     Args:
-        lattice: its points within a distance of the origin, and more.
-        cell: volume for each of its points.
+        lattice: function that returns all lattice points within a distance of the origin, and more.
+        cell: volume per lattice point.
 
     Raises:
-        ConfigError: two points that are equally far are in and out, wherever the origin lies.
+        ConfigError: for every position of the origin, two points that are equally far would be in and out.
     """
-    radius = (3 * count * cell / (4 * math.pi)) ** (1 / 3)  # of the ball that has room for so many
+    radius = (3 * count * cell / (4 * math.pi)) ** (1 / 3)  # of the ball with the volume of `count` cells
     points = lattice(math.ceil(radius) + 2)
     for centre in CENTRES:
         about = points - np.array(centre)
@@ -112,10 +113,10 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
         order = np.argsort(norm, kind="stable")[: count + 1]
         last, next_one = norm[order[-2:]]
         if next_one - last > GAP:
-            chosen = np.sort(order[:count])  # back in the order of the lattice, x slowest
+            chosen = np.sort(order[:count])  # restores the order of the lattice, x slowest
             return (
                 about[chosen] * 2 / (last + next_one)
-            )  # the ball ends half way between the last in and the next
+            )  # the ball ends half way between the last point inside and the next one
     raise ConfigError(
         f"encoder bps: no ball holds exactly points={count} of this lattice, to rounding; write points={count + 1}."
     )

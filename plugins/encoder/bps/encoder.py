@@ -1,4 +1,4 @@
-"""Basis point sets: a cloud as what a fixed set of points sees of it."""
+"""Basis point sets: features of a cloud relative to a fixed set of points."""
 
 from typing import Annotated
 
@@ -18,20 +18,21 @@ from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, pr
 class BPS(Encoder):
     """Features of the point of a cloud that is nearest to each point of a fixed basis (thesis eq. 6.1-6.5).
 
+    Features are (channels, side, side, side), x slowest, with the basis "grid". With the others they are
+    (channels × points,): all of the first channel, then all of the second. The basis is stored in the checkpoint.
+
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
-        input_columns: names of the columns, where features are attributes.
-        basis: how basis points are chosen (`plugins.encoder.bps.basis`).
-        points: how many, k; of a "grid" a cube, side³.
-        radius: of the ball the basis points are in; of a "grid" half its edge. In units of the normalised cloud.
-        features: what is computed for each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5),
-            and of the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
+        input_columns: names of the columns, if features are attributes.
+        basis: choice of basis points (`plugins.encoder.bps.basis`).
+        points: number of basis points, k; side³ for a "grid".
+        radius: radius of the ball that holds the basis points; half the edge of a "grid". In units of the normalised
+            cloud.
+        features: features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5), and of
+            the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
         normalise: as `framework.geometry.clouds.normalised`.
-        basis_seed: of "ball_uniform"; the run's seed has no part in it.
+        basis_seed: seed of "ball_uniform"; the run's seed has no influence on it.
         rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
-
-    With the basis "grid" features are (channels, side, side, side), x slowest, else (channels × points,): all of the
-    first channel, then all of the second. The basis is stored in the checkpoint.
 
     Raises:
         ConfigError: an input that is no cloud, no feature or one twice, a feature that the clouds do not have, a "grid"
@@ -79,6 +80,7 @@ class BPS(Encoder):
         self.output_shape = (total, *[sets.side(points)] * 3) if basis == "grid" else (total * points,)
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        """Return the features of the clouds."""
         found = encode(
             inputs,
             self.prepared(),
@@ -90,10 +92,10 @@ class BPS(Encoder):
         return channels(found).reshape(-1, *self.output_shape)
 
     def prepared(self) -> Basis:
-        """The basis, prepared again only where it was moved, cast or given other numbers since."""
+        """Return the basis prepared for search; it is prepared again only if its device, dtype or values changed."""
         known = self._prepared
         if known is None or not _same(known.points, self.basis):
-            # of a copy, which stays what it was when the basis is changed in place
+            # a copy, which does not change when the basis is changed in place
             known = self._prepared = prepared(self.basis.clone())
         return known
 

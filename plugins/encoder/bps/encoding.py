@@ -1,4 +1,4 @@
-"""From clouds to features of basis points, and back (thesis eq. 6.1-6.5)."""
+"""Conversion of clouds to features of basis points, and back (thesis eq. 6.1-6.5)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,21 +26,21 @@ GROUPS = {"color": COLOR, "normal": NORMAL}
 
 
 class Basis(NamedTuple):
-    """Basis points, and what searching for many clouds' nearest points of them needs to do but once."""
+    """Basis points, with the data structure that nearest-point searches of many clouds share."""
 
     points: Float[Tensor, "k 3"]
     queries: Queries
 
 
 class Encoding(NamedTuple):
-    """Features of a batch of clouds, and all that leads back to them.
+    """Features of a batch of clouds, and what `decode` needs to recover points from them.
 
     Attributes:
         features: (batch, k) or (batch, k, 3), by name.
-        index: the point of each cloud that is nearest to each basis point, the first of equally near ones.
+        index: index of the point of each cloud that is nearest to each basis point, the first of equally near ones.
         basis: the basis points.
-        centre, scale: of each cloud (framework.geometry.clouds.Normalised).
-        frame: each cloud's own axes as columns, where the encoding does not turn with the clouds; else None.
+        centre, scale: centre and scale of each cloud (framework.geometry.clouds.Normalised).
+        frame: each cloud's own axes as columns, if the encoding is rotation-invariant; else None.
     """
 
     features: dict[str, Tensor]
@@ -52,17 +52,17 @@ class Encoding(NamedTuple):
 
 
 def prepared(points: Float[Tensor, "k 3"]) -> Basis:
-    """A basis for `encode`."""
+    """Return basis points prepared for `encode`."""
     return Basis(points, prepare(points))
 
 
 def width(feature: str) -> int:
-    """Numbers a feature has for each basis point."""
+    """Return the number of values that a feature has for each basis point."""
     return 3 if feature == "delta" or feature in GROUPS else 1
 
 
 def columns_of(feature: str, columns: Sequence[str]) -> list[int]:
-    """Where the attributes of a feature stand in a cloud; none of "distance" and "delta".
+    """Return the column indices of a feature's attributes in a cloud; an empty list for "distance" and "delta".
 
     Args:
         columns: names of a cloud's columns (`Data.columns`).
@@ -93,19 +93,20 @@ def encode(
     *,
     rotation_invariant: bool = False,
 ) -> Encoding:
-    """Features of the point of each cloud that is nearest to each basis point; only those that are asked for.
+    """Return the requested features of the point of each cloud that is nearest to each basis point.
 
     "distance": its distance from the basis point (eq. 6.4). "delta": the vector from the basis point to it (eq. 6.5).
-    "color", "normal", or the name of any column: its attributes, as they came ("x", "y", "z" normalised). Distances and
-    deltas are in units of the normalised cloud; all is of the basis's dtype, and differentiable in the clouds but where
-    another point becomes the nearest.
+    "color", "normal", or the name of any column: its attributes, unchanged ("x", "y", "z" normalised). Distances and
+    deltas are in units of the normalised cloud. All features have the basis's dtype. They are differentiable in the
+    clouds, except where another point becomes the nearest.
 
     Args:
-        columns: names of the clouds' columns, where a feature is an attribute.
-        rotation_invariant: encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals turn with it.
+        columns: names of the clouds' columns, if a feature is an attribute.
+        rotation_invariant: encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals are rotated with
+            it.
 
     Raises:
-        ConfigError: a feature wants a column that is not there.
+        ConfigError: a feature needs a column that the clouds do not have.
         DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
     """
     wanted = {feature: columns_of(feature, columns) for feature in features}
@@ -115,7 +116,9 @@ def encode(
     if normalise == "none":
         reach = max(1.0, float(basis.points.abs().max()))
         require_normalised(local[..., :3], reach, counts, by="encoder bps")
-        within = LOOSE * reach  # beyond which that takes a point for an outlier, of half the points at most
+        within = (
+            LOOSE * reach
+        )  # `require_normalised` takes at most half of the points, beyond it, for outliers
     axes = frame(local[..., :3], within) if rotation_invariant else None
     if axes is not None:
         local = _turned(local, axes, columns, {place for places in wanted.values() for place in places})
@@ -130,7 +133,9 @@ def encode(
             made[feature] = found.distance  # eq. 6.4
             if delta is not None and delta.requires_grad:
                 length = torch.linalg.vector_norm(delta, dim=-1)
-                made[feature] = found.distance + (length - length.detach())  # the same bits, and a gradient
+                made[feature] = found.distance + (
+                    length - length.detach()
+                )  # adds a gradient and changes no bit
         elif feature == "delta" and delta is not None:
             made[feature] = delta
         else:
@@ -140,16 +145,16 @@ def encode(
 
 
 def channels(encoding: Encoding) -> Float[Tensor, "batch channels k"]:
-    """All features in the order they were asked for, the components of vectors one after the other."""
+    """Return all features in the order requested, with the components of vectors as separate channels."""
     parts = [part[:, None] if part.dim() == 2 else part.mT for part in encoding.features.values()]
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 def decode(encoding: Encoding, *, unique: bool = False) -> Float[Tensor, "batch points 3"]:
-    """The points of the clouds that are nearest to basis points, in the clouds' own units (§6.4.1), from "delta".
+    """Return the cloud points nearest to the basis points, in the clouds' own units (§6.4.1), from "delta".
 
-    As many as basis points and in their order, so that a point may occur several times; with `unique` each once, in the
-    order of the cloud, and padded as clouds are.
+    The points have the number and the order of the basis points, so that a point may occur several times. With `unique`
+    each occurs once, in the order of the cloud, and the result is padded as clouds are.
 
     Raises:
         UserError: the deltas were not encoded.
@@ -172,8 +177,10 @@ def decode(encoding: Encoding, *, unique: bool = False) -> Float[Tensor, "batch 
 def per_point(
     encoding: Encoding, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points features"]:
-    """What a network reads that predicts something of single points, a segment say (§8.2): the features of their whole
-    cloud, as many as `channels` has, before the point's normalised coordinates. Padding stays NaN.
+    """Return the input of a network that predicts something for single points, such as a segment (§8.2).
+
+    For each point these are the features of its whole cloud, as many as `channels` has, then the point's normalised
+    coordinates. Padding stays NaN.
 
     Args:
         points: in the clouds' own units, of the same clouds in the same order.
@@ -186,21 +193,21 @@ def per_point(
 
 
 def _taken(numbers: Float[Tensor, "batch points columns"], index: Int[Tensor, "batch k"]) -> Tensor:
-    """The rows of each cloud that an index names, (batch, k, columns)."""
+    """Return the rows of each cloud that an index names, (batch, k, columns)."""
     return numbers.gather(1, index[..., None].expand(-1, -1, numbers.shape[2]))
 
 
 def _turned(
     local: Float[Tensor, "batch points columns"], axes: Tensor, columns: Sequence[str], read: set[int]
 ) -> Float[Tensor, "batch points columns"]:
-    """Coordinates, and normals where any of them is read, along each cloud's own axes."""
+    """Return coordinates, and normals if any of them is read, along each cloud's own axes."""
     parts = list(local.unbind(-1))
     vectors = [[0, 1, 2]]
     if read & {columns.index(name) for name in NORMAL if name in columns}:
         vectors.append(columns_of("normal", columns))
     for places in vectors:
         vector = local[..., places].double()
-        padding = vector.isnan()  # is no summand of the axes' gradient
+        padding = vector.isnan()  # it must add nothing to the axes' gradient
         along = (vector.where(~padding, 0) @ axes).where(~padding, torch.nan).to(local.dtype)
         for place, part in zip(places, along.unbind(-1), strict=True):
             parts[place] = part
@@ -208,7 +215,7 @@ def _turned(
 
 
 def _first_of_each(index: Int[Tensor, "k"]) -> Int[Tensor, "different"]:
-    """Where each different number of an index stands first, numbers ascending."""
+    """Return the first position of each distinct value of an index, by ascending value."""
     order = index.argsort(stable=True)
     ordered = index[order]
     first = torch.ones_like(ordered, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""A frame of a cloud's own, which turns with it: principal axes, their directions by third moments."""
+"""A frame that rotates with its cloud: principal axes, with directions by third moments."""
 
 from typing import Any
 
@@ -9,42 +9,49 @@ from torch import Tensor
 from plugins.encoder.bps.symmetric import EQUAL, symmetric_frame
 
 WITHIN = 1 + 1e-6
-"""Norm up to which a point of a normalised cloud counts, to rounding: not what a robust normalisation left outside."""
+"""Norm up to which a point of a normalised cloud counts, to rounding; outliers of a robust normalisation lie beyond."""
 APART = 1e-9
-"""Eigenvalues that differ by less, in units of the largest, are equal: their axes have no derivative. One that is less
-is 0: what is thinner than 3e-5 of its length is flat."""
+"""Difference below which eigenvalues, in units of the largest, are equal, so that their axes have no derivative.
+
+An eigenvalue below it is 0: a cloud thinner than 3e-5 of its length is flat.
+"""
 
 SKEWED = 1e-6
-"""Skewness from which a third moment tells a direction, of the longest axis; of a shorter one as many times more, since
-coordinates are rounded in units of the longest."""
+"""Skewness above which a third moment determines the direction of the longest axis.
+
+It is larger for a shorter axis, in proportion to the ratio of the lengths, since coordinates are rounded in units of
+the longest.
+"""
 
 
 def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> Float[Tensor, "batch 3 3"]:
-    """Rotations whose columns are each cloud's axes, float64; `coordinates @ frame` does not turn with the cloud.
+    """Return rotations whose columns are each cloud's axes, float64; `coordinates @ frame` is rotation-invariant.
 
     Axes are the eigenvectors of the second moments about the origin, the longest first. An axis points to where the
-    third moment along it is positive; the axis of least skewness, which a mirror plane makes 0, is the one that
-    completes a right-handed frame, so that a cloud with mirror planes has its frame up to its own symmetries. Where two
-    moments are equal to rounding, as of a cube, or fewer than two axes are skewed, as where x → -x changes nothing,
-    `symmetric_frame` chooses. Where two moments are nearly equal, as of points drawn on a cylinder, a small change of
-    the cloud turns its axes far. Differentiable in the clouds to any order, equal eigenvalues apart.
+    third moment along it is positive. The axis of least skewness, which a mirror plane makes 0, completes a
+    right-handed frame instead, so that the frame of a cloud with mirror planes is determined up to the cloud's own
+    symmetries. `symmetric_frame` chooses where two moments are equal to rounding, as of a cube, or fewer than two axes
+    are skewed, as of a cloud that x → -x does not change. Where two moments are nearly equal, as of points drawn on a
+    cylinder, a small change of the cloud rotates its axes far. The frame is differentiable in the clouds to any order,
+    except where eigenvalues are equal.
 
     Args:
-        coordinates: about the origin; rows of NaN are padding.
+        coordinates: relative to the origin; rows of NaN are padding.
         reach: norm beyond which points are outliers, which do not count.
     """
     points = coordinates.double()
     norm = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True)
-    inside = norm <= WITHIN * reach  # not where NaN
+    inside = norm <= WITHIN * reach  # False for NaN
     points = points.where(inside, 0)
-    # sums, since a factor changes no eigenvector, and the skewness below is divided by them
+    # sums, not means: a factor changes no eigenvector, and the skewness below does not depend on it
     second = points.mT @ points
     values, axes = torch.linalg.eigh(second.detach())
     values, axes = values.flip(-1), axes.flip(-1)
     along = points.detach() @ axes
     third = along.pow(3).mean(1)
     skewness = third / along.square().mean(1).clamp(min=torch.finfo(torch.float64).tiny).pow(1.5)
-    # what is flat is its own mirror image: along its normal there is rounding alone, whose skewness may be the largest
+    # A flat cloud is its own mirror image. Along its normal there are only rounding errors, whose skewness may be the
+    # largest.
     skewness = skewness.where(values > APART * values[:, :1], 0)
     direction = torch.ones_like(third).where(third >= 0, -1)
     axes = axes * direction[:, None]
@@ -64,16 +71,17 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
 
 
 class Axes(torch.autograd.Function):
-    """Eigenvalues and eigenvectors that are known already, with derivatives in the matrix that they are of.
+    """Known eigenvalues and eigenvectors, with derivatives in the matrix that they belong to.
 
-    The backward is made of what the forward gives, so that it has derivatives in turn. torch.linalg.eigh's own are not
-    finite where two eigenvalues are equal.
+    The backward uses only the outputs of the forward, so that it has derivatives in turn. Those of torch.linalg.eigh
+    are not finite where two eigenvalues are equal.
     """
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, second: Tensor, values: Tensor, axes: Tensor
     ) -> tuple[Tensor, Tensor]:
+        """Return the eigenvalues and eigenvectors unchanged."""
         values, axes = values.clone(), axes.clone()
         ctx.save_for_backward(values, axes)
         return values, axes
@@ -82,8 +90,9 @@ class Axes(torch.autograd.Function):
     def backward(  # type: ignore[override]
         ctx: Any, of_values: Tensor, of_axes: Tensor
     ) -> tuple[Tensor, None, None]:
+        """Return the gradient in the matrix."""
         values, axes = ctx.saved_tensors
-        # first order of perturbation: d value_j = axis_jᵀ d(second) axis_j, and
+        # first-order perturbation: d value_j = axis_jᵀ d(second) axis_j, and
         # d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)
         gap = values[:, None] - values[..., None]
         known = gap.abs() > APART * values[:, :1, None]

@@ -1,11 +1,11 @@
-"""Frames of symmetric clouds, whose second and third moments do not determine any: of a few candidates the best.
+"""Frames of symmetric clouds, whose second and third moments determine no frame: the best of a few candidates.
 
-A cloud that is its own image under x → -x has no third moments, so that none of its axes has a direction, and one with
-equal second moments, such as a cube, has no axes. Candidates are then what is left of the axes' directions, or frames
-through points of the cloud. The one with the largest L(F a) is chosen, where F is the candidate, a is a constant, and
-L(s) = mean exp(s·p) is the Laplace transform of the cloud. It holds moments of every order. So two candidates have the
-same value, but for coincidences, where a symmetry of the cloud leads from one to the other, and in both the cloud looks
-the same. No rotation of the cloud changes the choice.
+A cloud that is its own image under x → -x has no third moments, so that none of its axes has a direction. A cloud with
+equal second moments, such as a cube, has no axes. The candidates are then the remaining directions of the axes, or
+frames through points of the cloud. The candidate with the largest L(F a) is chosen, where F is the candidate, a is a
+constant, and L(s) = mean exp(s·p) is the Laplace transform of the cloud, which holds moments of every order. Two
+candidates have the same value, but for coincidences, only if a symmetry of the cloud maps one to the other; the cloud
+looks the same in both. No rotation of the cloud changes the choice.
 """
 
 import torch
@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 EQUAL = 1e-6
-"""Second moments that differ by less, in units of the largest, are equal to the rounding of float32."""
+"""Relative difference, in units of the largest, below which second moments are equal to the rounding of float32."""
 TIED = 1e-6
-"""Likewise lengths, relative to themselves, and values of L."""
+"""Difference below which lengths, relative to themselves, and values of L are equal."""
 GENERIC = (1.3, 0.9, 0.5)
-"""The vector a, over the root mean square of a coordinate: its components differ, and none is 0."""
+"""The vector a, in inverse units of the root mean square of a coordinate: its components differ, and none is 0."""
 AT_ONCE = 2**22
-"""Most pairs of a candidate and a point that are held at once."""
+"""Largest number of pairs of a candidate and a point that are held at once."""
 FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 """Directions of three axes that leave a frame right-handed."""
 
@@ -31,12 +31,12 @@ def symmetric_frame(
     fixed: Bool[Tensor, "3"],
     equal: Bool[Tensor, "2"],
 ) -> Float[Tensor, "3 3"]:
-    """Return a right-handed frame, as columns, that turns with a cloud.
+    """Return a right-handed frame, as columns, that rotates with the cloud.
 
     Args:
-        points: about the origin.
+        points: relative to the origin.
         axes: principal axes as columns, the longest first, right-handed.
-        fixed: which of these point where they do by their third moments; read where no two moments are equal.
+        fixed: axes whose direction is determined by their third moments; read if no two second moments are equal.
         equal: whether the second moments of the first two axes are equal, and those of the last two.
     """
     if bool(equal.all()):
@@ -54,8 +54,11 @@ def symmetric_frame(
 
 
 def _through_two_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "frame 3 3"]:
-    """Return frames whose first axis leads to one of the farthest points, and whose second leads towards one of those
-    that are farthest from this axis."""
+    """Return frames through points of the cloud, (frame, 3, 3).
+
+    The first axis leads to one of the farthest points; the second leads towards one of those that are farthest from
+    this axis.
+    """
     first = points[_farthest(points.norm(dim=1))]
     first = first / first.norm(dim=1, keepdim=True)
     value = _log_transform(points, GENERIC[0] * first)
@@ -65,8 +68,11 @@ def _through_two_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "fra
 def _about(
     points: Float[Tensor, "points 3"], axis: Float[Tensor, "3"], last: bool = False
 ) -> Float[Tensor, "frame 3 3"]:
-    """Return frames with an axis as their first column or their last, and another towards one of the points that are
-    farthest from it; of these towards one that is farthest along it, in either direction."""
+    """Return frames with `axis` as their first column, or as their last.
+
+    Another axis leads towards one of the points that are farthest from `axis`; of these, towards one that is farthest
+    along it, in either direction.
+    """
     along = points @ axis
     across = points - along[:, None] * axis
     distance = across.norm(dim=1)

@@ -1,1 +1,1 @@
-"""Blocks of fully connected layers whose outputs are joined to their inputs."""
+"""Blocks of fully connected layers whose outputs are concatenated to their inputs."""

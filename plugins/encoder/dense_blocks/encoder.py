@@ -15,20 +15,23 @@ from framework.errors import ConfigError
 class DenseBlocks(Encoder):
     """A fully connected network in the manner of DenseNet: two blocks of two layers, for mesh registration.
 
-    A block is `layers` times a linear layer, batch norm where asked for, ReLU and dropout; what leaves it is its input
-    with its output appended, so that later layers read the features themselves and all that was made of them (thesis
-    Figure 6.2, §6.5.2-6.5.3; Huang et al. 2017).
+    A block repeats `layers` times a linear layer, batch norm if requested, ReLU and dropout. The block returns its
+    input with its output appended, so that later layers read the features themselves and everything computed from them
+    (thesis Figure 6.2, §6.5.2-6.5.3; Huang et al. 2017).
 
     Args:
         input_shape: any; a sample is flattened.
-        blocks, layers: how many blocks, and layers of each.
+        blocks, layers: number of blocks, and number of layers in each.
         width: outputs of a layer.
         dropout: probability of dropping an output of a layer.
-        standardise: whether features are first brought to mean 0 and deviation 1, each by its own mean over all of
-            training (in training by the batch's): features that hardly vary about a mean train many times slower.
-        batch_norm: whether layers normalise over the batch. With either, training needs batches of at least two.
+        standardise: whether each feature is first brought to mean 0 and deviation 1, by its moments over all of
+            training (during training by those of the batch). Without it, features that hardly vary around a mean train
+            many times slower.
+        batch_norm: whether layers normalise over the batch. With this or `standardise`, training needs batches of at
+            least two.
         bottleneck: length of a last linear layer without activation; None for none. The linear layer in front of a
-            density head of very many numbers then has this rank, and is as much smaller and faster.
+            density head with very many distribution parameters then has this rank, and is smaller and faster in
+            proportion.
 
     Raises:
         ConfigError: a sample holds no numbers.
@@ -60,14 +63,14 @@ class DenseBlocks(Encoder):
                 f"dense_blocks got samples of shape {input_shape}, which hold no numbers; wanted at least one. "
                 "Check what `data` yields, or the encoder before it."
             )
-        # no decay of older batches (momentum=None), and nothing learnt
+        # momentum=None: older batches do not decay; affine=False: nothing is learnt
         self.standard = nn.BatchNorm1d(length, affine=False, momentum=None) if standardise else nn.Identity()
         self.blocks = nn.ModuleList()
         for _ in range(blocks):
             parts: list[nn.Module] = []
             inner = length
             for _ in range(layers):
-                parts.append(nn.Linear(inner, width, bias=not batch_norm))  # batch norm has its own
+                parts.append(nn.Linear(inner, width, bias=not batch_norm))  # batch norm has its own bias
                 if batch_norm:
                     parts.append(nn.BatchNorm1d(width))
                 parts += [nn.ReLU(inplace=True), nn.Dropout(dropout)]
@@ -75,11 +78,12 @@ class DenseBlocks(Encoder):
             self.blocks.append(nn.Sequential(*parts))
             length += width
         self.bottleneck = nn.Identity() if bottleneck is None else nn.Linear(length, bottleneck)
-        self.vectorises = not (batch_norm or standardise)  # whose running moments are buffers
+        self.vectorises = not (batch_norm or standardise)  # their running moments are buffers
         self.starts_flat = bottleneck is not None
         self.output_shape = (bottleneck or length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the flattened inputs."""
         numbers = inputs.flatten(1).to(next(self.parameters()).dtype)
         if inputs.dtype == torch.uint8:
             numbers = numbers / 255

@@ -1,1 +1,1 @@
-"""Flights of a ball as features: by the differential equation, and by the parabola on which the last frames lie."""
+"""Flights of a ball as features: by the differential equation, and by parabolas through the last frames."""

@@ -1,4 +1,4 @@
-"""A flight by the physics as features: where the ball arrives by its differential equation, and how sure that is."""
+"""Features of a flight by physics: the predicted path of the differential equation, and its standard deviations."""
 
 from typing import Annotated
 
@@ -15,22 +15,22 @@ from framework.flights.trajectories import flown_with_slopes
 from plugins.encoder.flights.extrapolation import frames_of
 
 LARGEST = 1e4
-"""Bound on the magnitude of inputs and features; larger ones are cut off."""
+"""Bound on the magnitude of inputs and features; larger ones are clamped."""
 
 
 class BallisticEncoder(Encoder):
-    """The flight by its differential equation as features.
+    """Predicted flight of the ball by its differential equation, as features.
 
-    Metres: x, y and z at each future frame, the logarithms of their standard deviations, and what was read (frame by
-    frame as `PARTS`).
+    Features, from metres: x, y and z at each future frame, the logarithms of their standard deviations, and the
+    observed frames (frame by frame as `PARTS`).
 
     The constants are those of the config, or those that a run of `density_head=ballistic` found. Nothing is learnt.
 
     Args:
-        future, step: of the data.
-        spin: standard deviation believed of each component of the spin, rad/s.
-        noise: of a coordinate, m.
-        constants: of the ball and the table.
+        future, step: as of the data.
+        spin: prior standard deviation of each component of the spin, rad/s.
+        noise: standard deviation of a coordinate, m.
+        constants: constants of the ball and the table.
 
     Raises:
         ConfigError: inputs are no frames of `PARTS`, flattened.
@@ -66,6 +66,7 @@ class BallisticEncoder(Encoder):
 
     @torch.no_grad()
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the flights."""
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         frames = inputs.double().clamp(-LARGEST, LARGEST).cpu()
         seen = seen_of(frames.unflatten(-1, (-1, len(PARTS))), self.step)

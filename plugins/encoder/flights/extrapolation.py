@@ -1,4 +1,4 @@
-"""A flight's path without physics, as features: the parabola on which the last frames lie, and what is off it."""
+"""Features of a flight without physics: the parabola through the last frames, and the residuals from it."""
 
 import math
 from typing import Annotated
@@ -16,26 +16,28 @@ from framework.flights.frames import GRAVITY, PARTS
 from plugins.encoder.flights.parabolas_compiled import described
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
-"""Shares of the frames that a parabola is laid through: the longest that it fits counts, a bounce is left behind."""
+"""Shares of the frames that a parabola is fitted to; the longest that fits is used, so that a bounce is left out."""
 SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
-"""By which the unit of features grows with time, m/s, and its square, m/s²: z is reversed by a bounce, which may have
-been in the last frames."""
+"""Growth of the unit of features with time, m/s, and with its square, m/s², for each axis.
+
+The values of z are larger, since a bounce reverses its velocity, and one may have been in the last frames.
+"""
 FURTHER = 24
-"""Features beside the two of each number that is predicted and the four of each frame."""
+"""Number of features beside the two of each predicted number and those of each frame."""
 
 
 class ExtrapolationEncoder(Encoder):
-    """Where the ball would be if it went on as it did.
+    """Extrapolated positions of the ball on a robust parabola through its last frames.
 
-    Metres: x, y and z at each future frame, the logarithms of units in which to say how far it is from there, and what
-    was seen, relative to it.
+    Features, from metres: x, y and z at each future frame; the logarithms of the units in which a head says how far the
+    ball is from there; and the observed frames, relative to the parabola.
 
-    Each coordinate is a parabola in time, laid through the last frames by least squares with Cauchy's weights, so that
-    an outlier counts for little; no drag, spin, table or bounce is known. Nothing is learnt.
+    Each coordinate is a parabola in time, fitted to the last frames by least squares with Cauchy's weights, so that an
+    outlier has little influence. Drag, spin, table and bounce are not modelled. Nothing is learnt.
 
     Args:
-        future, step: of the data.
-        noise: of a coordinate, m.
+        future, step: as of the data.
+        noise: standard deviation of a coordinate, m.
 
     Raises:
         ConfigError: inputs are no frames of `PARTS`, flattened.
@@ -67,6 +69,7 @@ class ExtrapolationEncoder(Encoder):
 
     @torch.no_grad()
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the flights."""
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         seen = seen_of(inputs.double().unflatten(-1, (-1, len(PARTS))), self.step)
         seen = Seen(*(part.cpu() for part in seen))
@@ -87,10 +90,10 @@ class ExtrapolationEncoder(Encoder):
 
 
 def frames_of(input_shape: tuple[int, ...], by: str) -> int:
-    """How many frames a sample has.
+    """Return the number of frames of a sample.
 
     Raises:
-        ConfigError: it is no sample of frames.
+        ConfigError: the shape is not that of a sample of frames.
     """
     length = math.prod(input_shape)
     if len(input_shape) != 1 or length % len(PARTS) or not length:

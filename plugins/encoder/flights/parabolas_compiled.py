@@ -1,4 +1,4 @@
-"""Robust parabolas through the last frames of flights and what they say, on one CPU core; functions on NumPy arrays."""
+"""Robust parabolas through the last frames of flights, and features of them, on one CPU core; on NumPy arrays."""
 
 from pathlib import Path
 from typing import no_type_check
@@ -9,17 +9,17 @@ from framework.storage.kernels import compiler, kept_in
 
 compiled = compiler(kept_in("parabolas", [Path(__file__)]))
 FITS, STRANGE = 5.0, 2
-"""Noises from the parabola beyond which a frame is strange; of a span that it fits no more are."""
+"""Criterion of a fit: frames farther than FITS standard deviations are outliers, of which it has at most STRANGE."""
 ROUNDS = 8
-"""Of weights and parabola."""
+"""Number of alternating updates of weights and parabola."""
 BELIEF = (10.0, 10.0, 4.0)
-"""Standard deviations of place, velocity and acceleration beyond gravity before anything is seen: m, m/s, m/s²."""
+"""Prior standard deviations of position, velocity and acceleration beyond gravity: m, m/s, m/s²."""
 
 
 @compiled
 @no_type_check
 def factored(matrix):
-    """Cholesky's lower triangle of a positive definite 3 × 3 matrix, in its place."""
+    """Compute Cholesky's lower triangle of a positive definite 3 × 3 matrix in place."""
     for row in range(3):
         for column in range(row + 1):
             total = matrix[row, column]
@@ -46,18 +46,18 @@ def solved(triangle, right):
 @compiled
 @no_type_check
 def parabolas(times, places, there, spans, noise, long, short, spread, span):
-    """Lay parabolas through the last frames, by least squares with Cauchy's weights (Holland & Welsch 1977).
+    """Fit parabolas to the last frames, by least squares with Cauchy's weights (Holland & Welsch 1977).
 
     Args:
         times: (flight, frame), s.
-        places: (flight, frame, 3), m; any number where none was seen.
-        there: (flight, frame), whether one was.
-        spans: how many of the last frames count, the most first.
-        noise: of a coordinate, m.
-        long: to be filled: coefficients of 1, t and t²/2 (flight, 3, axis) of the longest span that fits.
-        short: the same of the last span.
-        spread: covariance of an axis's coefficients of `long`, (flight, 3, 3).
-        span: which span it is, (flight,).
+        places: positions (flight, frame, 3), m; any number where the ball was not seen.
+        there: (flight, frame), whether the ball was seen.
+        spans: numbers of last frames that are fitted, the largest first.
+        noise: standard deviation of a coordinate, m.
+        long: filled with the coefficients of 1, t and t²/2 (flight, 3, axis) of the longest span that fits.
+        short: filled with the coefficients of the last span.
+        spread: filled with the covariance of an axis's coefficients of `long`, (flight, 3, 3).
+        span: filled with the index of the span of `long`, (flight,).
     """
     count = times.shape[1]
     power, weight, apart = np.empty((count, 3)), np.empty(count), np.empty(count)
@@ -87,7 +87,7 @@ def parabolas(times, places, there, spans, noise, long, short, spread, span):
                                 )
                 factored(precision)
                 solved(precision, found)
-                # wide at first, so that the first parabola does not say which frames are strange
+                # wide at first, so that the first parabola does not decide which frames are outliers
                 width = 3 * 3.0 ** max(0, 4 - turn)
                 strange = 0
                 for frame in range(first, count):
@@ -114,16 +114,16 @@ def parabolas(times, places, there, spans, noise, long, short, spread, span):
 @compiled
 @no_type_check
 def described(times, places, there, gravity, spans, noise, speed, growth, moments, features):
-    """Fill `features` (flight, number) with what `extrapolation.ExtrapolationEncoder` says of flights.
+    """Fill `features` (flight, number) with the features of flights that `extrapolation.ExtrapolationEncoder` returns.
 
     Args:
         times, places, there, noise, spans: see `parabolas`.
         gravity: m/s².
-        speed, growth: of the unit with time, (3,), m/s, and with its square, m/s².
-        moments: at which the ball is wanted, (future,), s.
+        speed, growth: growth of the unit with time, (3,), m/s, and with its square, m/s².
+        moments: times at which the ball is predicted, (future,), s.
     """
     flights, count = times.shape
-    fallen = places.copy()  # as they would be without gravity
+    fallen = places.copy()  # positions without the effect of gravity
     for flight in range(flights):
         for frame in range(count):
             fallen[flight, frame, 2] += gravity / 2 * times[flight, frame] ** 2
@@ -163,7 +163,8 @@ def described(times, places, there, gravity, spans, noise, speed, growth, moment
                     total += power[row] * spread[flight, row, column] * power[column]
             found[place] = np.log(total) / 6
             place += 1
-        # both finely and coarsely: a bounce's path is metres from the parabola, a frame's noise millimetres
+        # Residuals on a fine and a coarse scale: after a bounce the path is metres from the parabola, while the noise
+        # of a frame is millimetres.
         for frame in range(count):
             power[1], power[2] = times[flight, frame], times[flight, frame] ** 2 / 2
             for axis in range(3):

@@ -1,4 +1,4 @@
-"""Rows of the contract: what is seen of thrown balls."""
+"""Rows of the contract: observed frames of thrown balls."""
 
 from framework.testing.flights import thrown
 from framework.testing.rows import EncoderRow

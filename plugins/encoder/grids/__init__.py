@@ -1,1 +1,1 @@
-"""Point clouds on grids: which cells they occupy, how far they are from each, and convolutions over grids."""
+"""Point clouds on grids: occupancy, truncated distance fields, and convolutions over grids."""

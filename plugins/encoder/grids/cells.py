@@ -1,4 +1,4 @@
-"""What encoders of clouds on a grid over [-1, 1]³ share: how they read clouds, and the way back to points."""
+"""Shared functions of the encoders of clouds on a grid over [-1, 1]³: reading clouds, and the way back to points."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ def on_cells(
     numbers: Callable[[Tensor, int], Tensor],
     side: int,
 ) -> Float[Tensor, "batch 1 side side side"]:
-    """What `numbers` says of normalised clouds on a grid of side³ cells, x slowest, one number a cell.
+    """Return the result of `numbers` for normalised clouds on a grid of side³ cells, x slowest, one number per cell.
 
     Raises:
         DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
@@ -40,14 +40,16 @@ def on_cells(
 def centres_of(
     chosen: Bool[Tensor, "batch cells"], like: Tensor, side: int, normalised: Normalised, what: str
 ) -> Float[Tensor, "batch points 3"]:
-    """Centres of the chosen cells in the clouds' own units (§6.4.1), padded as clouds are, of the dtype of `like`.
+    """Return the centres of the chosen cells in the clouds' own units (§6.4.1).
+
+    The result is padded as clouds are, and has the dtype of `like`.
 
     Args:
-        normalised: of the clouds that were encoded; its centre and scale lead back.
-        what: is said of a chosen cell: "occupied".
+        normalised: the encoded clouds; their centre and scale lead back to the clouds' units.
+        what: adjective for a chosen cell in the message, such as "occupied".
 
     Raises:
-        DataError: no cell of a cloud is chosen, all its points being outside the cube.
+        DataError: no cell of a cloud is chosen, since all its points are outside the cube.
     """
     empty = (~chosen).all(1).nonzero()
     if len(empty):

@@ -1,4 +1,4 @@
-"""Occupancy grids, the rival of point-set encodings that fills space with flags."""
+"""Occupancy grids, the thesis's baseline for point-set encodings that fills space with cells."""
 
 from typing import Annotated
 
@@ -11,18 +11,18 @@ from framework.geometry.clouds import Normalisation, Normalised, require_clouds
 from plugins.encoder.grids.cells import centres_of, on_cells
 
 ROUNDING = 1e-6
-"""A point may be so far outside of [-1, 1] and lie in the cell at the edge: rounding puts a norm above 1."""
+"""Largest distance outside of [-1, 1] at which a point still lies in the edge cell: rounding puts a norm above 1."""
 
 
 class Occupancy(Encoder):
-    """Which cells of a grid over [-1, 1]³ hold a point of the normalised cloud (thesis §6.4.1, §6.5.1).
+    """Occupancy of the cells of a grid over [-1, 1]³ by points of the normalised cloud (thesis §6.4.1, §6.5.1).
+
+    Features are (1, side, side, side), x slowest, 0 or 1, of the clouds' dtype. They have no gradient.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         side: cells along each edge.
         normalise: as `framework.geometry.clouds.normalised`. With "robust" far outliers lie in no cell.
-
-    Features are (1, side, side, side), x slowest, 0 or 1, of the clouds' dtype; no gradient leads back.
 
     Raises:
         ConfigError: an input that is no cloud.
@@ -51,22 +51,24 @@ class Occupancy(Encoder):
         self.output_shape = (1, side, side, side)
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        """Return the occupancy of the cells."""
         return on_cells(inputs.detach(), self.normalise, "encoder occupancy", occupancy, self.side)
 
 
 def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float[Tensor, "batch cells"]:
-    """1 for each of the side³ cells of the cube [-1, 1]³, x slowest, that a point lies in, 0 for the others.
+    """Return 1 for each of the side³ cells of the cube [-1, 1]³, x slowest, that a point lies in, 0 for the others.
 
-    A cell holds its lower faces, the last one of a row its upper too. Points outside the cube lie in no cell.
+    A cell includes its lower faces; the last cell of a row includes its upper face too. Points outside the cube lie in
+    no cell.
 
     Args:
         clouds: normalised; rows of NaN are padding.
     """
     coordinates = clouds[..., :3].detach()
-    inside = (coordinates.abs() <= 1 + ROUNDING).all(-1)  # not where NaN
+    inside = (coordinates.abs() <= 1 + ROUNDING).all(-1)  # False for NaN
     place = ((coordinates.double() + 1) / 2 * side).nan_to_num(0, 0, 0).clamp(0, side - 1).long()
     cell = (place[..., 0] * side + place[..., 1]) * side + place[..., 2]
-    cell = cell.where(inside, side**3)  # a cell more, for points of no cell
+    cell = cell.where(inside, side**3)  # an extra cell collects the points that lie in no cell
     flags = coordinates.new_zeros(len(clouds), side**3 + 1)
     return flags.scatter_(1, cell, 1.0)[:, :-1]
 
@@ -74,5 +76,5 @@ def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float
 def decode(
     flags: Float[Tensor, "batch cells"], side: int, normalised: Normalised
 ) -> Float[Tensor, "batch points 3"]:
-    """Centres of the occupied cells, as `centres_of`."""
+    """Return the centres of the occupied cells, as `centres_of` returns them."""
     return centres_of(flags > 0, flags, side, normalised, "occupied")

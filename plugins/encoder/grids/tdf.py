@@ -1,4 +1,4 @@
-"""Truncated distance fields, the rival of point-set encodings that fills space with local distances."""
+"""Truncated distance fields, the thesis's baseline for point-set encodings that fills space with local distances."""
 
 import itertools
 import math
@@ -15,16 +15,16 @@ from plugins.encoder.grids.cells import centres_of, on_cells
 
 
 class TDF(Encoder):
-    """How far the cells of a grid over [-1, 1]³ are from the normalised cloud, cut off within a cell (thesis §6.5.1).
+    """Distances of grid cells over [-1, 1]³ from the normalised cloud, truncated within a cell (thesis §6.5.1).
+
+    Features are (1, side, side, side), x slowest, of the clouds' dtype. They are unsigned distances as a share of the
+    truncation: 0 at a point, 1 at the truncation and beyond.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         side: cells along each edge.
-        truncation: distance that counts as far, in edges of a cell.
+        truncation: largest distance that is told apart, in edges of a cell.
         normalise: as `framework.geometry.clouds.normalised`.
-
-    Features are (1, side, side, side), x slowest, unsigned distances as a share of the truncation: 0 at a point, 1 at
-    the truncation and beyond. Of the clouds' dtype.
 
     Raises:
         ConfigError: an input that is no cloud.
@@ -54,6 +54,7 @@ class TDF(Encoder):
         self.output_shape = (1, side, side, side)
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        """Return the truncated distances of the cells."""
         numbers = partial(truncated_distance, truncation=self.truncation)
         return on_cells(inputs, self.normalise, "encoder tdf", numbers, self.side)
 
@@ -61,10 +62,10 @@ class TDF(Encoder):
 def truncated_distance(
     clouds: Float[Tensor, "batch points columns"], side: int, truncation: float
 ) -> Float[Tensor, "batch cells"]:
-    """For each of the side³ cells of the cube [-1, 1]³, x slowest, the distance of its centre from the nearest point,
-    at most `truncation`, as a share of it: 0 to 1. Differentiable in the clouds.
+    """Return the truncated distance of each of the side³ cells of the cube [-1, 1]³ from the nearest point, x slowest.
 
-    Only cells so near to a point are looked at, each point's neighbourhood in turn: what is cut off costs nothing.
+    The distance is that of the cell's centre, at most `truncation`, as a share of it: 0 to 1. It is differentiable in
+    the clouds. Only the neighbourhood of each point is computed, so that cells beyond the truncation cost nothing.
 
     Args:
         clouds: normalised; rows of NaN are padding.
@@ -72,7 +73,7 @@ def truncated_distance(
     """
     real = ~clouds[..., 0].isnan()
     reach = math.floor(truncation + 1 / 2)
-    squares, numbers = [], []  # along each axis, for each step off a point's own cell
+    squares, numbers = [], []  # along each axis, for each step away from a point's own cell
     for axis, stride in enumerate((side * side, side, 1)):
         # in edges of a cell, from the cube's corner
         place = (clouds[..., axis].where(real, 0) + 1) / 2 * side
@@ -88,7 +89,7 @@ def truncated_distance(
         numbers.append([cell.clamp(0, side - 1).long() * stride for cell in cells])
     square = clouds.new_full((len(clouds), side**3), truncation**2)
     for x, y, z in itertools.product(range(2 * reach + 1), repeat=3):
-        # a centre so many cells off is at most half a cell nearer than that
+        # the centre of a cell that is n steps away is at least n - 1/2 edges away
         if sum(max(abs(step - reach) - 1 / 2, 0) ** 2 for step in (x, y, z)) >= truncation**2:
             continue
         number = numbers[0][x] + numbers[1][y] + numbers[2][z]
@@ -104,5 +105,5 @@ def truncated_distance(
 def decode(
     field: Float[Tensor, "batch cells"], side: int, normalised: Normalised
 ) -> Float[Tensor, "batch points 3"]:
-    """Centres of the cells that are less than the truncation from a point, as `centres_of`."""
+    """Return the centres of the cells that are less than the truncation from a point, as `centres_of` returns them."""
     return centres_of(field < 1, field, side, normalised, "near a point")

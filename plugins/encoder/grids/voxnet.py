@@ -1,4 +1,4 @@
-"""VoxNet (Maturana & Scherer 2015) and the deeper network that the thesis puts on grids of basis points (§6.5.3)."""
+"""VoxNet (Maturana & Scherer 2015) and the deeper network that the thesis applies to basis point grids (§6.5.3)."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -14,12 +14,12 @@ from framework.errors import ConfigError
 Positive = Annotated[int, Field(gt=0)]
 Probability = Annotated[float, Field(ge=0, lt=1)]
 SLOPE = 0.1
-"""Of VoxNet's ReLU below zero."""
+"""Slope of VoxNet's leaky ReLU below zero."""
 
 
 @dataclass(frozen=True)
 class Published:
-    """Sizes of a variant: of its convolutions, its fully connected layers, and its dropout layers."""
+    """Published sizes of a variant's convolutions, fully connected layers and dropout layers."""
 
     channels: tuple[int, ...]
     widths: tuple[int, ...]
@@ -35,22 +35,22 @@ PUBLISHED = {
 class VoxNet(Encoder):
     """Three-dimensional convolutions over a grid (channels, side, side, side), then fully connected layers.
 
-    "voxnet": a 5 × 5 × 5 convolution of stride 2, 3 × 3 × 3 convolutions, 2 × 2 × 2 max-pooling, one fully connected
-    layer; leaky ReLU after convolutions, dropout after the first convolution, after the pooling and at the end.
-    "conv3d": 3 × 3 × 3 convolutions, each with ReLU and batch norm, max-pooling after every second; dropout after each
-    fully connected layer. The thesis leaves the channels of the latter open: those of the default have the parameters
-    and model size of its Tables 6.2 and 6.3 (README).
+    "voxnet" has a 5 × 5 × 5 convolution of stride 2, 3 × 3 × 3 convolutions, 2 × 2 × 2 max-pooling, and one fully
+    connected layer. Leaky ReLU follows each convolution. Dropout follows the first convolution, the pooling and the
+    last layer. "conv3d" has 3 × 3 × 3 convolutions, each with ReLU and batch norm, and max-pooling after every second
+    one. Dropout follows each fully connected layer. The thesis does not state the channels of "conv3d": the default
+    ones give the number of parameters and the model size of its Tables 6.2 and 6.3 (README).
 
     Args:
         input_shape: (channels, side, side, side).
-        variant: which of the two.
-        channels: of each convolution.
-        widths: of each fully connected layer; the last is the length of the features.
+        variant: "voxnet" or "conv3d".
+        channels: outputs of each convolution.
+        widths: outputs of each fully connected layer; the last is the length of the features.
         dropout: probabilities: three in "voxnet", one for each fully connected layer in "conv3d".
         padding: zeros around the grid that 3 × 3 × 3 convolutions read; with 1 they keep the side.
 
     Raises:
-        ConfigError: the input is no cube of numbers or too small, or there are more or fewer dropout layers.
+        ConfigError: the input is no cube of numbers, or is too small, or `dropout` has the wrong length.
     """
 
     bibtex = """@inproceedings{maturana2015voxnet,
@@ -94,7 +94,8 @@ class VoxNet(Encoder):
                 f"voxnet with variant={variant} and {len(planes)} convolutions needs a grid of {least} cells a side at "
                 f"least, this one has {input_shape[1]}. Make the grid finer, set padding=1, or shorten `channels`."
             )
-        # 0.7 of the time of the deeper network on a CPU, forward and in training; of VoxNet 1.2 (README)
+        # channels last takes 0.7 of the time of the deeper network on a CPU, forward and in training, but 1.2 of
+        # VoxNet's (README)
         self.layout = torch.channels_last_3d if variant == "conv3d" else torch.contiguous_format
         self.convolutions = nn.Sequential(*layers).to(memory_format=self.layout)  # pyright: ignore
         length = planes[-1] * side**3
@@ -107,6 +108,7 @@ class VoxNet(Encoder):
         self.output_shape = (length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the grids."""
         grid = inputs.to(next(self.parameters()).dtype, memory_format=self.layout)
         return self.connected(self.convolutions(grid).flatten(1))
 
@@ -114,7 +116,7 @@ class VoxNet(Encoder):
 def _voxnet(
     planes: int, side: int, channels: list[int], dropout: list[float], padding: int
 ) -> tuple[list[nn.Module], int]:
-    """The convolutions and the side of what they leave, cells; below 1 where the grid is too small."""
+    """Return the layers up to the pooling, and the side of their output, cells; below 1 if the grid is too small."""
     first, *others = channels
     layers: list[nn.Module] = [
         nn.Conv3d(planes, first, kernel_size=5, stride=2),
@@ -131,7 +133,7 @@ def _voxnet(
 def _conv3d(
     planes: int, side: int, channels: list[int], dropout: list[float], padding: int
 ) -> tuple[list[nn.Module], int]:
-    """As above."""
+    """Return the layers, and the side of their output, cells, as `_voxnet` does."""
     layers: list[nn.Module] = []
     for index, width in enumerate(channels):
         layers += [

@@ -27,18 +27,18 @@ SMALLEST = 75
 class InceptionResNetV2(Encoder):
     """Inception-ResNet-v2 for large images: 54.3 million parameters, random or from a local weight file.
 
-    The names and shapes of its weights are those of timm's `inception_resnet_v2`, so that such a file loads
-    name by name; the classifier's are left out. Images are scaled to [-1, 1], as that file wants them; one
-    channel is repeated to three.
+    Its weights have the names and shapes of timm's `inception_resnet_v2`, so that such a file loads name by name; the
+    classifier's weights are left out. Images are scaled to [-1, 1], as that file needs them. A single channel is
+    repeated to three.
 
     Args:
-        input_shape: (channels, height, width), 1 or 3 channels, at least 75 × 75 pixels; the published
-            network reads 299 × 299.
+        input_shape: (channels, height, width), 1 or 3 channels, at least 75 × 75 pixels; the published network reads
+            299 × 299.
         weights: a local file (`framework.storage.weights`), or None to start from random weights.
         dropout: probability of dropping a feature.
 
     Raises:
-        ConfigError: the input is not an image, or too small; there is no such weight file.
+        ConfigError: the input is not an image, or too small; or the weight file does not exist.
         CheckpointError: the weights do not fit, or are damaged.
     """
 
@@ -91,6 +91,7 @@ class InceptionResNetV2(Encoder):
             fill_from_file(self, weights, ignored=("classif.", "classifier."))
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch 1536"]:
+        """Return the features of the images."""
         images = inputs.to(self.conv2d_7b.conv.weight.dtype, memory_format=torch.channels_last)
         if not inputs.is_floating_point():
             images = images / 255

@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 
 class ConvNorm(nn.Module):
-    """Convolution without bias, batch norm, ReLU.
+    """A convolution without bias, batch norm and ReLU.
 
     Args:
-        kernel: height and width, or both.
+        kernel: height and width of the kernel; one number for both.
         padding: "same" keeps height and width; "valid" pads nothing.
     """
 
@@ -29,11 +29,12 @@ class ConvNorm(nn.Module):
         self.bn = nn.BatchNorm2d(outputs, eps=1e-3)
 
     def forward(self, inputs: Float[Tensor, "batch planes height width"]) -> Float[Tensor, "batch _ _ _"]:
+        """Return the maps after convolution, batch norm and ReLU."""
         return self.bn(self.conv(inputs)).relu_()
 
 
 class Branches(nn.Module):
-    """Layers side by side that read the same input; their outputs are joined along the channels."""
+    """Parallel layers that read the same input; their outputs are concatenated along the channels."""
 
     def __init__(self, *branches: nn.Module) -> None:
         super().__init__()
@@ -41,14 +42,15 @@ class Branches(nn.Module):
             self.add_module(f"branch{number}", branch)
 
     def forward(self, inputs: Float[Tensor, "batch planes height width"]) -> Float[Tensor, "batch _ _ _"]:
+        """Return the concatenated outputs of the branches."""
         return torch.cat([branch(inputs) for branch in self.children()], 1)
 
 
 class Residual(nn.Module):
-    """ReLU(x + scale · conv(branches(x))), the scaled Inception-ResNet block of Szegedy et al. 2017.
+    """The scaled Inception-ResNet block ReLU(x + scale · conv(branches(x))) of Szegedy et al. 2017.
 
     Args:
-        relu: whether the sum is rectified; the last block's is not.
+        relu: whether the sum is rectified; that of the last block is not.
     """
 
     def __init__(
@@ -63,22 +65,25 @@ class Residual(nn.Module):
     def forward(
         self, inputs: Float[Tensor, "batch planes height width"]
     ) -> Float[Tensor, "batch planes height width"]:
+        """Return the maps after the residual block."""
         joined = torch.cat([self.get_submodule(f"branch{number}")(inputs) for number in range(self.count)], 1)
         total = torch.add(inputs, self.conv2d(joined), alpha=self.scale)
         return total.relu_() if self.relu else total
 
 
 def mixed_5b() -> Branches:
+    """Return the block Mixed 5b, from 192 to 320 channels."""
     return Branches(
         ConvNorm(192, 96),
         nn.Sequential(ConvNorm(192, 48), ConvNorm(48, 64, 5)),
         nn.Sequential(ConvNorm(192, 64), ConvNorm(64, 96, 3), ConvNorm(96, 96, 3)),
-        # padding is left out of the mean, as in the TensorFlow code the published weights come from
+        # the mean excludes padding, as in the TensorFlow code that the published weights come from
         nn.Sequential(nn.AvgPool2d(3, stride=1, padding=1, count_include_pad=False), ConvNorm(192, 64)),
     )
 
 
 def block35() -> Residual:
+    """Return a residual block for 320 channels."""
     return Residual(
         320,
         128,
@@ -90,6 +95,7 @@ def block35() -> Residual:
 
 
 def mixed_6a() -> Branches:
+    """Return the reduction Mixed 6a, from 320 to 1088 channels and half the size."""
     return Branches(
         ConvNorm(320, 384, 3, stride=2, padding="valid"),
         nn.Sequential(
@@ -100,6 +106,7 @@ def mixed_6a() -> Branches:
 
 
 def block17() -> Residual:
+    """Return a residual block for 1088 channels."""
     return Residual(
         1088,
         384,
@@ -110,6 +117,7 @@ def block17() -> Residual:
 
 
 def mixed_7a() -> Branches:
+    """Return the reduction Mixed 7a, from 1088 to 2080 channels and half the size."""
     return Branches(
         nn.Sequential(ConvNorm(1088, 256), ConvNorm(256, 384, 3, stride=2, padding="valid")),
         nn.Sequential(ConvNorm(1088, 256), ConvNorm(256, 288, 3, stride=2, padding="valid")),
@@ -121,6 +129,7 @@ def mixed_7a() -> Branches:
 
 
 def block8(*, scale: float = 0.20, relu: bool = True) -> Residual:
+    """Return a residual block for 2080 channels."""
     return Residual(
         2080,
         448,

@@ -1,6 +1,6 @@
-"""Rows of the contract: one, of grey images as small as may be: each check takes seconds.
+"""Rows of the contract: one, with the smallest grey images, since each check takes seconds.
 
-Colour, against timm's features, is in test_inception_resnet_v2.py.
+The comparison of colour images with timm's features is in test_inception_resnet_v2.py.
 """
 
 from framework.testing.rows import EncoderRow

@@ -16,21 +16,21 @@ Probability = Annotated[float, Field(ge=0, lt=1)]
 
 
 class MLP(Encoder):
-    """Fully connected layers; flattens whatever comes in.
+    """Fully connected layers on the flattened input.
 
-    Each layer is linear, batch norm where asked for, ReLU or ELU (Clevert et al. 2016), dropout; with
-    `batch_norm="after_relu"` linear, units, batch norm, dropout, the blocks of thesis §6.5.1.
+    Each layer is linear, batch norm if requested, ReLU or ELU (Clevert et al. 2016), dropout. With
+    `batch_norm="after_relu"` the order is linear, activation, batch norm, dropout, as in the blocks of thesis §6.5.1.
 
     Args:
         input_shape: any; a sample is flattened.
         widths: output length of each layer; with an empty list the features are the flattened input.
-        dropout: probability of dropping an output of a layer; one for all layers, or one for each.
-        batch_norm: whether to normalise over the batch, before the units or after them; training then needs batches of
-            at least two.
+        dropout: probability of dropping an output of a layer; one number for all layers, or one for each.
+        batch_norm: whether to normalise over the batch, before the activation or after it; training then needs batches
+            of at least two.
         activation: rectified, or exponential linear units.
 
     Raises:
-        ConfigError: a sample holds no numbers, or there are more or fewer probabilities than layers.
+        ConfigError: a sample holds no numbers, or the number of probabilities differs from that of layers.
     """
 
     bibtex = """@article{rumelhart1986learning,
@@ -68,17 +68,20 @@ class MLP(Encoder):
         before, after = batch_norm is True, batch_norm == "after_relu"
         units = {"relu": nn.ReLU, "elu": nn.ELU}[activation]
         for width, drop in zip(widths, drops, strict=True):
-            layers.append(nn.Linear(length, width, bias=not before))  # batch norm behind it has its own
+            layers.append(
+                nn.Linear(length, width, bias=not before)
+            )  # the batch norm after it has its own bias
             layers += [nn.BatchNorm1d(width)] * before
             layers.append(units(inplace=True))
             layers += [nn.BatchNorm1d(width)] * after
             layers.append(nn.Dropout(drop))
             length = width
         self.layers = nn.Sequential(*layers)
-        self.vectorises = not batch_norm  # whose running moments are buffers
+        self.vectorises = not batch_norm  # its running moments are buffers
         self.output_shape = (length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the flattened inputs."""
         numbers = inputs.flatten(1)
         own = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         dtype = next((parameter.dtype for parameter in self.parameters()), own)

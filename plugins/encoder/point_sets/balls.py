@@ -1,4 +1,4 @@
-"""Points of clouds within balls about some of them, compiled at the first call; the compiled code is kept on disk."""
+"""Search for the points within balls around centroids; it is compiled at the first call and kept on disk."""
 
 from pathlib import Path
 from typing import no_type_check
@@ -21,17 +21,18 @@ def within(
     radius: float,
     most: int,
 ) -> Int[Tensor, "centroid most"]:
-    """Rows of the points that are within a radius of each centroid: the first so many of its cloud, in their order.
+    """Return rows of the points within a radius of each centroid: the first `most` of its cloud, in their order.
 
-    The first points of each cloud are its centroids, all where it has fewer. Where fewer points are within the radius
-    the first of them stands in the places left. Computed in float64 on the processor, wherever the clouds are.
+    The first points of each cloud are its centroids, all of them if it has fewer. If fewer than `most` points are
+    within the radius, the first of them fills the remaining places. The distances are computed in float64 on the CPU,
+    whatever device the clouds are on.
 
     Args:
-        places: of all clouds one after the other.
-        counts: how many points each cloud has.
-        centroids: how many of each cloud.
-        radius: in units of the places; what is exactly so far away is within.
-        most: how many are wanted of each ball.
+        places: positions of the points of all clouds, concatenated.
+        counts: number of points of each cloud.
+        centroids: number of centroids of each cloud.
+        radius: in units of the positions; a point at exactly this distance is within.
+        most: number of rows returned for each ball.
     """
     coordinates = np.ascontiguousarray(places.detach().cpu().double().numpy())
     found = _within(coordinates, counts.cpu().numpy(), centroids, radius * radius, most)

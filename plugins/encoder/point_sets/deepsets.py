@@ -1,4 +1,4 @@
-"""Deep Sets (Zaheer et al. 2017), as for point clouds."""
+"""Deep Sets (Zaheer et al. 2017), in the form for point clouds."""
 
 from typing import Annotated, Literal
 
@@ -16,18 +16,20 @@ ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
 
 
 class DeepSets(Encoder):
-    """Equivariant layers: each point's numbers relative to the largest over its cloud; then the maximum over the cloud.
+    """Equivariant layers on each point's difference from the maximum over its cloud, then a maximum over the cloud.
 
-    x ↦ σ(β + (x - 1 max x) Γ), the layer that the paper uses on clouds. Neither the order of the points nor padding
-    changes the features; nor does what all points have in common, so that a shift of the cloud does not either.
+    The layer is x ↦ σ(β + (x - 1 max x) Γ), which the paper uses on clouds. The features do not depend on the order of
+    the points or on padding. They do not depend on a value that all points have in common either, such as a shift of
+    the cloud.
 
     Args:
         input_shape: (points, columns).
-        channels: of the equivariant layers.
-        widths: of the layers after the maximum; the last is the length of the features.
+        channels: outputs of each equivariant layer.
+        widths: outputs of each layer after the maximum; the last is the length of the features.
         activation: σ.
-        dropout: before and after the layers that follow the maximum.
-        points: of each cloud at most so many are read, the first; None for all. 100 is the thesis's "micro".
+        dropout: probability of dropping a number before and after each layer that follows the maximum.
+        points: largest number of points that are read of a cloud, the first ones; None for all. 100 is the thesis's
+            "micro".
         normalise: as of framework.geometry.clouds.normalised.
         attributes: whether columns after x, y, z are read too.
 
@@ -71,6 +73,7 @@ class DeepSets(Encoder):
         self.output_shape = (length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the clouds."""
         dtype = next(self.parameters()).dtype
         return over_points(self._described, inputs, self.reading, dtype, training=self.training)
 
@@ -83,21 +86,21 @@ class DeepSets(Encoder):
         *others, final = self.equivariant
         for layer in others:
             values = self.activation(layer(below_largest(values, counts)))  # Zaheer et al. 2017, §4.2
-        # σ grows, so that the largest may pass it alone
+        # σ is increasing, so that it may be applied after the maximum
         return self.whole(self.activation(largest(final(below_largest(values, counts)), counts)))
 
     @torch.no_grad()
     def _attaining(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> tuple[Int[Tensor, "attaining"], Int[Tensor, "batch"]]:
-        """Rows of the points that attain a largest number of any layer, and how many there are of each cloud.
+        """Return the rows of the points that attain a maximum of any layer, and their number in each cloud.
 
-        A network of these alone says the same, and no other point has a gradient (PointNet's critical points: Qi et al.
-        2017, §4.3, theorem 2). Where several attain a number, one is chosen.
+        The network gives the same features for these points alone, and no other point has a gradient (PointNet's
+        critical points: Qi et al. 2017, §4.3, theorem 2). Where several points attain a maximum, one is chosen.
         """
         *_, final = self.equivariant
         found = []
-        for part in values.split(counts.tolist()):  # one cloud's numbers stay in a CPU's cache
+        for part in values.split(counts.tolist()):  # the numbers of one cloud stay in a CPU's cache
             most, index = part.mT.max(1, keepdim=True)
             columns, chosen = part.mT, [index]
             for layer in self.equivariant:
@@ -115,5 +118,5 @@ class DeepSets(Encoder):
 def below_largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
-    """x - 1 max x, over each cloud."""
+    """Return x - 1 max x, with the maximum over each cloud."""
     return values - to_points(largest(values, counts), counts)

@@ -6,7 +6,7 @@ from torch import nn
 
 
 def layers(length: int, widths: Sequence[int]) -> nn.Sequential:
-    """Linear, batch norm, ReLU for each width; batch norm has the bias."""
+    """Return linear, batch norm and ReLU layers for each width; the bias is in the batch norm."""
     found: list[nn.Module] = []
     for width in widths:
         found += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]

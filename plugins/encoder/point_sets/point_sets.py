@@ -1,4 +1,4 @@
-"""Functions of sets: the points of a batch of clouds one after the other, and the largest numbers over each cloud."""
+"""Functions of sets: concatenating the points of a batch of clouds, and maxima over each cloud."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,12 +11,12 @@ from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, normalised, require_clouds, sizes
 
 AT_ONCE = 2**12
-"""Points that a CPU takes through a network together: more leave its caches (2^16 are half as fast)."""
+"""Number of points that a CPU takes through a network together: more leave its caches (2^16 are half as fast)."""
 AT_ONCE_ON_DEVICE = 2**19
 
 
 def columns_read(input_shape: tuple[int, ...], by: str, attributes: bool) -> int:
-    """How many columns of its clouds an encoder reads: the coordinates, and the attributes where they are asked for.
+    """Return how many columns of its clouds an encoder reads: the coordinates, and the attributes if requested.
 
     Raises:
         ConfigError: the input is no cloud, or has no attributes.
@@ -30,7 +30,13 @@ def columns_read(input_shape: tuple[int, ...], by: str, attributes: bool) -> int
 
 
 class Reading(NamedTuple):
-    """What an encoder reads of its clouds: the first `columns`, of `most` points at most (None for all), normalised."""
+    """The part of its clouds that an encoder reads.
+
+    Attributes:
+        columns: number of columns, the first ones.
+        most: largest number of points of a cloud, the first ones; None for all.
+        normalise: as of `framework.geometry.clouds.normalised`.
+    """
 
     columns: int
     most: int | None
@@ -46,10 +52,11 @@ def over_points(
     training: bool,
     held: int = 1,
 ) -> Float[Tensor, "batch features"]:
-    """What a network says of clouds, given their points (as `points_of`) and how many each has; in parts where it may.
+    """Return the features that a network computes of clouds, in parts of the batch where possible.
 
     Args:
-        training: whether the whole batch is wanted at once, as batch norm does.
+        network: function of the points (as `points_of` returns them) and of the number of points of each cloud.
+        training: whether the network needs the whole batch at once, as batch norm does.
         held: as of `in_parts`.
     """
     columns, most, normalise = reading
@@ -67,13 +74,13 @@ def points_of(
     most: int | None,
     dtype: torch.dtype,
 ) -> tuple[Float[Tensor, "point read"], Int[Tensor, "batch"]]:
-    """The points of all clouds one after the other, normalised, without padding; and how many each cloud has.
+    """Return the points of all clouds, concatenated, normalised and without padding, and the number of points of each.
 
     Args:
-        normalise: as of `framework.geometry.clouds.normalised`; it sees all points.
-        columns: the first so many are read.
-        most: of each cloud no more points are read, the first ones; None for all.
-        dtype: of the points returned.
+        normalise: as of `framework.geometry.clouds.normalised`; it reads all points.
+        columns: number of columns that are read, the first ones.
+        most: largest number of points that are read of a cloud, the first ones; None for all.
+        dtype: dtype of the points returned.
 
     Raises:
         DataError: as `framework.geometry.clouds.sizes`.
@@ -90,7 +97,7 @@ def points_of(
 def largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "batch channels"]:
-    """The largest number of each channel over the points of each cloud; every cloud has one point at least."""
+    """Return the maximum of each channel over the points of each cloud; every cloud has at least one point."""
     count, channels = len(counts), values.shape[1]
     if count == 0:
         return values.new_zeros(0, channels)
@@ -100,7 +107,7 @@ def largest(
 
 
 def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
-    """Rows of the first so many points of each cloud, of all points one after the other."""
+    """Return the rows, among all points concatenated, of the first `most` points of each cloud."""
     if len(counts) == 0:
         return counts
     start = counts.cumsum(0) - counts
@@ -111,12 +118,12 @@ def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
 def to_points(
     values: Float[Tensor, "batch channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
-    """What belongs to a cloud, at each of its points."""
+    """Return the values of each cloud, repeated for each of its points."""
     return values.repeat_interleave(counts, 0)
 
 
 def even(counts: Int[Tensor, "batch"], points: int) -> bool:
-    """Whether every cloud has so many points."""
+    """Return whether every cloud has `points` points."""
     return bool((counts == points).all())
 
 
@@ -126,12 +133,13 @@ def in_parts(
     counts: Int[Tensor, "batch"],
     held: int = 1,
 ) -> Float[Tensor, "batch features"]:
-    """What a network says of points and counts, given few clouds at a time so that their numbers stay near.
+    """Return the features of a network of points and counts, computed for few clouds at a time to stay in caches.
 
-    For evaluation without gradient: with it all are held anyway, and batch norm in training wants the whole batch.
+    It is for evaluation without gradient: a gradient holds all numbers anyway, and batch norm in training needs the
+    whole batch.
 
     Args:
-        held: rows of numbers that the network makes of a point, about.
+        held: approximate number of rows of numbers that the network makes of a point.
     """
     limit = (AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE) // held
     total, groups = 0, [[]]

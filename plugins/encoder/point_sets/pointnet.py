@@ -15,26 +15,27 @@ from plugins.encoder.point_sets.pooled import largest_after
 
 Width = Annotated[int, Field(gt=0)]
 LOCAL = 2
-"""Layers that every point passes before its features are transformed."""
+"""Number of layers that every point passes before its features are transformed."""
 
 
 class PointNet(Encoder):
-    """Every point passes the same layers; the largest number of each channel over the cloud describes it.
+    """Every point passes the same layers; the features of the cloud are the maxima of each channel over its points.
 
-    "full" also predicts from the cloud a 3 × 3 matrix that every point is multiplied by, and one that the features of
-    every point are multiplied by after two layers. The paper adds a term to the loss that keeps the latter near a
-    rotation; an encoder has no loss, so it is left out here. "vanilla" has no such matrices. Every layer has batch norm
-    and ReLU. Neither the order of the points nor padding changes the features.
+    "full" also predicts two matrices from the cloud: a 3 × 3 matrix that every point is multiplied by, and a matrix
+    that the features of every point are multiplied by after two layers. The paper adds a term to the loss that keeps
+    the latter near a rotation. An encoder has no loss, so this term is left out here. "vanilla" has no such matrices.
+    Every layer has batch norm and ReLU. Neither the order of the points nor padding changes the features.
 
     Args:
         input_shape: (points, columns).
-        variant: which of the two.
-        point_widths: of the layers that every point passes; the matrices are predicted by those after the second.
-        widths: of the layers after the maximum; the last is the length of the features.
-        dropout: after the last layer.
-        points: of each cloud at most so many are read, the first; None for all.
+        variant: "full" or "vanilla".
+        point_widths: outputs of each layer that every point passes; the matrices are predicted by layers with the
+            widths after the second.
+        widths: outputs of each layer after the maximum; the last is the length of the features.
+        dropout: probability of dropping an output of the last layer.
+        points: largest number of points that are read of a cloud, the first ones; None for all.
         normalise: as of framework.geometry.clouds.normalised.
-        attributes: whether columns after x, y, z are read too; the first matrix leaves them alone.
+        attributes: whether columns after x, y, z are read too; the first matrix does not change them.
 
     Raises:
         ConfigError: the input is no cloud, or has no attributes to read.
@@ -74,6 +75,7 @@ class PointNet(Encoder):
         self.output_shape = (widths[-1],)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the clouds."""
         dtype = next(self.parameters()).dtype
         return over_points(self._described, inputs, self.reading, dtype, training=self.training)
 
@@ -90,12 +92,12 @@ class PointNet(Encoder):
 
 
 class Matrix(nn.Module):
-    """A square matrix predicted from a cloud by a small PointNet; near the identity before training.
+    """A square matrix that a small PointNet predicts from a cloud; it is near the identity before training.
 
     Args:
-        size: rows and columns; also the numbers of a point.
-        point_widths: of the layers that every point passes.
-        widths: of the layers after the maximum.
+        size: number of rows and columns; also of the numbers of a point.
+        point_widths: outputs of each layer that every point passes.
+        widths: outputs of each layer after the maximum.
     """
 
     def __init__(self, size: int, point_widths: list[int], widths: list[int]) -> None:
@@ -106,13 +108,14 @@ class Matrix(nn.Module):
         self.entries = nn.Linear(widths[-1], size * size)
         with (
             torch.no_grad()
-        ):  # small, not 0 as in the paper: so gradient reaches the layers before it at once
+        ):  # small, not 0 as in the paper: so the gradient reaches the layers before it from the first step
             self.entries.weight.mul_(0.01)
             self.entries.bias.copy_(torch.eye(size).flatten())
 
     def forward(
         self, values: Float[Tensor, "point size"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch size size"]:
+        """Return the matrix of each cloud from its points."""
         entries = self.entries(self.whole(largest_after(self.each, values, counts)))
         return entries.unflatten(1, (self.size, self.size))
 
@@ -122,6 +125,6 @@ def multiplied(
     matrices: Float[Tensor, "batch size size"],
     counts: Int[Tensor, "batch"],
 ) -> Float[Tensor, "point size"]:
-    """Every point times the matrix of its cloud."""
+    """Return every point times the matrix of its cloud."""
     parts = zip(values.split(counts.tolist()), matrices, strict=True)
     return torch.cat([values[:0], *(part @ matrix for part, matrix in parts)])

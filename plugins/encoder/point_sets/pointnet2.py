@@ -19,12 +19,12 @@ Count = Annotated[int, Field(gt=0)]
 
 
 class Scale(NamedTuple):
-    """Balls of one size about the centroids of a level, and the layers that their points pass.
+    """Balls of one size around the centroids of a level, and the layers that their points pass.
 
     Attributes:
-        radius: in radii of the first level's balls at single scale.
-        neighbours: points of a ball at most.
-        widths: of the layers.
+        radius: in units of the radius of the first level's balls in "single_scale".
+        neighbours: largest number of points of a ball.
+        widths: outputs of each layer.
     """
 
     radius: float
@@ -33,7 +33,7 @@ class Scale(NamedTuple):
 
 
 PUBLISHED = {
-    # Qi et al. 2017, "PointNet++", supplement on architectures; numbers of neighbours as in the authors' code
+    # Qi et al. 2017, "PointNet++", supplement on architectures; the numbers of neighbours are from the authors' code
     "single_scale": (
         (Scale(1, 32, (64, 64, 128)),),
         (Scale(2, 64, (128, 128, 256)),),
@@ -43,31 +43,33 @@ PUBLISHED = {
         (Scale(1, 32, (64, 64, 128)), Scale(2, 64, (128, 128, 256)), Scale(4, 128, (128, 128, 256))),
     ),
 }
-"""Of each level."""
+"""Published scales of each level, by grouping."""
 WHOLE, LAST = (256, 512, 1024), (512, 256)
-"""Widths of the layers that the last centroids pass, and of those after the maximum over them."""
+"""Widths of the layers that the last centroids pass, and of the layers after the maximum over them."""
 REACH = 5
-"""How far a cloud is meant to reach from the origin, in radii of the first level's balls: 1 as published."""
+"""Intended largest distance of a cloud from the origin, in radii of the first level's balls: 1 as published."""
 
 
 class PointNet2(Encoder):
-    """A PointNet for the points of small balls, one for larger balls about fewer places, one for the whole cloud.
+    """A PointNet on small balls of points, one on larger balls around fewer centroids, and one on the whole cloud.
 
-    Centroids are points as far as can be from each other, the first from the mean of the cloud
-    (`framework.geometry.farthest`). A ball is described by where its points are relative to the centroid and what is
-    known of them: they pass the same layers, each with batch norm and ReLU, then the largest number of each channel
-    stands at the centroid. A ball with more points than are read is described by those that are far from each other.
-    Padding changes no feature, and the order of the points none but where distances are equal, as in a lattice: of
-    equally far points the first is chosen. Nor do, in evaluation, points that come twice, if each does.
+    Centroids are points that are as far as possible from each other; the first is the farthest from the mean of the
+    cloud (`framework.geometry.farthest`). A ball is described by its points: their positions relative to the centroid,
+    and their features. They all pass the same layers, each with batch norm and ReLU; the maximum of each channel over
+    the ball is the feature of the centroid. If a ball has more points than are read, points that are far from each
+    other are read. Padding changes no feature. The order of the points changes none unless distances are equal, as in a
+    lattice: of equally far points the first is chosen. In evaluation, points that occur twice change no feature if each
+    point does.
 
     Args:
         input_shape: (points, columns).
-        grouping: "single_scale", balls of one size about a centroid; or "multi_scale", of three.
-        centroids: of the two levels; all points of clouds that have fewer.
-        radius: of the first level's balls at single scale, in units of the normalised cloud; others in proportion.
+        grouping: "single_scale", balls of one size around a centroid; or "multi_scale", balls of three sizes.
+        centroids: numbers of centroids of the two levels; clouds that have fewer points use all.
+        radius: radius of the first level's balls in "single_scale", in units of the normalised cloud; others in
+            proportion.
         width: factor of the published widths of all layers.
-        dropout: after each of the two last layers.
-        points: of each cloud at most so many are read, the first; None for all.
+        dropout: probability of dropping an output of each of the two last layers.
+        points: largest number of points that are read of a cloud, the first ones; None for all.
         normalise: as of framework.geometry.clouds.normalised.
         attributes: whether columns after x, y, z are read too.
 
@@ -113,10 +115,11 @@ class PointNet2(Encoder):
             after = last
         self.last = nn.Sequential(*found)
         self.output_shape = (after,)
-        # numbers of one cloud at a time stay near a CPU, those of several do not
+        # the numbers of one cloud at a time fit into a CPU's cache, those of several do not
         self.held = max(scale.neighbours for level in PUBLISHED[grouping] for scale in level)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
+        """Return the features of the clouds."""
         if self.reading.normalise == "none":
             require_normalised(inputs[..., :3], REACH * self.radius, sizes(inputs), by="encoder pointnet2")
         dtype = next(self.parameters()).dtype
@@ -135,13 +138,13 @@ class PointNet2(Encoder):
 
 
 class Level(nn.Module):
-    """Fewer points, each with what is known of the balls about it ("set abstraction").
+    """A level that replaces points by centroids with features of the balls around them ("set abstraction").
 
     Args:
-        length: how many numbers are known of a point.
-        centroids: how many points of each cloud stay.
-        radius: of the scales' unit.
-        scales: of the balls; what is known of each stands one after the other.
+        length: number of features of a point.
+        centroids: number of points of each cloud that remain.
+        radius: unit of the scales' radii.
+        scales: the balls; the features of the scales are concatenated.
         width: factor of the scales' widths.
     """
 
@@ -159,8 +162,8 @@ class Level(nn.Module):
         values: Float[Tensor, "point length"],
         counts: Int[Tensor, "batch"],
     ) -> tuple[Float[Tensor, "centroid 3"], Float[Tensor, "centroid channels"], Int[Tensor, "batch"]]:
-        """Places and values of points, those of a cloud as `spread` orders them, to those of the centroids."""
-        # a beginning of such an order is the order of its points, so that it is found once for all levels
+        """Return positions and features of the centroids, and their counts, from points in the order of `spread`."""
+        # The first points in this order are also the centroids, in their order. It is found once for all levels.
         centres = places[first_rows(counts, self.centroids)]
         found = []
         for (radius, most), network in zip(self.balls, self.networks, strict=True):
@@ -176,27 +179,30 @@ def described(
     centres: Float[Tensor, "centroid 3"],
     index: Int[Tensor, "centroid most"],
 ) -> Float[Tensor, "centroid channels"]:
-    """The largest number of each channel over the points of each ball, whose places relative to the centroid and whose
-    values have passed a network."""
+    """Return the maximum of each channel over the points of each ball, after a network.
+
+    The network reads the points' positions relative to the centroid, and their features.
+    """
     enter, *others, last = network.children()
     weight = enter.get_parameter("weight")
     rows = index.flatten()
     offset = places.index_select(0, rows) - centres.repeat_interleave(index.shape[1], 0)
-    # a linear layer of (offset, value) is one of the offset and one of the value, which is a point's and not a ball's
+    # A linear layer of (offset, value) is the sum of one of the offset and one of the value. The latter is computed
+    # once for each point, not for each ball.
     found = linear(offset, weight[:, :3])
     if values.shape[1]:
         found = found + linear(values, weight[:, 3:]).index_select(0, rows)
     for layer in others:
         found = layer(found)
     found = found.unflatten(0, index.shape)
-    # `max` has the faster gradient, `amax` the faster value; the last layer is a ReLU, which the largest may pass alone
+    # `max` has the faster gradient, `amax` the faster value. The last layer is a ReLU, which may follow the maximum.
     return last(found.max(1).values if found.requires_grad else found.amax(1))
 
 
 def spread(
     values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point columns"]:
-    """The points of each cloud, each as far as can be from those before it."""
+    """Return the points of each cloud in an order in which each is as far as possible from the points before it."""
     if len(counts) == 0:
         return values
     places = pad(values[:, :3].detach().split(counts.tolist()))
@@ -207,4 +213,5 @@ def spread(
 
 
 def scaled(widths: tuple[int, ...], factor: float) -> tuple[int, ...]:
+    """Return the widths times a factor, rounded, at least 1."""
     return tuple(max(1, round(factor * width)) for width in widths)

@@ -1,6 +1,7 @@
-"""The largest numbers over each cloud after layers of `layers`, without the numbers of every point where they can be
-spared: a step of PointNet then takes a quarter of the time and a third of the memory, as benchmarks/clouds/set_steps.md
-says."""
+"""Maxima over each cloud after layers of `layers`, without computing the outputs of every point where possible.
+
+A step of PointNet then takes a quarter of the time and a third of the memory (benchmarks/clouds/set_steps.md).
+"""
 
 from typing import cast
 
@@ -12,20 +13,19 @@ from torch.nn.functional import linear
 from plugins.encoder.point_sets.point_sets import largest
 
 POINTS = 64
-"""Of a cloud on average, from which on the rows that attain a maximum are few beside all; by count, not by a measured
-limit."""
+"""Smallest mean number of points of a cloud for which few rows attain a maximum; by count, not by a measured limit."""
 
 
 def largest_after(
     network: nn.Sequential, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "batch channels"]:
-    """`largest(network(values), counts)`, to rounding, with its gradient.
+    """Return `largest(network(values), counts)`, to rounding, with its gradient.
 
-    ReLU and, for one channel, batch norm are monotone: the largest number over a cloud is that of the point with the
-    largest (where the norm's factor is negative, the smallest) number before them. In evaluation the norm is a part of
-    the last linear layer. In training its moments over all points are those of the layer's inputs, W m and Wᵀ C W, so
-    that only the points which attain a maximum pass the layer with a gradient. Where several attain it, one has the
-    gradient.
+    ReLU and, for one channel, batch norm are monotone. The maximum over a cloud therefore belongs to the point with the
+    largest number before them (the smallest where the norm's factor is negative). In evaluation the norm is folded into
+    the last linear layer. In training its moments over all points follow from those of the layer's inputs, W m and Wᵀ C
+    W, so that only the points which attain a maximum pass the layer with a gradient. Where several points attain a
+    maximum, one of them has the gradient.
     """
     *others, final, norm, _ = network.children()
     for layer in others:
@@ -41,20 +41,21 @@ def largest_after(
 def folded(
     final: nn.Linear, norm: nn.BatchNorm1d
 ) -> tuple[Float[Tensor, "channels columns"], Float[Tensor, "channels"]]:
-    """Weight and bias of a linear layer without bias that a batch norm with running moments follows."""
+    """Return weight and bias of a linear layer without bias merged with the batch norm after it, by running moments."""
     assert norm.running_mean is not None and norm.running_var is not None
     factor = norm.weight * (norm.running_var + norm.eps).rsqrt()
     return final.weight * factor.unsqueeze(1), norm.bias - norm.running_mean * factor
 
 
 def _pays(final: nn.Linear, norm: nn.Module, values: Tensor, counts: Tensor) -> bool:
-    """Whether there is a gradient, on a CPU, in the layer's own precision, and less to be computed for it.
+    """Return whether the shortcut applies and needs less computation.
 
-    The covariance of the inputs takes columns / channels of a pass, the rows gathered clouds / points.
+    It applies with a gradient, on a CPU, in the layer's own precision. The covariance of the inputs takes columns /
+    channels of a pass, the gathered rows clouds / points.
     """
     return (
         torch.is_grad_enabled()
-        and type(norm) is nn.BatchNorm1d  # SyncBatchNorm has the moments of other processes
+        and type(norm) is nn.BatchNorm1d  # SyncBatchNorm also uses the moments of other processes
         and values.device.type == "cpu"
         and not torch.is_autocast_enabled("cpu")
         and final.out_features >= 2 * final.in_features
@@ -68,8 +69,11 @@ def _of_attaining(
     values: Float[Tensor, "point columns"],
     counts: Int[Tensor, "batch"],
 ) -> Float[Tensor, "batch channels"] | None:
-    """The largest numbers after linear layer and batch norm in training; None where the covariance of the inputs
-    leaves too few digits of a channel's variance, which is then a small difference of large numbers."""
+    """Return the maxima after linear layer and batch norm in training, or None if the variance would be too inexact.
+
+    The covariance of the inputs then leaves too few digits of a channel's variance, which is a small difference of
+    large numbers.
+    """
     weight = final.weight
     mean = values.mean(0)
     centred = values - mean
@@ -91,17 +95,17 @@ def attaining(
     weight: Float[Tensor, "channels columns"],
     counts: Int[Tensor, "batch"],
 ) -> Int[Tensor, "batch channels"]:
-    """Of each cloud and channel the row, of all points, with the largest product."""
+    """Return for each cloud and channel the row, among all points, with the largest product."""
     start = (counts.cumsum(0) - counts).tolist()
-    parts = values.split(counts.tolist())  # one cloud's numbers stay in a CPU's cache
-    # transposed, so that a channel's numbers lie side by side
+    parts = values.split(counts.tolist())  # the numbers of one cloud stay in a CPU's cache
+    # transposed, so that the numbers of a channel are contiguous
     return torch.stack(
         [first + (weight @ part.mT).argmax(1) for first, part in zip(start, parts, strict=True)]
     )
 
 
 def _moved(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor, points: int) -> None:
-    """Running moments as `nn.BatchNorm1d` moves them."""
+    """Update the running moments as `nn.BatchNorm1d` does."""
     if norm.running_mean is None or norm.running_var is None or norm.num_batches_tracked is None:
         return
     norm.num_batches_tracked.add_(1)

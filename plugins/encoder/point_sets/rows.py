@@ -6,7 +6,7 @@ COLOURED = ("x", "y", "z", "red", "green", "blue")
 
 
 def rows(first: CloudRow, second: CloudRow) -> tuple[CloudRow, ...]:
-    """Two rows, and the second's network on attributes and on the first points alone."""
+    """Return the two rows, and rows of the second's network on attributes and on the first points alone."""
     small = second.config
     return (
         first,

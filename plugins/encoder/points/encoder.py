@@ -1,4 +1,4 @@
-"""The points themselves, as many of each cloud."""
+"""The points themselves, an equal number of each cloud."""
 
 from typing import Annotated
 
@@ -12,16 +12,16 @@ from plugins.encoder.points.subset import Choice, chosen
 
 
 class Points(Encoder):
-    """A fixed number of points of each normalised cloud, with their attributes: what networks on point sets read.
+    """A fixed number of points of each normalised cloud, with their attributes, for networks on point sets.
+
+    Features are (points, columns), of the clouds' dtype.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
-        points: how many; smaller clouds repeat theirs.
-        choice: "random", or "farthest" from those chosen before (`plugins.encoder.points.subset`).
-        normalise: as `framework.geometry.clouds.normalised`, of the whole cloud.
-        seed: of "random"; the run's seed has no part in it.
-
-    Features are (points, columns), of the clouds' dtype.
+        points: number of points; smaller clouds repeat theirs.
+        choice: "random", or "farthest" from the points chosen before (`plugins.encoder.points.subset`).
+        normalise: as `framework.geometry.clouds.normalised`; it reads the whole cloud.
+        seed: seed of "random"; the run's seed has no influence on it.
 
     Raises:
         ConfigError: an input that is no cloud.
@@ -56,6 +56,7 @@ class Points(Encoder):
         self.output_shape = (points, input_shape[1])
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        """Return the chosen points of the clouds."""
         counts = sizes(inputs)
         clouds = normalised(inputs, self.normalise, counts).clouds
         index = chosen(clouds, counts, self.points, self.choice, self.seed)

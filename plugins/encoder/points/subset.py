@@ -1,4 +1,4 @@
-"""As many points of a cloud as are wanted, the same ones at every call."""
+"""The choice of a fixed number of points of a cloud; every call chooses the same points."""
 
 from functools import lru_cache
 from typing import Literal
@@ -20,9 +20,9 @@ def chosen(
     choice: Choice,
     seed: int,
 ) -> Int[Tensor, "batch count"]:
-    """Which points of each cloud, as indices; those of a cloud that has fewer in turn, over and over.
+    """Return the indices of the chosen points of each cloud; a cloud with fewer points repeats them in turn.
 
-    "random": drawn without replacement, by the seed and the cloud's size alone. "farthest": as
+    "random": drawn without replacement; the choice depends on the seed and the cloud's size alone. "farthest": as
     `framework.geometry.farthest`.
 
     Args:
@@ -36,6 +36,6 @@ def chosen(
 
 @lru_cache(maxsize=4096)
 def _random(size: int, count: int, seed: int) -> Int[Tensor, "count"]:
-    # NumPy promises the bits of its legacy generator for good
+    # NumPy guarantees that its legacy generator always gives the same bits
     order = np.random.RandomState([seed, size]).permutation(size)
     return torch.from_numpy(order[np.arange(count) % size].astype(np.int64))

@@ -1,1 +1,1 @@
-"""Coloured points as an image: the nearest point of each pixel, and the surface between points."""
+"""Images of coloured points: the nearest point of each pixel, and the surface between the points."""

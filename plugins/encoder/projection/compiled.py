@@ -1,9 +1,10 @@
-"""Which point of a cloud each pixel shows, on one CPU core; compiled functions on NumPy arrays.
+"""Compiled functions on NumPy arrays that find which point of a cloud each pixel shows, on one CPU core.
 
 Arrays:
-    cloud: (points, columns) float32 or float64: x, y, z before the canonical camera, metres; red, green, blue.
-    depth: (height, width) float32, metres; infinite where nothing is seen.
-    index: (height, width) int32: the point that is seen; -1 where there is none.
+    cloud: (points, columns) float32 or float64: x, y, z in the canonical camera's coordinates, metres; red, green,
+        blue.
+    depth: (height, width) float32, metres; infinite where no point is seen.
+    index: (height, width) int32: the point that is seen; -1 where no point is seen.
     picture: (channels, height, width) of the cloud's type.
 """
 
@@ -15,20 +16,21 @@ import numpy as np
 from framework.storage.kernels import compiler, kept_in
 
 KERNELS = ("compiled",)
-"""Files whose functions call each other."""
+"""Names of the compiled files whose functions call each other."""
 compiled = compiler(kept_in("projection", [Path(__file__)]))
 
 
 @compiled
 @no_type_check
 def project(cloud, focal, middle, nearest, farthest, depth, index, picture):
-    """Fill `depth`, and `index` or `picture`; the other is None, and compiled away.
+    """Fill `depth`, and either `index` or `picture`; the other one is None, and its branch is compiled away.
 
-    All decisions are those of `encoder.project`, made in float64; a number that is NaN fails every comparison.
+    All decisions equal those of `encoder.project` and are made in float64. A NaN fails every comparison, so that its
+    point is left out.
 
     Args:
-        focal, middle: pixels; `middle` is (column, row) of the principal point from the image's upper left corner,
-            half a pixel more than from the centre of its first pixel.
+        focal, middle: pixels; `middle` is (column, row) of the principal point, counted from the upper left corner of
+            the image. It is half a pixel more than counted from the centre of the first pixel.
         nearest, farthest: metres.
     """
     height, width = depth.shape
@@ -49,9 +51,9 @@ def project(cloud, focal, middle, nearest, farthest, depth, index, picture):
         red, green, blue = cloud[point, 3], cloud[point, 4], cloud[point, 5]
         if not (np.isfinite(red) and np.isfinite(green) and np.isfinite(blue)):
             continue
-        column, row = np.int64(across), np.int64(down)  # floor, of what is not negative
+        column, row = np.int64(across), np.int64(down)  # equals floor, since neither is negative
         distance = np.float32(z)
-        if distance < depth[row, column]:  # of equally near ones the first stays
+        if distance < depth[row, column]:  # of equally near points the first stays
             depth[row, column] = distance
             if index is not None:
                 index[row, column] = point
@@ -65,7 +67,7 @@ def project(cloud, focal, middle, nearest, farthest, depth, index, picture):
 @compiled
 @no_type_check
 def halve(depth, index, coarse_depth, coarse_index):
-    """Fill depth and index of an image of half the size, whose pixels show the nearest of what four of these show."""
+    """Fill depth and index of an image of half the size; each pixel shows the nearest point of its four pixels."""
     coarse_depth[:] = np.inf
     coarse_index[:] = -1
     for row in range(depth.shape[0]):
@@ -81,7 +83,7 @@ def halve(depth, index, coarse_depth, coarse_index):
 @compiled
 @no_type_check
 def paint(cloud, index, level, nearest, farthest, picture):
-    """Fill the four channels of `picture` from an index whose pixels each cover 2^level × 2^level of it."""
+    """Fill the four channels of `picture` from an index in which each pixel covers 2^level × 2^level pixels of it."""
     span = farthest - nearest
     picture[:] = 1.0
     for row in range(picture.shape[1]):
@@ -96,13 +98,14 @@ def paint(cloud, index, level, nearest, farthest, picture):
 @compiled
 @no_type_check
 def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
-    """Fill the five channels of `filled` from the four of `picture`, as `splats.splatted` says.
+    """Fill the five channels of `filled` from the four of `picture`, as `splats.splatted` describes.
 
     Args:
-        nearest, span: metres, of the fourth channel.
+        nearest, span: smallest depth, and range of depths, of the fourth channel, metres.
         focal, thick: pixels.
-        around, close: (places, 2) rows and columns of discs, row by row; of splats, and of holes that are closed.
-        weights: by the squared distances of a point, and of the nearest one.
+        around, close: (places, 2) rows and columns of the offsets in a disc, row by row: the disc of a splat, and the
+            disc of the closing of holes.
+        weights: weight of a point, indexed by its squared distance and the squared distance of the nearest point.
     """
     height, width = picture.shape[1:]
     longest, radius = len(weights), around[-1, 0]
@@ -118,7 +121,8 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
                 count += 1
     if count == 0:
         return
-    # all below is of the points' box and a border, which holds their discs and what is beside the near places
+    # All that follows runs on the bounding box of the points and a border. The border holds their discs and the
+    # pixels beside the near ones.
     top, left = seen[0, 0] - border, least - border
     box = (seen[count - 1, 0] + border + 1 - top, most + border + 1 - left)
     away, factor = np.empty(len(around), np.uint64), np.empty(len(around))
@@ -133,7 +137,7 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
         depth = nearest + span * np.float64(picture[3, row, column])
         row, column = row - top, column - left
         for place in range(len(around)):
-            # numbers without a sign are not checked for counting from the end
+            # unsigned indices spare the check for negative ones, which count from the end
             down, across = np.uint64(row + around[place, 0]), np.uint64(column + around[place, 1])
             cone = depth * factor[place]
             there = first[down, across]
@@ -142,7 +146,7 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
                 square[down, across] = away[place]
         for place in range(len(close)):
             near[row + close[place, 0], column + close[place, 1]] = True
-    # the image's places that no point is near take their discs away: those beside a near one do for all
+    # Erosion: each pixel of the image that no point is near removes its disc. Pixels beside a near one suffice.
     outside = np.zeros(box, np.bool_)
     low, high = max(-top, 0), min(height - top, box[0])
     start, stop = max(-left, 0), min(width - left, box[1])

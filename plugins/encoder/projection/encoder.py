@@ -1,4 +1,4 @@
-"""Coloured points as an image of red, green, blue and depth: the nearest point of each pixel (thesis eq. 7.3-7.4)."""
+"""Images of coloured points: red, green, blue and depth of the nearest point of each pixel (thesis eq. 7.3-7.4)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,12 +26,12 @@ NOTHING = torch.iinfo(torch.int64).max
 
 @dataclass(frozen=True)
 class View:
-    """What the canonical camera of images of this size sees of points.
+    """The view of points that the canonical camera has for images of this size.
 
     Attributes:
         height, width: pixels.
-        limits: nearest and farthest: points whose depth is in [nearest, farthest) are seen, metres.
-        levels: of images, each of half the size of the one before, rounded up.
+        limits: nearest and farthest depth, metres: points whose depth is in [nearest, farthest) are seen.
+        levels: number of images; each has half the size of the previous one, rounded up.
     """
 
     height: int
@@ -41,30 +41,33 @@ class View:
 
     @cached_property
     def lens(self) -> tuple[float, tuple[float, float]]:
-        """Focal length, and (column, row) of the principal point from the image's upper left corner, pixels: the centre
-        of the first pixel, where the camera counts from, lies half a pixel from it."""
+        """Focal length, and (column, row) of the principal point from the upper left corner of the image, pixels.
+
+        The camera counts from the centre of the first pixel, which lies half a pixel from that corner.
+        """
         camera = canonical_camera(self.height, self.width)
         across, down = camera.principal
         return float(camera.focal[0]), (float(across) + 0.5, float(down) + 0.5)
 
     def size(self, level: int) -> tuple[int, int]:
+        """Return height and width of a level's image, pixels."""
         return -(-self.height >> level), -(-self.width >> level)
 
 
 def project(
     clouds: Float[Tensor, "batch points columns"], view: View
 ) -> Float[Tensor, "batch channels height width"]:
-    """Red, green, blue and depth of the point that each pixel shows, four channels a level; 1 where it shows none.
+    """Return red, green, blue and depth of the point that each pixel shows, four channels a level; 1 if it shows none.
 
-    A point is seen at the pixel whose centre is nearest, floor(u + 0.5), and of several the nearest, of equally near
-    ones the first. Depth is (z - nearest) / (farthest - nearest). What is not in the image, not in [nearest, farthest)
-    or has a coordinate or colour that is not finite is left out. At level l the camera is scaled with its image: a
-    place u there is (u + 0.5) / 2^l - 0.5, so that its pixels show the nearest of what 2^l × 2^l of the whole image do;
-    they are repeated to its size.
+    A point is seen at the pixel whose centre is nearest, floor(u + 0.5). Of several points the nearest is seen, of
+    equally near points the first. Depth is (z - nearest) / (farthest - nearest). A point is left out if it is not in
+    the image, is not in [nearest, farthest), or has a coordinate or colour that is not finite. At level l the camera is
+    scaled with its image: a position u becomes (u + 0.5) / 2^l - 0.5. Each pixel of that level then shows the nearest
+    of the points that 2^l × 2^l pixels of the full image show. The pixels are repeated to the size of the full image.
 
-    On the CPU compiled, in one pass where no gradient is asked for. Differentiable in colours and depths of what is
-    seen, not in where it is seen. All ways give the same bits: pixels are decided in float64, whatever comes, depths
-    are compared as float32, and the channels are of the clouds' type.
+    The function is compiled on the CPU, in one pass if no gradient is wanted. It is differentiable in the colours and
+    depths of the points that are seen, not in where they are seen. All ways give the same bits: pixels are decided in
+    float64 for any input type, depths are compared as float32, and the channels have the clouds' type.
 
     Raises:
         DataError: the points have no colours.
@@ -96,7 +99,7 @@ def project(
 
 
 def pyramid(cloud: np.ndarray, view: View) -> list[np.ndarray]:
-    """Which point each pixel of each level shows, -1 where none."""
+    """Return which point each pixel of each level shows, -1 where it shows none."""
     depth, index = np.empty(view.size(0), np.float32), np.empty(view.size(0), np.int32)
     compiled.project(cloud, *view.lens, *view.limits, depth, index, None)
     found = [index]
@@ -111,7 +114,7 @@ def pyramid(cloud: np.ndarray, view: View) -> list[np.ndarray]:
 def seen(
     clouds: Float[Tensor, "batch points columns"], view: View
 ) -> list[Int[Tensor, "batch _rows _columns"]]:
-    """Of each level which point each pixel shows, -1 where none; contiguous clouds on the CPU."""
+    """Return for each level which point each pixel shows, -1 where it shows none, for contiguous clouds on the CPU."""
     arrays = clouds.numpy()
     each = [pyramid(array, view) for array in arrays]
     return [
@@ -125,19 +128,19 @@ def seen(
 def seen_in_torch(
     clouds: Float[Tensor, "batch points columns"], view: View
 ) -> list[Int[Tensor, "batch _rows _columns"]]:
-    """The same by operations on tensors, on any device.
+    """Return the result of `seen` by operations on tensors, on any device.
 
-    The bits of positive float32 numbers, read as whole numbers, are in their order: with the index below them in 64
-    bits, the least is the nearest point, and the first of equally near ones.
+    The bits of positive float32 numbers, read as integers, have the order of the numbers. A 64-bit key holds these bits
+    above the index of the point. The smallest key is then the nearest point, and the first of equally near points.
     """
     batch, height, width = len(clouds), view.height, view.width
     numbers = clouds[..., : len(COLUMNS)].detach()
     place = numbers[..., :3].double()
     depth = place[..., 2]
-    # divisors and summands as tensors: by a plain number CUDA multiplies with its reciprocal
+    # divisors and summands are tensors: CUDA multiplies with the reciprocal of a plain number
     focal, middle = view.lens
     across, down = (focal * place[..., axis] / depth + depth.new_tensor(middle[axis]) for axis in (0, 1))
-    # compared before any cast, which has no meaning for NaN and what is too large
+    # compared before any cast, since a cast of NaN or of too large a number is undefined
     nearest, farthest = view.limits
     shown = (depth >= nearest) & (depth < farthest) & numbers[..., 3:].isfinite().all(-1)
     shown &= (across >= 0) & (across < width) & (down >= 0) & (down < height)
@@ -160,7 +163,7 @@ def seen_in_torch(
 def gathered(
     clouds: Float[Tensor, "batch points columns"], seen: list[Int[Tensor, "batch _rows _columns"]], view: View
 ) -> Float[Tensor, "batch channels height width"]:
-    """The picture of what each pixel of each level shows, with a gradient in colours and depths."""
+    """Return the image of the points that the pixels of each level show, with a gradient in colours and depths."""
     nearest, farthest = view.limits
     span = torch.as_tensor(farthest - nearest, dtype=torch.float64, device=clouds.device)
     levels = []
@@ -178,27 +181,27 @@ def gathered(
 
 
 class Projection(Encoder):
-    """Coloured points as the image that the canonical camera of its size sees (`framework.geometry.camera`).
+    """Coloured points as the image that the canonical camera sees (`framework.geometry.camera`).
 
-    Clouds are x, y, z in that camera's coordinates, metres (`Camera.canonical` makes them of any camera's), then red,
-    green, blue, numbers in [0, 1] as files hold them, not light; further columns are not read.
+    Clouds hold x, y, z in that camera's coordinates, metres (`Camera.canonical` converts from any camera). Then follow
+    red, green, blue: numbers in [0, 1] as files hold them, not linear RGB. Further columns are not read. Features are
+    (4 · levels, height, width), five channels more with `splat`, of the clouds' dtype; see `project`.
 
     Args:
         input_shape: (points, columns) of the largest cloud.
-        input_columns: names of the columns, where data give them.
+        input_columns: names of the columns, if the data give them.
         height, width: pixels.
         nearest, farthest: metres. Points in [nearest, farthest) are seen, and their depth channel runs from 0 to 1. The
-            thesis's scanner sees 0.1 to 0.7 m, so that 1 tells the background (§7.3.1); a depth in metres would not
-            where people stand further off.
-        levels: how many images, each of half the size of the one before and enlarged again by repetition: a pixel
-            between sparse points still shows one at some level. Four channels each.
-        splat: radius, pixels, of splats that fill the surface between points: five channels before the others, red,
-            green, blue and depth of the surface and the distance to the nearest point; 0: none. See `splats.splatted`.
-
-    Features are (4 · levels, height, width), five channels more with `splat`, of the clouds' dtype; see `project`.
+            thesis's scanner sees 0.1 to 0.7 m, so that a value of 1 marks the background (§7.3.1). A depth in metres
+            would not mark it where people stand farther away.
+        levels: number of images, four channels each. Each has half the size of the previous one and is enlarged again
+            by repetition, so that a pixel between sparse points shows a point at some level.
+        splat: radius, pixels, of splats that fill the surface between points; 0 for none. They add five channels before
+            the others: red, green, blue and depth of the surface, and the distance to the nearest point. See
+            `splats.splatted`.
 
     Raises:
-        ConfigError: an input that is no cloud of coloured points, or a range of depths without any.
+        ConfigError: an input that is no cloud of coloured points, or an empty range of depths.
     """
 
     fixed = True
@@ -240,7 +243,8 @@ class Projection(Encoder):
         self.output_shape = (CHANNELS * levels + (splats.CHANNELS if splat else 0), height, width)
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
-        sizes(inputs)  # refuses what is no cloud
+        """Return the images of the clouds."""
+        sizes(inputs)  # refuses inputs that are no clouds
         points = project(inputs, self.view)
         if not self.splat:
             return points

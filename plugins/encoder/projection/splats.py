@@ -1,7 +1,7 @@
-"""The surface between projected points, from the points alone: the picture that a network of neural pixels adds to.
+"""The surface between projected points, computed from the points alone, for networks of neural pixels to refine.
 
-Splats in the spirit of Zwicker, Pfister, van Baar & Gross, "EWA Splatting", IEEE TVCG 8(3), 2002, in pixels: what a
-pixel shows is a weighted mean of the points about it that no nearer surface hides.
+Splats follow the idea of Zwicker, Pfister, van Baar & Gross, "EWA Splatting", IEEE TVCG 8(3), 2002, in pixels: a pixel
+shows a weighted mean of the points around it that no nearer surface hides.
 """
 
 from functools import cache
@@ -16,16 +16,16 @@ from framework.storage.threads import POOL
 from plugins.encoder.projection import compiled
 
 CHANNELS = 5
-"""Red, green, blue and depth of the surface, and how far the nearest point is."""
+"""Number of channels: red, green, blue and depth of the surface, and the distance to the nearest point."""
 THICK = 4.0
-"""Points so many pixels' widths behind the nearest surface belong to it."""
+"""Thickness of a surface, in widths of a pixel: points up to this far behind the nearest surface belong to it."""
 LEAST_WIDTH, SHARE = 0.45, 0.6
-"""A splat's standard deviation, pixels: so much, and so much of the distance to the nearest point."""
+"""Terms of a splat's standard deviation, pixels: a constant, and a share of the distance to the nearest point."""
 
 
 @cache
 def disc(radius: int) -> np.ndarray:
-    """(row, column) of the places about a pixel's, row by row."""
+    """Return (row, column) of the offsets around a pixel that lie in a disc, row by row, (places, 2)."""
     side = np.arange(-radius, radius + 1)
     rows, columns = np.meshgrid(side, side, indexing="ij")
     within = rows**2 + columns**2 <= radius * (radius + 1)
@@ -34,35 +34,36 @@ def disc(radius: int) -> np.ndarray:
 
 @cache
 def weights(radius: int) -> np.ndarray:
-    """Of a point by its squared distance and that of the nearest one, pixels."""
+    """Return a point's weight, indexed by its squared distance and that of the nearest point, in squared pixels."""
     square = np.arange(radius * (radius + 1) + 1)
     width = LEAST_WIDTH + SHARE * np.sqrt(square)
     return np.exp(-square[:, None] / (2 * width**2))
 
 
 def closing(radius: int) -> int:
-    """Of holes that are closed: gaps up to twice this, pixels."""
+    """Return the radius, pixels, of the closing of holes; it closes gaps up to twice this radius."""
     return (3 * radius + 2) // 5
 
 
 def splatted(
     pictures: Float[Tensor, "batch 4 height width"], limits: tuple[float, float], focal: float, radius: int
 ) -> Float[Tensor, "batch 5 height width"]:
-    """The surface through the points that pictures of `encoder.project` show.
+    """Return the surface through the points that the images of `encoder.project` show.
 
-    A cone about each point, whose depth grows by a pixel's width with each pixel, hides what is behind it; the first
-    cone that a pixel meets says how near the surface is, and how far the nearest of its points, in shares of radius + 1
-    (1: none is within `radius`). The pixel shows the mean of that surface's points within `radius`, weighted by a
-    Gaussian that is the wider the farther the nearest is. All is 1 beyond the outline, which is that of the points
-    with holes closed (a morphological closing).
+    A cone around each point hides what is behind it. Its depth grows by the width of a pixel with each pixel. The first
+    cone that a pixel meets gives the depth of the surface, and the distance to the nearest of its points. The fifth
+    channel is this distance as a share of radius + 1; it is 1 where no point is within `radius`. The pixel shows the
+    mean of the points of that surface within `radius`. The mean is weighted by a Gaussian, which is wider where the
+    nearest point is farther away. All channels are 1 outside the outline. The outline is that of the points with holes
+    closed (a morphological closing).
+
+    The function is compiled on the CPU if no gradient is wanted; all ways give the same bits. It is differentiable in
+    the channels, not in which points are seen.
 
     Args:
-        limits: nearest and farthest depth, metres, which the fourth channel runs between.
+        limits: nearest and farthest depth, metres, at which the fourth channel is 0 and 1.
         focal: pixels.
         radius: pixels, 1 or more.
-
-    On the CPU compiled where no gradient is asked for; all ways give the same bits. Differentiable in the channels, not
-    in which points are seen.
     """
     if pictures.device.type != "cpu" or (pictures.requires_grad and torch.is_grad_enabled()):
         return in_torch(pictures, limits, focal, radius)
@@ -88,7 +89,7 @@ def splatted(
 
 
 def in_torch(pictures: Tensor, limits: tuple[float, float], focal: float, radius: int) -> Tensor:
-    """The same by operations on tensors, on any device."""
+    """Return the result of `splatted` by operations on tensors, on any device."""
     nearest, farthest = limits
     height, width = pictures.shape[2:]
     seen = pictures[:, 3] < 1
@@ -96,7 +97,7 @@ def in_torch(pictures: Tensor, limits: tuple[float, float], focal: float, radius
     depth = (nearest + (farthest - nearest) * numbers[:, 3]).detach().where(seen, torch.inf)
 
     def moved(maps: Tensor, place: np.ndarray, beyond: float) -> Tensor:
-        """What lies `place` away from each pixel."""
+        """Return the maps shifted so that each pixel holds the value at the offset `place` from it."""
         row, column = (int(each) + radius for each in place)
         wide = functional.pad(maps, (radius,) * 4, value=beyond)
         return wide[..., row : row + height, column : column + width]
@@ -124,7 +125,7 @@ def in_torch(pictures: Tensor, limits: tuple[float, float], focal: float, radius
     for place in disc(closing(radius)):
         inside = inside & (moved(near.double(), place, 1.0) > 0)
     surface = (total / mass.where(inside, 1.0)[:, None]).where(inside[:, None], 1.0)
-    # not `square.sqrt()`: MKL's, which torch calls, errs in the last bit on some processors
+    # not `square.sqrt()`: torch calls MKL's square root, which errs in the last bit on some processors
     roots = torch.from_numpy(np.sqrt(np.arange(radius * (radius + 1) + 2))).to(depth.device)
     distance = (roots[square.long()] / (radius + 1)).where(reached, 1.0)
     return torch.cat([surface, distance[:, None]], 1).to(pictures.dtype)

@@ -1,1 +1,1 @@
-"""U-Nets that fill pictures of projected points or rasterised meshes."""
+"""U-Nets that turn images of projected points or rasterised meshes into complete images."""

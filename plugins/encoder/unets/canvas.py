@@ -1,4 +1,4 @@
-"""What surrounds a network's convolutions: it reads pictures, computes the subject's box alone, gives colours."""
+"""Input and output of a U-Net: reading images, restricting computation to the subject's box, forming colours."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,15 +16,21 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 
 WHITE = 6.0
-"""Colours are sigmoid(WHITE (1 + raw)): a raw 0 is white but for 0.6 of 255, -1 is grey, -2 black. An empty picture is
-white so from the start, also where training sees nothing far from a subject, and leaves it in steps of usual size."""
+"""Slope of the colours, which are sigmoid(WHITE (1 + raw)).
+
+A raw 0 is white but for 0.6 of 255, -1 is grey, -2 black. An empty image is therefore white from the start, also in
+regions where training sees nothing because they are far from a subject. A colour leaves white in steps of usual size.
+"""
 EMPTY_LOG_SCALE = -5.0
-"""What logarithms of scales start from: 0.007, near the error of that white. For the same reason: beyond the subject's
-box evaluation answers with the bias alone, which training hardly moves, and exp(0) would be the whole range."""
+"""Initial value of the logarithms of scales: a scale of 0.007, near the error of that white.
+
+The reason is the one for `WHITE`: outside the subject's box evaluation returns the bias alone, which training hardly
+changes, and exp(0) would be the whole range of colours.
+"""
 
 
 class Box(NamedTuple):
-    """Rows from `top` to before `bottom`, columns from `left` to before `right`."""
+    """A box with rows from `top` to before `bottom`, columns from `left` to before `right`."""
 
     top: int
     bottom: int
@@ -34,13 +40,13 @@ class Box(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What was computed of a batch of pictures.
+    """The areas that were computed of a batch of images.
 
     Attributes:
-        boxes: in each picture what the network ran on, None where that is empty; a box may end beyond the border, at a
-            multiple of the network's stride.
-        computed: pixels in the boxes.
-        left_out: pixels of the pictures outside of the boxes; they got the answer to an empty picture.
+        boxes: the area of each image that the network ran on, None if the image is empty; a box may end beyond the
+            border, at a multiple of the network's stride.
+        computed: number of pixels in the boxes.
+        left_out: number of pixels of the images outside the boxes; they have the value for an empty image.
     """
 
     boxes: tuple[Box | None, ...]
@@ -49,20 +55,24 @@ class Report:
 
 
 Maps = Callable[[Tensor, Iterator[Step]], Tensor]
-"""Pictures, as differences from the empty ground and of whole strides, and layers in order → what the head reads."""
+"""Function of images and layers that returns the maps that the head reads.
+
+The images are differences from the empty ground, and their sides are multiples of the stride.
+"""
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """How pictures come to a network and its answers become pictures.
+    """Settings of a U-Net's input and output: colours, padding, crop, precision and unshuffling.
 
     Attributes:
-        colors: outputs that are colours; the others stay raw.
-        stride: sides of what a network reads are multiples of it, pixels; pictures continue empty to the next one.
-        crop: margin around the subject's box, pixels; None: all is computed.
-        precision: of evaluation, where weights are float32.
-        shuffle: the head answers for squares of this side at once.
-        residual: whether colours are the input's first channels and what the network adds to them.
+        colors: number of outputs that are colours; the others stay raw.
+        stride: pixels; the sides of the images that a network reads are multiples of it. Images are padded with empty
+            ground to the next multiple.
+        crop: margin around the subject's box, pixels; None computes everything.
+        precision: precision of evaluation, for float32 weights.
+        shuffle: side, pixels, of the squares for which the head predicts all values at once.
+        residual: whether colours are the sum of the input's first channels and the network's output.
     """
 
     colors: int
@@ -80,8 +90,11 @@ class Canvas:
         head: nn.Conv2d,
         training: bool,
     ) -> tuple[Float[Tensor, "batch outputs height width"], Report | None]:
-        """The answer, and of a cropped one what was computed. In evaluation normalisation is folded into convolutions:
-        anew in every call, which costs less than to know for certain that no weight has changed."""
+        """Return the outputs of the network, and the report of a cropped evaluation, None otherwise.
+
+        In evaluation normalisation is folded into the convolutions in every call. That costs less than to check that no
+        weight has changed.
+        """
         weight, bias = head.weight, head.bias
         assert bias is not None
         if not len(inputs):
@@ -114,7 +127,7 @@ class Canvas:
     def _in_boxes(
         self, pictures: Tensor, boxes: tuple[Box | None, ...], answer: Step, empty: Tensor
     ) -> tuple[Tensor, Report]:
-        """One box after the other: what else is in the batch does not matter."""
+        """Return the outputs and the report, one box at a time, so that no image depends on the rest of the batch."""
         count, _, height, width = pictures.shape
         side = empty.shape[-1]
         answers = empty.new_empty(count, empty.shape[1], height, width)
@@ -133,16 +146,17 @@ class Canvas:
         return answers, Report(boxes, computed, left_out)
 
     def _colored(self, raw: Tensor, pictures: Tensor) -> Tensor:
-        """Of raw numbers and of what they answer to, as differences from the empty ground."""
+        """Return colours and raw scales from the network's output and the images (as differences from empty ground)."""
         if self.residual:
-            # a little beyond [0, 1] at times: cut off, what should be darker than its input could not be told so
+            # Colours may lie a little beyond [0, 1]. They are not clamped: a clamped colour that should become darker
+            # than its input would have no gradient.
             colors = 1 + pictures[:, : self.colors] + raw[:, : self.colors]
         else:
             colors = (WHITE + WHITE * raw[:, : self.colors]).sigmoid()
         return colors if raw.shape[1] == self.colors else torch.cat([colors, raw[:, self.colors :]], 1)
 
     def _kind(self, weight: Tensor) -> torch.dtype:
-        """The type of numbers that evaluation computes with."""
+        """Return the dtype in which evaluation computes."""
         if weight.dtype != torch.float32 or self.precision == "float32":
             return weight.dtype
         return (
@@ -151,15 +165,15 @@ class Canvas:
 
 
 def fast_bfloat16(device: torch.device) -> bool:
-    """Whether the device multiplies matrices of bfloat16 faster than of float32."""
+    """Return whether the device multiplies matrices of bfloat16 faster than of float32."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
 def subject(picture: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:
-    """The box around what is not empty (0 in every channel), a margin wider and out to whole strides."""
-    most = picture.detach().abs().amax(0)  # NaN where any is
+    """Return the box of the pixels that are not empty (0 in every channel), with a margin, widened to whole strides."""
+    most = picture.detach().abs().amax(0)  # NaN where any channel is NaN
     ends: list[int] = []
     for line in (most.amax(1), most.amax(0)):
         where = line.nonzero()
@@ -173,8 +187,11 @@ def subject(picture: Float[Tensor, "channels height width"], stride: int, margin
 def head(
     channels: int, size: int, colors: int, scales: int, places: int = 1, *, residual: bool = False
 ) -> nn.Conv2d:
-    """From maps to colours and scales, each of so many places; to an empty picture it answers 0, of scales
-    EMPTY_LOG_SCALE, before training, and where it is `residual` to any."""
+    """Return the last convolution, from maps to colours and scales at `places` pixels of each position.
+
+    Before training its output for an empty image is 0, and EMPTY_LOG_SCALE for scales. With `residual` its output is
+    then the same for any image.
+    """
     made = nn.Conv2d(channels, (colors + scales) * places, size)
     assert made.bias is not None
     nn.init.zeros_(made.bias)
@@ -187,9 +204,10 @@ def head(
 def require_pictures(
     name: str, input_shape: tuple[int, ...], normalisation: str, crop: int | None, least: int = 1
 ) -> None:
-    """
+    """Require images with enough channels, and compatible settings of crop and normalisation.
+
     Args:
-        least: channels that the input has at least.
+        least: smallest number of channels of the input.
 
     Raises:
         ConfigError: the input is no image, or has too few channels, or crop and normalisation exclude each other.

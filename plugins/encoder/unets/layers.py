@@ -1,8 +1,8 @@
-"""Convolutions for pictures on an empty ground: an empty picture is 0 in every layer.
+"""Convolutions for images on an empty ground: an empty image is 0 in every layer.
 
-Maps hold differences from what a layer would hold on an empty picture without end. There a convolution gives 0,
-normalisation and ReLU give relu(shift), and that is subtracted again. So zero padding continues the empty ground
-beyond a border in every layer, and what is far from any subject need not be computed.
+Maps hold differences from the values that a layer would have on an infinite empty image. On that image a convolution
+gives 0, and normalisation and ReLU give relu(shift), which is subtracted again. Zero padding therefore continues the
+empty ground beyond a border in every layer, and regions far from any subject need not be computed.
 """
 
 from collections.abc import Callable
@@ -18,19 +18,20 @@ Normalisation = Literal["batch", "renorm", "group"]
 Step = Callable[[Tensor], Tensor]
 EPSILON = 1e-5
 SLOWEST = 0.02
-"""Share of a batch in the running moments, at the least; at first they are the mean of all batches so far."""
+"""Smallest share of a batch in the running moments; at first they are the mean of all batches so far."""
 LARGEST_RATIO, LARGEST_SHIFT = 3.0, 5.0
-"""How far batch renormalisation may correct deviation and mean (Ioffe 2017, §4)."""
+"""Bounds on the correction of deviation and mean by batch renormalisation (Ioffe 2017, §4)."""
 GROUPS = 8
 
 
 class Layer(nn.Module):
-    """A convolution, normalisation and ReLU, of differences from the empty ground.
+    """A convolution, normalisation and ReLU of differences from the empty ground.
 
     Args:
-        size: side of the kernel, pixels; 3 keeps the size of the picture, 2 halves it.
-        normalisation: by the moments of the batch; of the batch, but corrected to the running ones (Ioffe 2017); of
-            each picture's groups of channels. The first two read running moments in evaluation.
+        size: side of the kernel, pixels; 3 keeps the size of the image, 2 halves it.
+        normalisation: "batch" normalises by the moments of the batch; "renorm" by those of the batch, corrected to the
+            running ones (Ioffe 2017); "group" by the moments of each image's groups of channels. The first two use
+            running moments in evaluation.
     """
 
     mean: Tensor
@@ -52,11 +53,11 @@ class Layer(nn.Module):
             self.register_buffer("batches", torch.zeros((), dtype=torch.long))
 
     def forward(self, maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """As in training; in evaluation too where the moments are the picture's own."""
+        """Return the maps after the layer as in training; "group" normalisation is the same in evaluation."""
         return self._normalised(convolved(maps, self.weight, None, self.stride))
 
     def folded(self, dtype: torch.dtype) -> Step:
-        """The same in evaluation: normalisation within the convolution, one pass over its numbers."""
+        """Return the layer as a function for evaluation, with normalisation folded into the convolution."""
         if self.normalisation == "group":
             weight = self.weight.to(dtype)
             return lambda maps: self._normalised(convolved(maps, weight, None, self.stride))
@@ -76,9 +77,9 @@ class Layer(nn.Module):
         return torch.maximum(torch.addcmul((shift - ground).to(maps), maps, scale.to(maps)), -ground.to(maps))
 
     def _of_batch(self, maps: Tensor) -> Tensor:
-        """By the moments of the batch; these enter the running ones."""
+        """Return maps normalised by the moments of the batch, after ReLU, and update the running moments."""
         with torch.no_grad():
-            # not torch.native_batch_norm: where channels lie last its sums lose digits to a large mean
+            # not torch.native_batch_norm: with channels last its sums lose digits if the mean is large
             kind, count = self.gain.dtype, maps.numel() // maps.shape[1]
             mean = _sum(maps, kind) / count
             standard = maps - _channels(mean, maps)
@@ -105,7 +106,7 @@ class Layer(nn.Module):
         return answer
 
     def _of_groups(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        """Scale and shift, (batch, channels, 1, 1), by the moments of each picture's groups of channels."""
+        """Return scale and shift, (batch, channels, 1, 1), from the moments of each image's groups of channels."""
         grouped = maps.unflatten(1, (self.groups, -1))
         variance, mean = torch.var_mean(grouped, (2, 3, 4), correction=0)
         each = maps.shape[1] // self.groups
@@ -115,17 +116,17 @@ class Layer(nn.Module):
 
 
 class FromGround(torch.autograd.Function):
-    """relu(gain s + offset) less what that is on the empty ground, where maps are 0; s are the maps, standardised.
+    """The function relu(gain s + offset) less its value on the empty ground, where s are the standardised maps.
 
-    Written by hand, since autograd of the same formula goes over the maps many times more. The moments, of the maps and
-    of the ground, are functions of the maps.
+    The maps are 0 on the empty ground. The gradient is written by hand, since autograd of the same formula makes many
+    more passes over the maps. The moments are functions of the maps, and so is the value on the ground.
     """
 
     @staticmethod
     def forward(
         ctx: Any, maps: Tensor, gain: Tensor, offset: Tensor, standard: Tensor, mean: Tensor, inverse: Tensor
     ) -> Tensor:
-        """`standard`, `mean` and `inverse` (of the deviation) are those of the maps over all but channels."""
+        """Return the maps after ReLU; `standard`, `mean` and `inverse` (of the deviation) are over all but channels."""
         shift = offset - gain * mean * inverse
         ground = shift.relu()
         upper, factor, floor = ((offset - ground), gain, -ground)
@@ -137,12 +138,14 @@ class FromGround(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the gradients in the maps, the gain and the offset."""
         answer, standard, gain, mean, inverse, shift = ctx.saved_tensors
         count = slope.numel() // slope.shape[1]
         of_ground = -_sum(slope, gain.dtype) * (shift > 0)
         slope = slope * (answer > _channels(-shift.relu(), answer))
         of_offset, of_gain = _sum(slope, gain.dtype), _sum(slope * standard, gain.dtype)
-        # how the answer moves with mean and inverse by the ground alone; by s both are in the usual formula
+        # Derivatives in mean and inverse through the ground alone. The usual formula of batch norm holds those
+        # through s.
         of_mean, of_inverse = -of_ground * gain * inverse, -of_ground * gain * mean
         constant = (of_mean - gain * inverse * of_offset) / count
         standardised = -(gain * inverse * of_gain + of_inverse * inverse.square()) / count
@@ -156,9 +159,10 @@ def _channels(values: Tensor, maps: Tensor) -> Tensor:
 
 
 def _sum(maps: Tensor, kind: torch.dtype) -> Float[Tensor, " channels"]:
-    """Over all but channels; by rows, which lie one behind the other where channels lie last."""
+    """Return the sum over all but channels; it adds rows, which are contiguous where channels are last."""
     return maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]).sum(0, dtype=kind)
 
 
 def convolved(maps: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1) -> Tensor:
+    """Return the convolution of the maps; of stride 1 it keeps their size."""
     return functional.conv2d(maps, weight, bias, stride, padding=weight.shape[-1] // 2 if stride == 1 else 0)

@@ -18,20 +18,21 @@ Channels = Annotated[int, Field(gt=0)]
 
 
 class Slim(Encoder):
-    """Squares of `unshuffle`² pixels become channels of one (Shi et al. 2016, backwards); then a small U-Net.
+    """A small U-Net that first folds squares of `unshuffle`² pixels into channels (Shi et al. 2016, in reverse).
 
-    One 3×3 convolution a level and way. A 2×2 convolution of stride 2 leads down; up, a 3×3 convolution to the upper
-    level's channels, each number repeated on 2×2 pixels, and a sum. An input of 1 in every channel is empty ground, and
-    so is all beyond the border: sides continue empty to a multiple of unshuffle × 2 ** (levels - 1) pixels.
+    Each level has one 3×3 convolution on the way down and one on the way up. A 2×2 convolution of stride 2 leads down.
+    On the way up, a 3×3 convolution gives the channels of the upper level, each number is repeated on 2×2 pixels, and
+    the maps of that level are added. An input of 1 in every channel is empty ground, and so is everything beyond the
+    border: sides are padded with empty ground to a multiple of unshuffle × 2 ** (levels - 1) pixels.
 
     Args:
-        input_shape: (channels, height, width), any size; other sizes than this one are read too.
+        input_shape: (channels, height, width), any size; images of other sizes are read too.
         widths: channels of each level. Processors compute 16 at once: 24 cost as much as 32.
         unshuffle: side of a square, pixels.
         normalisation, colors, scales, crop, precision, residual: as of `unet.UNet`.
 
     Attributes:
-        report: what evaluation computed of the last batch; None after training, and without crop.
+        report: areas that evaluation computed of the last batch; None after training, and without crop.
 
     Raises:
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
@@ -81,6 +82,7 @@ class Slim(Encoder):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def maps(self, pictures: Tensor, layers: Iterator[Step]) -> Tensor:
+        """Return the maps that the head reads."""
         maps = next(layers)(unshuffled(pictures, self.unshuffle))
         across = [maps]
         for _ in range(self.levels - 1):
@@ -92,12 +94,13 @@ class Slim(Encoder):
         return next(layers)(maps)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
+        """Return colours and scales of the images."""
         answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
         return answers
 
 
 def unshuffled(pictures: Float[Tensor, "batch channels height width"], side: int) -> Tensor:
-    """`functional.pixel_unshuffle` with channels last, in a third of its time."""
+    """Return `functional.pixel_unshuffle` with channels last, in a third of its time."""
     batch, channels, height, width = pictures.shape
     squares = pictures.reshape(batch, channels, height // side, side, width // side, side)
     planes = squares.permute(0, 1, 3, 5, 2, 4).reshape(

@@ -1,4 +1,4 @@
-"""The U-Net of the thesis: the reference among networks that fill pictures of projected vertices."""
+"""The U-Net of the thesis: the reference among networks that complete images of projected vertices."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
@@ -15,26 +15,27 @@ from plugins.encoder.unets.layers import Layer, Normalisation, Step
 
 
 class UNet(Encoder):
-    """Five levels of two 3×3 convolutions each, joined across at equal size (thesis §7.3.2; Ronneberger et al. 2015).
+    """Five levels of two 3×3 convolutions each, with skip connections (thesis §7.3.2; Ronneberger et al. 2015).
 
-    Max-pooling leads down; bilinear interpolation and a 3×3 convolution lead up, without the checkerboards of
-    transposed convolutions. An input of 1 in every channel is empty ground, and so is all beyond the border: sides
-    continue empty to a multiple of 2 ** (levels - 1) pixels.
+    Max-pooling leads down. Bilinear interpolation and a 3×3 convolution lead up, without the checkerboard patterns of
+    transposed convolutions. An input of 1 in every channel is empty ground, and so is everything beyond the border:
+    sides are padded with empty ground to a multiple of 2 ** (levels - 1) pixels.
 
     Args:
-        input_shape: (channels, height, width), any size; other sizes than this one are read too.
-        width: channels of the first level; each level down has twice as many.
-        normalisation: by running moments of batches (`batch`), the same with training corrected towards them
-            (`renorm`), or by each picture's groups of channels (`group`); see `layers.Layer`.
-        colors: outputs that are colours, 0 to 1.
-        scales: further outputs, any real number: logarithms of scales.
-        crop: margin, pixels, around the subject's box to which evaluation keeps; None computes all.
-        precision: of evaluation; `auto` is bfloat16 where the processor is made for it.
-        residual: the input's first `colors` channels are colours, to which the network adds: before training the answer
-            is the input. For rasterised meshes; colours may then lie a little beyond [0, 1].
+        input_shape: (channels, height, width), any size; images of other sizes are read too.
+        width: channels of the first level; each further level has twice as many.
+        normalisation: by running moments of batches (`batch`); by those, with training corrected towards them
+            (`renorm`); or by the moments of each image's groups of channels (`group`). See `layers.Layer`.
+        colors: number of outputs that are colours, 0 to 1.
+        scales: number of further outputs, any real numbers: logarithms of scales.
+        crop: margin, pixels, around the subject's box outside which evaluation computes nothing; None computes
+            everything.
+        precision: precision of evaluation; `auto` is bfloat16 on processors that are made for it.
+        residual: whether the input's first `colors` channels are colours, to which the network adds. Before training
+            the output is then the input. This is for rasterised meshes; colours may lie a little beyond [0, 1].
 
     Attributes:
-        report: what evaluation computed of the last batch; None after training, and without crop.
+        report: areas that evaluation computed of the last batch; None after training, and without crop.
 
     Raises:
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
@@ -89,6 +90,7 @@ class UNet(Encoder):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def maps(self, pictures: Tensor, layers: Iterator[Step]) -> Tensor:
+        """Return the maps that the head reads."""
         maps = pictures.contiguous(memory_format=torch.channels_last)
         across: list[Tensor] = []
         for level in range(self.levels):
@@ -103,11 +105,12 @@ class UNet(Encoder):
         return maps
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
+        """Return colours and scales of the images."""
         answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
         return answers
 
 
 def doubled(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-    """Bilinear interpolation to twice the size; beyond the border lies the empty ground."""
+    """Return the maps at twice the size by bilinear interpolation; beyond the border lies the empty ground."""
     wide = functional.pad(maps, (1, 1, 1, 1))
     return functional.interpolate(wide, scale_factor=2.0, mode="bilinear")[..., 2:-2, 2:-2]
