@@ -1,1 +1,1 @@
-"""What data sets of several families share: fields, images, tables, generated files."""
+"""Code that data sets of several families share: fields, images, tables, generated files."""

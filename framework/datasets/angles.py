@@ -1,4 +1,4 @@
-"""Looks at a user's angles, whether they are in the unit that is said."""
+"""Checks whether a user's angles look like another unit than the stated one."""
 
 import math
 
@@ -9,7 +9,7 @@ from framework.datasets.csv_columns import ENOUGH_ROWS
 
 
 def unlike_degrees(values: Float[np.ndarray, "rows"]) -> str:
-    """What makes angles look like radians, where degrees are said; "" where nothing does."""
+    """Return the reason why values stated in degrees look like radians, or "" if they do not."""
     found = np.abs(values[np.isfinite(values)])
     largest = found.max(initial=0.0)
     if len(found) > ENOUGH_ROWS and 0 < largest <= 2 * math.pi:
@@ -18,7 +18,7 @@ def unlike_degrees(values: Float[np.ndarray, "rows"]) -> str:
 
 
 def unlike_radians(values: Float[np.ndarray, "rows"]) -> str:
-    """What makes angles look like degrees, where radians are said; "" where nothing does."""
+    """Return the reason why values stated in radians look like degrees, or "" if they do not."""
     found = np.abs(values[np.isfinite(values)])
     beyond = found > 2 * math.pi
     if len(found) > ENOUGH_ROWS and 2 * beyond.sum() > len(found):

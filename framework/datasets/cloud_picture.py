@@ -1,4 +1,4 @@
-"""A point cloud as a small picture."""
+"""A small image of a point cloud."""
 
 import math
 from collections.abc import Sequence
@@ -10,18 +10,20 @@ from torch import Tensor
 from framework.geometry.mesh_files import COLOURS
 
 AZIMUTH, ELEVATION = math.radians(-55), math.radians(25)
-"""From where the picture is taken: x comes forward to the left, y goes back to the right, z up."""
+"""Direction of the camera, radians: x points forward to the left, y back to the right, z up."""
 SPREAD = 0.8
-"""Radius of a point's disc, as a share of the side of the square that is each point's if they fill the picture."""
+"""Radius of a point's disc, relative to the side of the square that each of the points has if they fill the image."""
 NEAR, FAR = np.array([20.0, 40.0, 90.0]), np.array([190.0, 205.0, 225.0])
+"""Colours of the nearest and the farthest point, RGB in 0…255."""
 
 
 def picture(
     cloud: Float[Tensor, "points columns"], columns: Sequence[str] = (), side: int = 160
 ) -> UInt8[np.ndarray, "side side 3"]:
-    """Orthographic, from obliquely above, z up, on white; nearer points hide further ones and are darker.
+    """Draw a point cloud in orthographic projection from obliquely above, z up, on white.
 
-    Rows that are not finite (padding) are left out; points have their own colours where `columns` name them.
+    Nearer points hide farther ones and are darker. Rows that are not finite (padding) are left out. Points have their
+    own colours if `columns` names them.
     """
     table = cloud.detach().cpu().double().numpy()
     table = table[np.isfinite(table[:, :3]).all(1)]
@@ -46,7 +48,7 @@ def picture(
         colour = 255 * own * (0.6 + 0.4 * share)
     else:
         colour = FAR + (NEAR - FAR) * share
-    # each point covers a disc, so large that the sides of a box about the picture look closed; the nearest wins
+    # Each point covers a disc so large that the sides of a box look closed. The nearest point wins a pixel.
     radius = min(max(SPREAD * side / math.sqrt(len(points)), 1.0), side / 40)
     reached = np.arange(-math.floor(radius), math.floor(radius) + 1)
     steps = np.stack(np.meshgrid(reached, reached), -1).reshape(-1, 2)

@@ -1,8 +1,9 @@
-"""A table of numbers and words in a CSV file, by columns; what is wrong with it is said by line and column.
+"""A CSV table of numbers and words, by columns; error messages name the line and the column.
 
-Which words are numbers `framework.storage.text` says, and how a user's own table is written its config: `Writing`. What
-is no column of numbers is named (`Chosen.left_out`): words, row numbers, or nothing. A column that would be numbers if
-it were written otherwise is refused, with the setting that reads it.
+`framework.storage.text` decides which words are numbers. `Writing` is the part of the config that says how a user's
+table is written. A column that holds no numbers is reported (`Chosen.left_out`): it holds words, row numbers, or
+nothing. A column whose cells would be numbers in another notation is refused, and the message names the setting that
+reads it.
 """
 
 import csv
@@ -32,19 +33,20 @@ MISSING = frozenset(
     | {".", "-", "--", "\N{EN DASH}", "\N{EM DASH}", "1.#ind", "-1.#ind", "1.#qnan", "-1.#qnan"}
     | {"#div/0!", "#value!", "#num!", "#ref!", "#name?", "#null!"}
 )  # fmt: skip
-"""What stands in a cell, in small letters, that has no number or label, as pandas, R and spreadsheets write it."""
+"""Cells without a number or label, in small letters, as pandas, R and spreadsheets write them."""
 BOOLEANS = {"true": 1.0, "false": 0.0}
+"""Numbers that the words TRUE and FALSE are read as."""
 ENOUGH_ROWS = 20
-"""With more rows than this a table shows what a column holds: row numbers, radians."""
+"""Number of rows above which a table is checked for row numbers and for radians."""
 INDEX = re.compile(
     r"unnamed: \d+(_level_\d+)?|index|level_\d+|row|rows?[ _.]?(number|name|id|index)s?|rownum|id|idx", re.I
 )
-"""What pandas, R and databases call a column that numbers the rows."""
+"""Names that pandas, R and databases give to a column that numbers the rows."""
 
 MOST_LOOKED_AT = 2000
-"""Cells of a column of words, evenly spaced, of which each is asked whether it would be a number after mending."""
+"""Number of cells of a column of words, evenly spaced, that are checked for numbers in another notation."""
 MOST_TOLD = 12
-"""Columns that a sentence lists."""
+"""Largest number of columns that a sentence lists."""
 Separator = Literal["comma", "semicolon", "tab", "bar", "space", ",", ";", "\t", "|", " "]
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 GROUPED_BY_POINTS = text.GROUPED["point"]
@@ -58,13 +60,14 @@ GROUPING = {
 
 @dataclass(frozen=True, kw_only=True)
 class Writing:
-    """How a user's table is written.
+    """Settings that say how a user's table is written.
 
     Attributes:
-        separator: what stands between cells; None: what the first line has, of commas, semicolons, tabs and bars.
+        separator: the sign between cells; None takes the sign found in the first line, out of commas, semicolons, tabs
+            and bars.
         decimal: the decimal sign.
-        thousands: what stands between groups of three figures; None: nothing.
-        units: what may stand beside the numbers of a column ("%", "$", "kg") and is left away; 5% is 5 then.
+        thousands: the sign between groups of three digits; None: no sign.
+        units: units that may stand beside the numbers of a column ("%", "$", "kg"). They are removed: 5% becomes 5.
     """
 
     separator: Separator | None = None
@@ -80,29 +83,30 @@ class Writing:
 
     @property
     def delimiter(self) -> str | None:
+        """Sign between cells; None if the first line decides it."""
         return None if self.separator is None else SEPARATORS.get(self.separator, self.separator)
 
     @property
     def sign(self) -> str:
-        """The decimal sign itself."""
+        """Decimal sign as a character."""
         return GROUPING.get(self.decimal, self.decimal)
 
     @property
     def missing(self) -> frozenset[str]:
-        """What says that a cell holds nothing, in small letters."""
+        """Words, in small letters, of cells that hold nothing."""
         return MISSING
 
     @cached_property
     def plain(self) -> bool:
-        """Whether numbers are written as programs write them."""
+        """True if numbers are written as programs write them."""
         return self.sign == "." and self.thousands is None and not self.units
 
     def standard(self, cell: str) -> str:
-        """A cell's number as programs write it; a word stays one."""
+        """Return the number in a cell as programs write it; a word is returned as a word."""
         return self._ungrouped(self.split_unit(cell)[0])
 
     def split_unit(self, cell: str) -> tuple[str, str]:
-        """A cell without its unit, and the unit, "" where it has none."""
+        """Return a cell without its unit, and the unit, "" if the cell has none."""
         cell = text.trimmed(cell).translate(text.MINUS)
         for unit in sorted(self.units or (), key=len, reverse=True):
             sign = cell[:1] if cell[:1] in ("+", "-") else ""
@@ -113,6 +117,10 @@ class Writing:
         return cell, ""
 
     def _ungrouped(self, cell: str) -> str:
+        """Return a cell with a decimal point and without signs between groups of digits.
+
+        A cell with digits that does not fit the notation gets a leading "_", so that it is no number.
+        """
         if self.sign == "." and self.thousands is None:
             return cell
         between, sign = (
@@ -129,17 +137,18 @@ class Writing:
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledWriting(Writing):
-    """How a table with missing numbers and labels is written.
+    """Settings that say how a table with missing numbers and labels is written.
 
     Attributes:
-        missing_words: what says that a cell holds nothing, beside an empty one; None: MISSING. []: nothing else does,
-            where "none" or "NA" is a label.
+        missing_words: words of cells that hold nothing, in addition to empty cells; None: those in MISSING. [] allows
+            empty cells only, for tables where "none" or "NA" is a label.
     """
 
     missing_words: list[Words] | None = None
 
     @cached_property
     def missing(self) -> frozenset[str]:
+        """Words, in small letters, of cells that hold nothing."""
         return MISSING if self.missing_words is None else frozenset(["", *map(str.lower, self.missing_words)])
 
 
@@ -148,14 +157,14 @@ PLAIN = Writing()
 
 @dataclass(frozen=True)
 class Columns:
-    """A table's cells by column.
+    """Cells of a table by column.
 
     Attributes:
-        file: where they come from.
-        cells: by column, without surrounding blanks.
-        lines: the number of the line each row ends on.
-        writing: how it is written; None: as programs write, and no setting says otherwise.
-        left_out: columns without a name that were left out, and why.
+        file: the file of the table.
+        cells: cells by column name, without surrounding blanks.
+        lines: number of the line on which each row ends.
+        writing: how the table is written; None: as programs write it, and no setting can change this.
+        left_out: columns without a name that were left out, with the reason.
     """
 
     file: Path
@@ -166,10 +175,15 @@ class Columns:
 
     @property
     def how(self) -> Writing:
+        """Settings of the table; those of programs if it has none."""
         return self.writing or PLAIN
 
     def written(self, name: str) -> Writing:
-        """How a column is written: with decimal points, too, where it has points that group no figures and no comma."""
+        """Return how a column is written.
+
+        A table with decimal commas may hold a column with decimal points. A column counts as such if it has points that
+        do not group digits, and no comma.
+        """
         how = self.how
         if how.sign != ",":
             return how
@@ -182,7 +196,13 @@ class Columns:
 
 
 class Chosen(NamedTuple):
-    """Columns of numbers by name; of the others why each is left out; of odd ones that are taken what is odd."""
+    """Chosen columns of numbers.
+
+    Attributes:
+        names: names of the chosen columns.
+        left_out: reason why each other column is left out, by name.
+        odd: what is odd about a chosen column, by name.
+    """
 
     names: tuple[str, ...]
     left_out: dict[str, str]
@@ -190,7 +210,7 @@ class Chosen(NamedTuple):
 
 
 def told(chosen: Chosen) -> tuple[str, ...]:
-    """Sentences on what is left out and what is odd, for the first lines of a run."""
+    """Return clauses about the columns left out and the odd ones, for the first lines of a run."""
     left_out = [f"{quoted(name)} ({why})" for name, why in chosen.left_out.items()]
     many = (
         [*left_out[:MOST_TOLD], f"and {len(left_out) - MOST_TOLD} more"]
@@ -203,14 +223,15 @@ def told(chosen: Chosen) -> tuple[str, ...]:
 
 @contextmanager
 def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterator[Any]:
-    """The rows of a CSV file as lists of cells: UTF-8, also with a byte-order mark.
+    """Open a CSV file, UTF-8 with or without a byte-order mark, and give its rows as lists of cells.
 
     Args:
-        missing: what to say of a file that is not there.
+        file: path of the table.
+        missing: end of the message about a file that does not exist.
         writing: how it is written.
 
     Raises:
-        DataError: it is missing or unreadable.
+        DataError: the file is missing or unreadable.
     """
     with (
         guarded(file, "a table", "Save it as the wanted UTF-8 text, a row a line.", missing),
@@ -221,13 +242,13 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
             try:
                 yield _rows(lines, writing or PLAIN)
             except UnicodeDecodeError:
-                text.decoded(read_bytes(file))  # names the line
+                text.decoded(read_bytes(file))  # raises an error that names the line
                 raise
 
 
 def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
     first = lines.readline()
-    told = re.fullmatch(r"sep=(.)\s*", first)  # how Excel writes which separator it uses
+    told = re.fullmatch(r"sep=(.)\s*", first)  # Excel states its separator so
     sign = told[1] if told else writing.delimiter or _separator(first)
     rest = _with_first(first, lines)
     if sign == " ":
@@ -241,7 +262,7 @@ def _with_first(first: str, lines: io.TextIOWrapper) -> Iterator[str]:
 
 
 def _separator(first: str) -> str:
-    """What separates the names of a first line; a comma where nothing does."""
+    """Return the sign that separates the names of a first line; a comma if no sign does."""
     outside = re.sub(r'"[^"]*"', "", first)
     counts = {sign: outside.count(sign) for sign in ",;\t|"}
     return "," if counts[","] or not any(counts.values()) else max(counts, key=counts.__getitem__)
@@ -250,17 +271,18 @@ def _separator(first: str) -> str:
 def read_columns(
     file: Path, writing: Writing | None = None, missing: str = "wanted a CSV table. Mend the path."
 ) -> Columns:
-    """Read a CSV file: UTF-8 (also with a byte-order mark), names in its first line; blank lines are left out.
+    """Read a CSV file, UTF-8 with or without a byte-order mark, with column names in its first line.
 
-    A column without a name is left out where it holds row numbers or nothing.
+    Blank lines are left out. A column without a name is left out if it holds row numbers or nothing.
 
     Args:
-        writing: how it is written; None: as programs write.
-        missing: what to say of a file that is not there.
+        file: path of the table.
+        writing: how it is written; None: as programs write it.
+        missing: end of the message about a file that does not exist.
 
     Raises:
-        DataError: it is missing, unreadable, empty, a name is missing or stands twice, there is no row, or a row has
-            more or fewer cells than there are names.
+        DataError: the file is missing, unreadable or empty; a column name is missing or occurs twice; there is no row;
+            or a row has more or fewer cells than there are names.
     """
     with csv_rows(file, missing, writing) as reader:
         names = next(reader, [])
@@ -275,7 +297,7 @@ def read_columns(
         columns: list[list[str]] = [[] for _ in header]  # a list for each row would take most of the memory
         lines: list[int] = []
         for cells in reader:
-            # a spreadsheet's `,,,`; in a table of one column an empty cell is a row that misses its number
+            # A spreadsheet writes an empty row as `,,,`. In a table of one column an empty cell is a missing number.
             if not cells or (len(cells) > 1 and not any(map(str.strip, cells))):
                 continue
             if len(cells) != len(header):
@@ -293,6 +315,7 @@ def read_columns(
 
 
 def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writing | None) -> str:
+    """Return a hint why a row has another number of cells than the first line, or ""."""
     if len(cells) > len(header) and sum(cell.strip().isdigit() for cell in cells) > len(header) // 2 + 1:
         return " Where commas separate cells, a decimal comma stands in quotation marks."
     return (
@@ -305,7 +328,7 @@ def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writi
 def _named(
     file: Path, header: Sequence[str], columns: list[list[str]], lines: list[int], writing: Writing | None
 ) -> Columns:
-    """The columns that have names; of others row numbers and empty ones are left out."""
+    """Return the columns that have names; a column without a name must hold row numbers or nothing."""
     left_out: dict[str, str] = {}
     for place, (name, cells) in enumerate(zip(header, columns, strict=True), 1):
         if name:
@@ -321,13 +344,15 @@ def _named(
 
 
 def require(columns: Columns, names: Sequence[str], asked: str) -> None:
-    """Refuse names that are no columns.
+    """Refuse names that are not columns of the table.
 
     Args:
-        asked: who names them, "data.columns" say.
+        columns: the table.
+        names: the names to check.
+        asked: the setting that names them, for example "data.columns".
 
     Raises:
-        DataError: with the nearest name there is.
+        DataError: a name is no column; the message says the nearest column name.
     """
     for name in names:
         if name not in columns.cells:
@@ -340,14 +365,16 @@ def require(columns: Columns, names: Sequence[str], asked: str) -> None:
 def tables(
     files: Sequence[Path], names: Sequence[str], asked: str, writing: Writing | None = None
 ) -> Iterator[tuple[Columns, Float[np.ndarray, "rows names"]]]:
-    """A user's own files one after the other, each with its columns of these names as numbers.
+    """Read a user's own files one after the other and yield each with its columns of these names as numbers.
 
     Args:
-        asked: who names them.
-        writing: how they are written; with it TRUE and FALSE are 1 and 0, as in a table that was trained on.
+        files: the tables.
+        names: names of the columns, in order.
+        asked: the setting that names the columns.
+        writing: how the tables are written. If it is given, TRUE and FALSE are read as 1 and 0, as in a training table.
 
     Raises:
-        DataError: there is no file; or as `read_columns`, `require` and `numbers`.
+        DataError: there is no file; or as in `read_columns`, `require` and `numbers`.
     """
     if not files:
         raise DataError(f"No file was given; wanted at least one CSV table with {', '.join(names)}.")
@@ -359,14 +386,15 @@ def tables(
 
 
 def numeric_columns(columns: Columns, but: Collection[str], asked: str) -> Chosen:
-    """Which columns hold numbers, TRUE and FALSE among them, where nobody names them.
+    """Return the columns that hold numbers, or TRUE and FALSE, for a table whose columns the user did not name.
 
     Args:
-        but: columns of another meaning.
-        asked: the setting that names columns, "data.columns" say.
+        columns: the table.
+        but: columns that have another meaning.
+        asked: the setting that names columns, for example "data.columns".
 
     Raises:
-        DataError: most cells of a column would be numbers, written otherwise; says how.
+        DataError: most cells of a column are numbers in another notation; the message says how to read them.
     """
     names: list[str] = []
     left_out, odd = dict(columns.left_out), {}
@@ -388,7 +416,7 @@ def numeric_columns(columns: Columns, but: Collection[str], asked: str) -> Chose
 
 
 def _counts_rows(cells: Sequence[str]) -> bool:
-    """Whether a column numbers the rows of a table that has enough of them."""
+    """Return whether a column numbers the rows of a table that has more than ENOUGH_ROWS rows."""
     if len(cells) <= ENOUGH_ROWS or cells[0] not in ("0", "1"):
         return False
     start = int(cells[0])
@@ -396,13 +424,18 @@ def _counts_rows(cells: Sequence[str]) -> bool:
 
 
 def _distinct_whole(cells: Sequence[str]) -> bool:
+    """Return whether all cells are whole numbers and no number occurs twice."""
     values = [text.value(cell) for cell in cells]
     whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
     return whole and len(set(values)) == len(values)
 
 
 def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
-    """Why a column holds no numbers; refuses one that would after mending."""
+    """Return the reason why a column holds no numbers.
+
+    Raises:
+        DataError: more than half of its cells are numbers, or would be numbers in another notation.
+    """
     how = columns.written(name)
     filled = [
         (cell, line)
@@ -418,7 +451,7 @@ def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
     unit = max(units, key=units.__getitem__, default="")
     wrong = [(cell, line, mend) for cell, line, mend in found if mend is not None and mend.unit in ("", unit)]
     if wrong and 2 * (plain + len(wrong)) > len(filled):
-        clear = (one for one in wrong if len(one[2].settings) == 1)  # 1,5 says more than 1,234
+        clear = (one for one in wrong if len(one[2].settings) == 1)  # 1,5 has one reading, 1,234 has two
         cell, line, mend = next(clear, wrong[0])
         raise DataError(
             f"{columns.file} line {line}, column {quoted(name)}: {quoted(cell)} is a number {mend.what}. "
@@ -428,7 +461,7 @@ def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
 
 
 def _mended(cell: str, writing: Writing) -> text.Mended | None:
-    """How a word that is no number, as a table is written, could become one."""
+    """Return how a cell that is no number in the table's notation could be read as a number; None if it cannot."""
     if not writing.plain and text.value(cell) is not None:
         figures = cell.lstrip("+-")
         grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, figures)
@@ -439,7 +472,7 @@ def _mended(cell: str, writing: Writing) -> text.Mended | None:
 
 
 def remedy(mend: text.Mended, writing: Writing | None) -> str:
-    """What to do about a number that is written otherwise."""
+    """Return the advice on a number that is written in another notation than the table's."""
     if writing is None or not mend.settings:
         return f"Write {mend.number}."
     ways = [
@@ -452,14 +485,14 @@ def remedy(mend: text.Mended, writing: Writing | None) -> str:
 
 
 def is_boolean(columns: Columns, name: str) -> bool:
-    """Whether a column says TRUE or FALSE, in any letters, wherever it says something."""
+    """Return whether all cells of a column that are not missing say TRUE or FALSE, in any case."""
     cells, missing = columns.cells[name], columns.how.missing
     first = next((cell for cell in cells if cell.lower() not in missing), "")
     return first.lower() in BOOLEANS and {cell.lower() for cell in cells} - missing <= BOOLEANS.keys()
 
 
 def mostly_numbers(columns: Columns, name: str) -> bool:
-    """Whether more than half of a column's cells that are not empty are numbers; not so where all are empty."""
+    """Return whether more than half of the cells of a column that are not empty are numbers; False if all are empty."""
     how = columns.written(name)
     if _all_finite(columns.cells[name], how) is not None:
         return True
@@ -468,14 +501,14 @@ def mostly_numbers(columns: Columns, name: str) -> bool:
 
 
 def number(cell: str, writing: Writing = PLAIN) -> float | None:
-    """What a cell says in figures, perhaps infinite; NaN where it says that there is none; None where it is a word."""
+    """Return the number in a cell, which may be infinite; NaN if the cell is missing; None if it is a word."""
     if cell.lower() in writing.missing:
         return math.nan
     return _said(cell, writing)
 
 
 def _said(cell: str, writing: Writing) -> float | None:
-    """The number of a cell that is not missing."""
+    """Return the number in a cell that is not missing; None if it is a word."""
     found = text.value(cell if writing.plain else writing.standard(cell))
     return None if found is not None and math.isnan(found) else found
 
@@ -483,15 +516,18 @@ def _said(cell: str, writing: Writing) -> float | None:
 def numbers(
     columns: Columns, name: str, *, missing: str | None, booleans: bool = False
 ) -> Float[np.ndarray, "rows"]:
-    """A column as float64, NaN where it has no number.
+    """Return a column as float64, NaN where the number is missing.
 
     Args:
-        missing: None lets numbers be missing; otherwise what else could be done about one, a clause for the message.
-        booleans: take TRUE and FALSE for 1 and 0, where all cells are of these.
+        columns: the table.
+        name: name of the column.
+        missing: None allows missing numbers; otherwise a clause for the message that says what else could be done about
+            a missing number.
+        booleans: read TRUE and FALSE as 1 and 0, if all cells are one of them.
 
     Raises:
-        DataError: a cell is a word, is infinite, or is missing and must not be; or some numbers have a unit and others
-            have not; names the first.
+        DataError: a cell is a word, is infinite, or is missing and must not be; or only some numbers have a unit. The
+            message names the first such cell.
     """
     how = columns.written(name)
     plain = _all_finite(columns.cells[name], how)
@@ -512,6 +548,7 @@ def numbers(
 
 
 def _hint(cell: str, value: float | None, columns: Columns, missing: str | None) -> str:
+    """Return a clause that says what else could be done about a cell without a finite number, or ""."""
     if value is not None:
         return f" Or {missing}." if math.isnan(value) and missing else ""
     mend = _mended(cell, columns.how)
@@ -519,7 +556,7 @@ def _hint(cell: str, value: float | None, columns: Columns, missing: str | None)
 
 
 def _check_units(columns: Columns, name: str) -> None:
-    """Refuse a column some of whose numbers have a unit, and others another one or none."""
+    """Refuse a column whose numbers do not all have the same unit, or no unit."""
     how = columns.how
     if not how.units:
         return
@@ -537,7 +574,7 @@ def _check_units(columns: Columns, name: str) -> None:
 
 
 def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndarray, "rows"] | None:
-    """The cells as `number` has them, several times as fast; None unless all are finite numbers."""
+    """Return the cells as `number` reads them, several times as fast; None unless all are finite numbers."""
     joined = "".join(cells)
     if "_" in joined:
         return None
@@ -567,7 +604,10 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
 
 
 def _check_blanks(file: Path, header: Sequence[str], columns: Sequence[Sequence[str]]) -> None:
-    """Refuse a table whose cells blanks separate: it has a single column, of as many words in each line."""
+    """Refuse a table whose cells are separated by blanks.
+
+    Such a table has a single column, and each of its lines holds equally many words.
+    """
     words = len(header[0].split())
     if len(header) == 1 and words > 1 and all(len(cell.split()) == words for cell in columns[0]):
         raise DataError(

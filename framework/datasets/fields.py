@@ -1,4 +1,4 @@
-"""A data set held in memory as named tensors, fetched a whole batch at a time."""
+"""A data set that is held in memory as named tensors and fetched one batch at a time."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,7 +9,7 @@ from framework.data import Batch
 
 
 class Fields(Dataset[dict[str, Tensor]]):
-    """Named tensors with one common first dimension; `__getitems__` indexes each once per batch.
+    """Data set of named tensors with one common first dimension; `__getitems__` indexes each tensor once per batch.
 
     Raises:
         ValueError: the tensors' lengths differ.
@@ -33,11 +33,11 @@ class Fields(Dataset[dict[str, Tensor]]):
 
 
 def fetched(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:
-    """Some samples as a batch, at once where the dataset can do that, as a loader fetches them."""
+    """Return the samples `indices` as a batch, fetched at once if the dataset can do so, as a loader fetches them."""
     at_once = getattr(dataset, "__getitems__", None)
     return as_batch(at_once(indices) if at_once else [dataset[index] for index in indices])
 
 
 def as_batch(items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """Collation: what a dataset's `__getitems__` batched stays as it is, single items are stacked."""
+    """Return samples as a batch: the result of a dataset's `__getitems__` as it is, or single items stacked."""
     return dict(items) if isinstance(items, Mapping) else default_collate(items)

@@ -1,4 +1,4 @@
-"""Images that a user has in memory, as the models of image data read them."""
+"""Images that a user has in memory, as inputs of models of image data."""
 
 from typing import Any
 
@@ -14,14 +14,15 @@ from framework.errors import DataError, shown
 
 
 def inputs(data: Data, given: Any) -> Tensor:
-    """`Data.inputs` of a data set of square images, of `input_shape` (channels, side, side).
+    """Return images as a batch of inputs: `Data.inputs` of a data set of square images.
 
-    Beside files and arrays of that shape it takes Pillow images, and arrays of bytes as Pillow holds them: (height,
-    width), (height, width, channels), or a batch of either; a batch without channels where the model's images are grey.
-    Images of another size are made square by repeating border pixels, and scaled, as files are. Floats are from 0 to 1.
+    `input_shape` of the data set is (channels, side, side). Besides files and arrays of that shape the function takes
+    Pillow images, and arrays of bytes as Pillow holds them: (height, width), (height, width, channels), or a batch of
+    either. A batch without channels is allowed if the model's images are grey. Images of another size are made square
+    by repeating border pixels, and scaled, as files are. Floats are from 0 to 1.
 
     Raises:
-        DataError: it is none of these.
+        DataError: `given` is none of these.
     """
     items = given if isinstance(given, list | tuple) else [given]
     if items and all(isinstance(item, Image.Image) for item in items):
@@ -51,11 +52,12 @@ def inputs(data: Data, given: Any) -> Tensor:
 
 
 def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channels side side"]:
+    """Return an image as an input of this shape; border pixels are repeated to make it square."""
     try:
         decoded = plain(image, shape[0], upright=True)
     except DataError as error:
         raise DataError(f"an image of mode {image.mode}: {error}") from error
-    except Exception as error:  # Pillow reads the file only now
+    except Exception as error:  # Pillow reads the file only at this point
         why = shown(error) or type(error).__name__
         raise DataError(
             f"an image of mode {image.mode} cannot be decoded ({why}). Restore its file."

@@ -1,4 +1,4 @@
-"""Reads image files, cuts squares out of them, makes data sets of the squares, and varies, blurs and shows them."""
+"""Functions that read image files, cut squares out of them, make data sets of squares, and augment and blur images."""
 
 import math
 import os
@@ -27,38 +27,38 @@ from framework.storage.limits import AT_ONCE, LONGEST_SIDE, MOST_PADDED, MOST_PI
 from framework.storage.progress import tracked
 
 READERS = min(8, os.cpu_count() or 1)
-"""So many threads decode at once."""
+"""Number of threads that decode images at the same time."""
 FORMATS = ("AVIF", "BMP", "GIF", "ICO", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
-"""Of Pillow's formats those that decode pixels and do nothing else: EPS starts another program."""
+"""Formats of Pillow that only decode pixels; EPS, for example, would start another program."""
 SUFFIXES = (".avif", ".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
-"""The usual ends of their names; a file of another one is an image where it can be read."""
+"""Usual suffixes of image files; a file with another suffix is an image if it can be decoded."""
 ORIENTATION = 0x0112
-"""Number of EXIF's entry that says how an image is turned."""
+"""Number of the EXIF entry that says how an image is rotated."""
 BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
-"""Numbers of TIFF's entries for the bits of a number, and for what 0 stands: 0 is white, 1 is black."""
+"""Numbers of the TIFF entries for the bits of a value, and for the meaning of 0: entry 0 is white, entry 1 is black."""
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
-"""Pillow's names of decoded images, by their channels."""
+"""Pillow's names of decoded images, by number of channels."""
 STRIP = 256
-"""Rows that are converted at once."""
+"""Number of rows that are converted at a time."""
 IN_MEMORY = 2 * 2**30
-"""Crops of up to so many bytes are kept in memory."""
+"""Size of a data set of crops, in bytes, up to which the crops are kept in memory."""
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom in pixels from the outer corner: (0, 0, width, height) is the whole image."""
+"""Left, top, right and bottom in pixels, measured from the outer corner: (0, 0, width, height) is the whole image."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square to be cut out of an image file.
+    """A square that is cut out of an image file.
 
     Attributes:
-        file: where the image is.
-        box: what to show, in the middle of the square; None: the whole image.
-        margin: what to add on each side, as a share of the box's longer side.
-        side: of the result, pixels.
+        file: path of the image.
+        box: part of the image in the middle of the square; None: the whole image.
+        margin: border added on each side, as a share of the box's longer side.
+        side: side of the resulting square, pixels.
         channels: 3 for colour, 1 for grey.
-        upright: turn the image as its EXIF entry says, as photo viewers do.
-        blur: standard deviation of a Gaussian the result is blurred with, pixels of the result; 0: none.
+        upright: rotate the image as its EXIF entry says, as photo viewers do.
+        blur: standard deviation of the Gaussian that blurs the result, pixels of the result; 0: no blur.
     """
 
     file: Path
@@ -70,10 +70,10 @@ class Crop:
     blur: float = 0.0
 
     def read(self) -> UInt8[Tensor, "channels side side"]:
-        """Read the file and cut the square out of it.
+        """Read the file and return the square cut out of it.
 
         Raises:
-            DataError: the file is missing, is no image, is cut short, or the box lies outside the image.
+            DataError: the file is missing, is no image or is truncated, or the box lies outside the image.
         """
         with opened(self.file) as raw, DECODED.taking(raw.width * raw.height):
             image = plain(raw, self.channels, upright=self.upright)
@@ -84,7 +84,7 @@ class Crop:
         return blurred(torch.from_numpy(pixels), self.blur)
 
     def check(self) -> None:
-        """Look at the file's header only.
+        """Check the header of the file only.
 
         Raises:
             DataError: the file is missing, is no image, or the box lies outside the image.
@@ -105,7 +105,7 @@ def opened(file: Path) -> Iterator[Image.Image]:
     """Open an image file for the time of decoding it.
 
     Raises:
-        DataError: the file is missing, is no image, or is cut short; names it.
+        DataError: the file is missing, is no image, or is truncated; the message names it.
     """
     with (
         reading.guarded(file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."),
@@ -117,13 +117,13 @@ def opened(file: Path) -> Iterator[Image.Image]:
 
 @contextmanager
 def of_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
-    """Open the content of an image file, whatever its name ends in, for the time of decoding it.
+    """Open the content of an image file for the time of decoding it, whatever the file's suffix.
 
-    Of several images (frames, pages) it is the first.
+    If the file holds several images (frames, pages), it is the first one.
 
     Raises:
-        ValueError: it has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow.
-        Exception: it is no image, or damaged.
+        ValueError: the image has more pixels than `MOST_PIXELS_OF` and `LONGEST_SIDE` allow.
+        Exception: the content is no image, or damaged.
     """
     try:
         found = Image.open(stream, formats=FORMATS)
@@ -139,10 +139,12 @@ def of_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
 
 
 class AtOnce:
-    """Lets threads hold so many pixels together, and one of them alone any number: decoded images take the memory.
+    """Limit on the pixels that all threads hold together, because decoded images take much memory.
+
+    A single thread may hold any number of pixels while no other thread holds any.
 
     Args:
-        most: pixels.
+        most: largest number of pixels.
     """
 
     def __init__(self, most: int) -> None:
@@ -151,7 +153,7 @@ class AtOnce:
 
     @contextmanager
     def taking(self, pixels: int) -> Iterator[None]:
-        """Wait until there is room for so many pixels, and hold it."""
+        """Wait until there is room for this many pixels, and reserve it inside the block."""
         with self.changed:
             self.changed.wait_for(lambda: not self.taken or self.taken + pixels <= self.most)
             self.taken += pixels
@@ -163,25 +165,27 @@ class AtOnce:
                 self.changed.notify_all()
 
     def _forget(self) -> None:
-        """Of the threads that hold some a forked process has none."""
+        """Reset the count in a forked process, which has none of the threads that hold pixels."""
         self.taken, self.changed = 0, threading.Condition()
 
 
 DECODED = AtOnce(AT_ONCE)
+"""Limit on the decoded images of this process."""
 
 
 def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
-    """Decode an image to eight bits, however it was stored: the decoder of every reader of images.
+    """Decode an image to eight bits, however it is stored. Every reader of images uses this decoder.
 
     Args:
+        image: an opened image.
         channels: 1 for grey, 3 for RGB, 4 for RGB with alpha. Without alpha, transparent pixels become white.
-        upright: turn it as its EXIF entry says.
+        upright: rotate it as its EXIF entry says.
 
     Raises:
-        DataError: the range of its numbers is unknown.
+        DataError: the range of its values is unknown.
     """
     stored = _stored(image)
-    # exif_transpose would copy it in any case
+    # exif_transpose would copy the image in any case
     turned = upright and image.getexif().get(ORIENTATION, 1) != 1
     whole = ImageOps.exif_transpose(image) if turned else image
     whole.load()
@@ -189,20 +193,20 @@ def plain(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
     if whole.mode == mode and "transparency" not in whole.info:
         return whole
     found = Image.new(mode, whole.size)
-    # in strips: beside the image and the result a whole one of each step would take four times the memory
+    # In strips, because whole intermediate images beside the source and the result would take four times the memory.
     for top, strip in _strips(whole, stored, channels, opaque=False):
         found.paste(strip, (0, top))
     return found
 
 
 def colors(image: Image.Image) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
-    """Decode an image to RGB as `plain` does, but without its alpha: what lies under transparent pixels is shown.
+    """Decode an image to RGB as `plain` does, but ignore its alpha: transparent pixels keep their colours.
 
     Yields:
         The first row of a strip, and its pixels.
 
     Raises:
-        DataError: as `plain`.
+        DataError: as in `plain`.
     """
     for top, strip in _strips(image, _stored(image), 3, opaque=True):
         yield top, np.asarray(strip)
@@ -222,16 +226,17 @@ def _strips(
 
 
 def has_alpha(image: Image.Image) -> bool:
-    """Say whether an image tells how transparent its pixels are."""
+    """Return whether an image has an alpha channel or a transparent colour."""
     return image.mode in ("LA", "La", "PA", "RGBA", "RGBa") or "transparency" in image.info
 
 
 class _Stored(NamedTuple):
-    """How the numbers of a file are to be read; a loaded image no longer says it.
+    """Meaning of the values in a file; a loaded image no longer tells it.
 
     Attributes:
-        black, white: the numbers that stand for them where a number has more than eight bits.
-        key: which colour is transparent, as decoded pixels say it; None where no colour is.
+        black: value of black, if a value has more than eight bits.
+        white: value of white, if a value has more than eight bits.
+        key: colour that is transparent, in the values of decoded pixels; None if no colour is.
     """
 
     black: int
@@ -240,13 +245,13 @@ class _Stored(NamedTuple):
 
 
 def _stored(image: Image.Image) -> _Stored:
-    """Look at the header of an image.
+    """Read the meaning of an image's values from its header.
 
     Raises:
-        DataError: the range of its numbers is unknown, or one of its 16-bit colours, of which 8 bits are decoded, is
-            transparent.
+        DataError: the range of its values is unknown; or a 16-bit colour is transparent, of which only 8 bits are
+            decoded.
     """
-    tags = getattr(image, "tag_v2", {})  # of a TIFF
+    tags = getattr(image, "tag_v2", {})  # entries of a TIFF file
     long = image.mode.startswith("I")
     if image.mode == "F" or (image.mode == "I" and tags):
         kind = "floating-point numbers" if image.mode == "F" else "integers of 32 bits, or with a sign,"
@@ -259,7 +264,7 @@ def _stored(image: Image.Image) -> _Stored:
             "one of its 16-bit colours stands for transparent pixels; wanted an alpha channel. Save it with one."
         )
     if image.mode == "L" and isinstance(key, int) and isinstance(image, ImageFile.ImageFile) and image.tile:
-        # Pillow gives it in the bits of the PNG file
+        # Pillow gives the key in the bits of the PNG file.
         key *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
     most = 2 ** tags.get(BITS_PER_SAMPLE, (16,))[0] - 1 if long else 255
     return _Stored(most, 0, key) if long and tags.get(PHOTOMETRIC) == 0 else _Stored(0, most, key)
@@ -286,9 +291,9 @@ def _eight_bit(strip: Image.Image, stored: _Stored) -> Image.Image:
 
 
 def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
-    """Cut out the square around a box, (channels, side, side), low-pass filtered; None where the box is empty.
+    """Return the square around a box, (channels, side, side), low-pass filtered; None if the box is empty.
 
-    The box is first clipped to the image. Where the square reaches beyond it, border pixels are repeated.
+    The box is first clipped to the image. Where the square reaches beyond the image, border pixels are repeated.
     """
     inner = clipped(box, image.size)
     if inner is None:
@@ -296,12 +301,12 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
     left, top, right, bottom = inner
     half = (0.5 + margin) * max(right - left, bottom - top)
     x, y = (left + right) / 2, (top + bottom) / 2
-    # whole pixels around the square, then those of them that exist, then the square within what was cut
+    # First the whole pixels around the square, then those inside the image, then the square within the cut part.
     first_x, first_y = math.floor(x - half), math.floor(y - half)
     last_x, last_y = math.ceil(x + half), math.ceil(y + half)
     inside = (max(0, first_x), max(0, first_y), min(image.width, last_x), min(image.height, last_y))
     padded = inside != (first_x, first_y, last_x, last_y)
-    if padded and (last_x - first_x) * (last_y - first_y) > MOST_PADDED:  # a strip, say
+    if padded and (last_x - first_x) * (last_y - first_y) > MOST_PADDED:  # a long strip, for example
         step = math.ceil(max(last_x - first_x, last_y - first_y) / math.isqrt(MOST_PADDED))
         small = (left / step, top / step, right / step, bottom / step)
         return square(image.reduce(step), small, margin, side)
@@ -315,7 +320,7 @@ def square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np
 
 
 def _padded(image: Image.Image, left: int, top: int, size: tuple[int, int]) -> Image.Image:
-    """An image of `size` in which this one lies at (left, top); around it its border pixels are repeated."""
+    """Return an image of `size` with this image at (left, top); its border pixels are repeated around it."""
     width, height = size
     right, bottom = left + image.width, top + image.height
     found = Image.new(image.mode, size)
@@ -332,7 +337,7 @@ def _padded(image: Image.Image, left: int, top: int, size: tuple[int, int]) -> I
 
 
 def clipped(box: Box, size: tuple[int, int]) -> Box | None:
-    """Cut a box at the borders of an image of (width, height); None where nothing is left, or it is not finite."""
+    """Return a box clipped to an image of (width, height); None if nothing is left or the box is not finite."""
     if not all(map(math.isfinite, box)):
         return None
     width, height = map(float, size)
@@ -341,9 +346,9 @@ def clipped(box: Box, size: tuple[int, int]) -> Box | None:
 
 
 class Crops(Dataset[dict[str, Tensor]]):
-    """Reads each crop when it is asked for; the other fields are in memory.
+    """Data set that reads each crop from its file when it is requested; the other fields are in memory.
 
-    Items raise a DataError where a file cannot be read.
+    Items raise a DataError if a file cannot be read.
     """
 
     def __init__(self, crops: Sequence[Crop], **fields: Tensor) -> None:
@@ -360,10 +365,10 @@ class Crops(Dataset[dict[str, Tensor]]):
 def load(
     crops: Sequence[Crop], fields: Mapping[str, Tensor], what: str, *, in_memory: bool
 ) -> tuple[Fields | Crops, list[DataError]]:
-    """Make a data set of the crops that can be read ("input", their `fields`, "index"), and list the others' faults.
+    """Return a data set of the crops that can be read ("input", their `fields`, "index"), and the errors of the others.
 
-    In memory everything is decoded now. Otherwise only the files' headers are read, and damage further on
-    shows when a crop is used.
+    With `in_memory` every crop is decoded now. Otherwise only the headers of the files are read, and damage after the
+    header is found when a crop is used.
     """
     faults: dict[int, DataError] = {}
     shape = (len(crops), crops[0].channels, crops[0].side, crops[0].side) if crops and in_memory else (0,)
@@ -398,15 +403,17 @@ def load_splits(
     skip_unreadable: bool,
     generated_in: Path | None = None,
 ) -> tuple[dict[str, Fields | Crops], int]:
-    """Make a data set of each split's crops that can be read, and count the samples that cannot.
+    """Return a data set of the readable crops of each split, and the number of samples that cannot be read.
 
     Args:
-        crops, fields: by the split's name.
-        faults: of samples whose labels could not be read.
-        generated_in: the cache folder of generated images; None: they are the user's.
+        crops: crops by the split's name.
+        fields: fields by the split's name.
+        faults: errors of samples whose labels could not be read.
+        skip_unreadable: leave out samples that cannot be read.
+        generated_in: the cache folder of generated images; None: the images are the user's.
 
     Raises:
-        DataError: samples cannot be read and are not to be skipped; names the first ten.
+        DataError: samples cannot be read and must not be skipped; the message names the first ten.
     """
     every = [crop for chosen in crops.values() for crop in chosen]
     total = len(faults) + len(every)
@@ -425,7 +432,7 @@ def load_splits(
 
 
 def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Tensor]:
-    """Make "target" (radians in [-π, π), a column for each name) and "group" (0) of samples with these angles."""
+    """Return "target" (radians in [-π, π), one column per name) and "group" (0) of samples with these angles."""
     turned = [[(angle + math.pi) % (2 * math.pi) - math.pi for angle in row] for row in angles]
     return {
         "target": torch.tensor(turned, dtype=torch.float32).reshape(len(angles), len(names)),
@@ -434,10 +441,10 @@ def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dic
 
 
 def unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
-    """Make a data set, "input" and "index", of a user's own images in their order.
+    """Return a data set, "input" and "index", of a user's own images in their order.
 
     Raises:
-        DataError: there are none, or some cannot be read; names the first ten.
+        DataError: there is no image, or some cannot be read; the message names the first ten.
     """
     if not crops:
         raise DataError("No image file was given; wanted at least one.")
@@ -449,16 +456,17 @@ def unlabelled(crops: Sequence[Crop]) -> Fields | Crops:
 
 
 def fit_in_memory(crops: int, side: int, channels: int) -> bool:
+    """Return whether this many crops take at most IN_MEMORY bytes."""
     return crops * channels * side**2 <= IN_MEMORY
 
 
 def fault_message(faults: Sequence[DataError], total: int, remedy: str) -> str:
-    """Say how many samples cannot be read, at most ten of the reasons, and what to do."""
+    """Return a message with the number of unreadable samples, at most ten of the reasons, and the remedy."""
     return f"{len(faults)} of {total} samples cannot be read:{listed(faults)}\n{remedy}"
 
 
 def listed(items: Sequence[object]) -> str:
-    """List at most ten of the items, each on a line of its own, and say how many more there are."""
+    """Return at most ten of the items, each on its own line, and the number of the others."""
     lines = [str(item) for item in items[:10]]
     if len(items) > 10:
         lines.append(f"and {len(items) - 10} more")
@@ -466,9 +474,9 @@ def listed(items: Sequence[object]) -> str:
 
 
 def varied(batch: Batch, signs: Sequence[float], jitter: float) -> Batch:
-    """Vary the images of a training batch as `augmented` does and, where there are `signs`, mirror half of them.
+    """Vary the images of a training batch as `augmented` does and, if there are `signs`, mirror half of them.
 
-    A mirrored image's angles are multiplied by `signs`, 1 or -1 for each angle.
+    The angles of a mirrored image are multiplied by `signs`, 1 or -1 for each angle.
     """
     if not signs and not jitter:
         return batch
@@ -487,18 +495,18 @@ def augmented(
 ) -> Float[Tensor, "batch channels height width"]:
     """Vary images at random; the values are 0…1, on the images' device.
 
-    Those that `mirrored` marks are reflected left to right. Every image is shifted and scaled by up to `jitter` of
-    its side (linear interpolation, border pixels repeated), made brighter or darker by up to `jitter`, and
-    its contrast changed by up to twice that. Random numbers come from torch's global CPU generator.
+    Images that `mirrored` marks are reflected left to right. Every image is shifted and scaled by up to `jitter` of its
+    side (linear interpolation, border pixels repeated). Its brightness changes by up to `jitter`, and its contrast by
+    up to twice that. Random numbers come from torch's global CPU generator.
     """
     batch, _, height, width = images.shape
-    # float32, whatever the default is while a model of float64 trains
+    # float32, because the default type may be float64 while a float64 model trains.
     amount = (2 * torch.rand(5, batch, dtype=torch.float32) - 1) * jitter
     scale = amount[0].exp()
     sign = 1 - 2 * mirrored.to("cpu", torch.float32)
     rows = _positions(height, scale, amount[1] * height).to(images.device)
     columns = _positions(width, sign * scale, amount[2] * width).to(images.device)
-    # Whole lines are copied fastest: columns are interpolated as rows of the transposed image. kornia's warp_affine
+    # Whole lines are copied fastest, so columns are interpolated as rows of the transposed image. kornia's warp_affine
     # agrees to 0.01 grey levels and takes twice to five times as long (batches of 48 to 75 pixels, one thread).
     image = _interpolated(images.transpose(2, 3), columns)
     image = _interpolated(image.transpose(2, 3), rows)
@@ -510,14 +518,14 @@ def augmented(
 
 
 def _positions(length: int, scale: Tensor, shift: Tensor) -> Float[Tensor, "batch length"]:
-    """Say where each of `length` pixels comes from: scaled about the middle, kept within the image."""
+    """Return the source position of each of `length` pixels, scaled about the middle and kept within the image."""
     middle = (length - 1) / 2
     offset = torch.arange(length, dtype=torch.float32) - middle
     return (middle + shift[:, None] + scale[:, None] * offset).clamp(0, length - 1)
 
 
 def _interpolated(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor:
-    """Interpolate each image's lines at fractional `rows`, as float32."""
+    """Interpolate the lines of each image at fractional `rows`, as float32."""
     batch, channels, height, width = images.shape
     lines = images.reshape(-1, width)
     plane = height * torch.arange(batch * channels, device=images.device).view(batch, channels, 1)
@@ -533,10 +541,10 @@ def _interpolated(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor
 def blurred(
     images: Shaped[Tensor, "*batch height width"], deviation: float
 ) -> Shaped[Tensor, "*batch height width"]:
-    """Convolve images with a Gaussian of standard deviation `deviation` pixels; 0 gives the images themselves.
+    """Convolve images with a Gaussian of standard deviation `deviation` pixels; 0 returns the images themselves.
 
-    The kernel ends at four deviations and sums to 1; beyond the border the image is mirrored about its edge
-    (d c b a | a b c d | d c b a). The result has the images' type; whole numbers are rounded.
+    The kernel ends at four deviations and sums to 1. Beyond the border the image is mirrored about its edge (d c b a |
+    a b c d | d c b a). The result has the images' type; integers are rounded.
     """
     if deviation == 0:
         return images
@@ -551,7 +559,7 @@ def blurred(
 
 
 def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
-    """Write the Gaussian filter of a line of `length` pixels as a matrix, float64."""
+    """Return the Gaussian filter of a line of `length` pixels as a matrix, float64."""
     reach = int(4 * deviation + 0.5)
     offsets = torch.arange(-reach, reach + 1)
     weights = (-0.5 * (offsets.double() / deviation).square()).exp()
@@ -563,7 +571,7 @@ def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
 
 
 def picture(image: Tensor) -> NDArray[np.uint8]:
-    """Turn one image (channels, height, width), uint8 or float in 0…1, into (height, width, 3) uint8."""
+    """Return one image (channels, height, width), uint8 or float in 0…1, as (height, width, 3) uint8."""
     pixels = image.detach().cpu()
     if pixels.is_floating_point():
         pixels = (255 * pixels.clamp(0, 1)).round().to(torch.uint8)

@@ -1,8 +1,8 @@
-"""Reads MATLAB 5 files, which may be damaged: numbers, text, cells and structs.
+"""Reader for MATLAB 5 files that may be damaged: numbers, text, cells and structs.
 
 SciPy's reader can crash the process on a file with a wrong byte in it (seen with SciPy 1.17), so none of it is used.
-Every element must lie within the one that holds it and bring the data that its dimensions ask for, before anything is
-allocated. The format: MathWorks, MAT-File Format (R2023b).
+Every element must lie within the element that holds it, and must hold as much data as its dimensions say, before memory
+is allocated. The format: MathWorks, MAT-File Format (R2023b).
 """
 
 import math
@@ -20,21 +20,24 @@ from framework.storage.reading import RESTORE, guarded, inflated, read_bytes, ro
 
 HEADER_BYTES = 128
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+"""NumPy types by the types of elements that hold numbers, table 1-1."""
 LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+"""Encodings by the types of elements that hold text, table 1-1."""
 UNSIGNED, MATRIX, COMPRESSED = 6, 14, 15
 """Types of elements, table 1-1."""
 CELL, STRUCT, CHAR, NUMERIC, OPAQUE = 1, 2, 4, range(6, 16), 17
 """Classes of arrays, table 1-3."""
 COMPLEX = 0x0800
+"""Flag of an array of complex numbers."""
 NAME_WITHIN = 512
-"""The bytes at the beginning of a variable that hold its flags, at most 32 sides and its name."""
+"""Number of bytes at the beginning of a variable that hold its flags, at most 32 dimensions and its name."""
 
 
 def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:
-    """Read the named variables of a file, or all; see `variables`.
+    """Read the named variables of a file, or all; `variables` describes the result.
 
     Raises:
-        DataError: there is no such file, it is damaged, or of version 7.3.
+        DataError: the file does not exist, is damaged, or is of version 7.3.
     """
     with guarded(file, "a MATLAB file", remedy):
         content = read_bytes(file)
@@ -44,13 +47,14 @@ def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str =
 
 
 def variables(content: bytes, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """The named variables of a file's bytes, or all.
+    """Return the named variables in a file's bytes, or all.
 
-    Sides of length 1 are left out, and what is alone comes without an array. Numbers have the type that they are stored
-    in, a struct is a dict, text a string. What labels do not hold (sparse matrices, objects, functions) is None.
+    Dimensions of length 1 are removed, and a single value is returned without an array. Numbers keep their stored type,
+    a struct becomes a dict, and text becomes a string. Contents that label files do not use (sparse matrices, objects,
+    functions) become None.
 
     Raises:
-        ValueError, zlib.error: the file is damaged, or what is asked for holds complex numbers.
+        ValueError, zlib.error: the file is damaged, or a requested variable holds complex numbers.
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:HEADER_BYTES])
     if order is None:
@@ -79,7 +83,7 @@ def variables(content: bytes, names: Sequence[str] | None = None) -> dict[str, A
 
 
 class _Head(NamedTuple):
-    """What an array begins with; its data follow at `position`."""
+    """The beginning of an array; the array's data follow at `position`."""
 
     kind: int
     complex: bool
@@ -89,12 +93,17 @@ class _Head(NamedTuple):
 
 
 class _Reader:
+    """Parser of the elements of one file, with the byte order `order` ("<" or ">")."""
+
     def __init__(self, order: str) -> None:
         self.order = order
         self.arrays = 0
 
     def element(self, content: bytes, position: int, limit: int) -> tuple[int, int, int]:
-        """Read the tag at `position`: the element's type, and the first byte and end of its data, before `limit`."""
+        """Read the tag at `position` and return the element's type and the first byte and the end of its data.
+
+        The data must end at `limit` or before.
+        """
         if position + 8 > limit:
             raise ValueError(f"the file ends within an element at byte {position}")
         kind, size = struct.unpack_from(f"{self.order}II", content, position)
@@ -108,6 +117,7 @@ class _Reader:
         return kind, start, start + size
 
     def head(self, content: bytes, start: int, end: int) -> _Head:
+        """Read flags, dimensions and name of the array that begins at `start`."""
         kind, first, last = self.element(content, start, end)
         if kind != UNSIGNED or last - first != 8:
             raise ValueError(f"an array without its flags at byte {start}")
@@ -123,14 +133,14 @@ class _Reader:
         return _Head(flags & 0xFF, bool(flags & COMPLEX), shape, name, _padded(last))
 
     def numbers(self, content: bytes, position: int, limit: int) -> tuple[np.ndarray, int]:
-        """The numbers of the element at `position`, and where the next begins."""
+        """Return the numbers of the element at `position`, and the position of the next element."""
         kind, start, end = self.element(content, position, limit)
         if kind not in NUMBERS:
             raise ValueError(f"an element of type {kind} at byte {position}; wanted numbers")
         return np.frombuffer(content[start:end], self.order + NUMBERS[kind]), _padded(end)
 
     def array(self, content: bytes, start: int, end: int, depth: int) -> Any:
-        """The array that lies between two bytes, and all that it holds."""
+        """Return the array between the bytes `start` and `end`, with all arrays inside it."""
         if start == end:
             return np.empty(0)
         head = self.head(content, start, end)
@@ -169,7 +179,7 @@ class _Reader:
         return values.item() if count == 1 else values.squeeze()
 
     def text(self, content: bytes, position: int, limit: int, shape: tuple[int, ...]) -> str | np.ndarray:
-        """Text, or an array of its rows."""
+        """Return text, or an array of the rows of text."""
         kind, start, end = self.element(content, position, limit)
         if kind not in LETTERS or len(shape) != 2:
             raise ValueError(f"text of type {kind} and shape {shape} at byte {position}")
@@ -183,7 +193,7 @@ class _Reader:
         return np.array([letters[row::rows] for row in range(rows)])
 
     def fields(self, content: bytes, position: int, limit: int) -> tuple[list[str], int]:
-        """The names of a struct's fields, each padded to the same length, and where its values begin."""
+        """Return the field names of a struct, which are padded to one length, and the position of its values."""
         lengths, position = self.numbers(content, position, limit)
         _, start, end = self.element(content, position, limit)
         length = int(lengths[0]) if len(lengths) == 1 else 0
@@ -195,4 +205,5 @@ class _Reader:
 
 
 def _padded(position: int) -> int:
+    """Return the next position that is a multiple of 8."""
     return -(-position // 8) * 8

@@ -10,7 +10,7 @@ from framework.geometry.light import eight_bit
 
 
 def png(light: Float[Tensor, "height width number"]) -> bytes:
-    """The content of an 8-bit file of an image in linear light: colours, or grey where it has not three."""
+    """Return an image in linear RGB as the content of an 8-bit PNG file, grey if it does not have three channels."""
     numbers = eight_bit(light.cpu()).numpy()
     content = BytesIO()
     Image.fromarray(numbers if numbers.shape[-1] == 3 else numbers[..., 0]).save(content, "PNG")
