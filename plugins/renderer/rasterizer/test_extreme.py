@@ -149,8 +149,14 @@ def bad_slopes(scene: Scene, renderer: Rasterizer, kind: torch.dtype, scale: flo
     ]
 
 
-@pytest.mark.parametrize("gradient", KINDS)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name, gradient",
+    [
+        pytest.param(name, kind, marks=() if place % len(KINDS) == number else pytest.mark.slow)
+        for place, name in enumerate(SCENES)
+        for number, kind in enumerate(KINDS)
+    ],
+)
 def test_no_gradient_is_NaN_or_infinite(name: str, gradient: Gradient) -> None:
     for kind, supersampling in itertools.product(TYPES, (1, 2)):
         bad = bad_slopes(SCENES[name](), Rasterizer(gradient=gradient, supersampling=supersampling), kind)
@@ -187,8 +193,14 @@ def test_wild_scenes_have_finite_pictures_and_gradients(seed: int, gradient: Gra
         assert not bad_slopes(wild(seed), Rasterizer(gradient=gradient), kind, scale), kind
 
 
-@pytest.mark.parametrize("gradient", KINDS)
-@pytest.mark.parametrize("quarter", range(4))
+@pytest.mark.parametrize(
+    "quarter, gradient",
+    [
+        pytest.param(quarter, kind, marks=() if quarter == number else pytest.mark.slow)
+        for quarter in range(4)
+        for number, kind in enumerate(KINDS)
+    ],
+)
 def test_a_face_whose_corners_are_1e30_away_fills_the_image_whatever_is_asked(
     quarter: int, gradient: Gradient
 ) -> None:

@@ -28,6 +28,7 @@ from plugins.renderer.rasterizer.test_extreme import (
 SAVINGS = get_args(Saving)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150, derandomize=True)
 @given(
     st.integers(0, 2**32 - 1),

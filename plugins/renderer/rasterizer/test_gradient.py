@@ -116,6 +116,7 @@ def scene(
     return Scene(moved, faces, None, seen, Texture((image,), uv, faces))
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
     """Squared error against another pose, over four views, in every kind of parameter: 8 deformations, colours, the
     camera's rotation, translation and focal length, a texture. Cosine and length over all parameters of a kind; with

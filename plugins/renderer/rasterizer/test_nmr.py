@@ -82,7 +82,7 @@ def literal(places, faces, face, color, slopes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("whole", [False, True])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> None:
     """Overlapping faces, also from behind and past the image; `whole`: corners on pixels, edges along lines of them."""
     random = np.random.default_rng(seed)

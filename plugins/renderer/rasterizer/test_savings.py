@@ -245,7 +245,9 @@ def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
     )
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize(
+    "threads", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
     """Of different sizes and meshes, with gradients, and without where none are wanted."""
     random = np.random.default_rng(1)
