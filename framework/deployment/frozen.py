@@ -14,12 +14,13 @@ from typing import Any, final
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Distribution
 
 from framework.configuration.loading import load_with_description, reader
 from framework.data import Data, Frame
 from framework.deployment.frozen_network import Layer, Network, read, softmax
 from framework.distributions.class_probabilities import class_probabilities
+from framework.distributions.description import CategoricalDensity
 from framework.distributions.moved import Moved
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
@@ -144,7 +145,7 @@ class Frozen:
             return self.inner(features)
         raw = torch.from_numpy(network(features))
         if network.classes:
-            return Categorical(logits=raw, validate_args=False)
+            return CategoricalDensity(logits=raw, validate_args=False)
         assert isinstance(self.inner, Model)
         return self.inner.head(raw)
 

@@ -11,7 +11,7 @@ import logging
 import re
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, final
@@ -25,7 +25,7 @@ from framework.deployment.request_bodies import (
     too_large,
     wanted_of,
 )
-from framework.errors import DataError, shown
+from framework.errors import DataError, printable, shown
 
 INVOCATIONS = "/invocations"
 MOST_PASSED_OVER = 2**28
@@ -47,11 +47,13 @@ class Ticket:
         seconds: what the request may take.
         deadline: when it ends, by `time.monotonic`.
         sentence: why the model refused the request.
+        remarks: what an answer says beside its table.
     """
 
     seconds: float
     deadline: float
     sentence: str = ""
+    remarks: Sequence[str] = ()
 
     def require_time(self) -> None:
         """Refuse to go on after the deadline.
@@ -62,6 +64,10 @@ class Ticket:
         if time.monotonic() > self.deadline:
             self.sentence = too_long(self.seconds)
             raise DataError(self.sentence)
+
+
+REMARK = b"x-model-remark"
+"""Header of an answer with what a wrapper of the model found when it was calibrated."""
 
 
 @dataclass
@@ -131,7 +137,7 @@ class Bounded:
             raise Refused(408 if body is None else 413, too_long(self.seconds)) from None
         if status >= 400:
             raise Refused(_status(status), ticket.sentence or _sentence(content, kind))
-        await _send(send, status, content, media)
+        await _send(send, status, content, media, remarks=ticket.remarks)
 
     async def _body(
         self, headers: Mapping[bytes, bytes], receive: Receive, received: Received
@@ -275,9 +281,23 @@ async def _refuse(receive: Receive | None, send: Send, refusal: Refused) -> None
     await send({"type": "http.response.body", "body": b""})
 
 
-async def _send(send: Send, status: int, content: bytes, media: bytes, *, close: bool = False) -> None:
-    """Send an answer; where the connection is to `close`, its end is left to the caller."""
+async def _send(
+    send: Send,
+    status: int,
+    content: bytes,
+    media: bytes,
+    *,
+    remarks: Iterable[str] = (),
+    close: bool = False,
+) -> None:
+    """Send an answer; where the connection is to `close`, its end is left to the caller.
+
+    Each of `remarks` is a header of its own: a table of predictions has no place for them.
+    """
     headers = [(b"content-type", media), (b"content-length", str(len(content)).encode())]
+    headers += [
+        (REMARK, printable(remark, kept="").encode("ascii", "backslashreplace")) for remark in remarks
+    ]
     headers += [(b"connection", b"close")] * close
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": content, "more_body": close})

@@ -48,6 +48,8 @@ class Served:
     def predict(self, given: Any, params: object = None) -> pd.DataFrame:
         """As `answer`; MLflow calls it, and its server tells a client the sentence of an MlflowException alone."""
         ticket = TICKET.get()
+        if ticket is not None:
+            ticket.remarks = self.description.remarks
         try:
             return self.answer(given)
         except UserError as error:
@@ -69,6 +71,8 @@ class Served:
     @torch.no_grad()
     def answer(self, given: Any) -> pd.DataFrame:
         """A row a sample, with the set that the model promises (`promised`); an image is a PNG in base64.
+
+        What `mode=predict` prints of these sets stands in `attrs["remarks"]` of the table.
 
         Args:
             given: what `framework.load`'s model takes, but files only as `pathlib.Path`; or the content of files: a
@@ -103,7 +107,9 @@ class Served:
                 labels, found = {}, {**found, **named(target, mode, "_mode")}
             numbers = {key: column.numpy() for key, column in found.items()}
             parts.append(pd.DataFrame({**labels, **numbers, **promised(target, prediction)}))
-        return pd.concat(parts, ignore_index=True)
+        table = pd.concat(parts, ignore_index=True)
+        table.attrs["remarks"] = list(self.description.remarks)
+        return table
 
     def warm_up(self) -> None:
         """Predict once for made-up samples, so that no later prediction waits for imports and compilation."""
@@ -273,6 +279,8 @@ def _load_pyfunc(path: str) -> Served:
     """Return the model that MLflow asks for with the path of its checkpoint; errors as `framework.load`."""
     predictor, description = load_with_description(path)
     served = Served(predictor, description, reader(description))
+    for remark in description.remarks:
+        _log.warning("%s", remark)
     served.warm_up()
     samples = (one.to_dict(orient="split", index=False) for one in served.made_up())
     bound_server([json.dumps({"dataframe_split": sample}).encode() for sample in samples])

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch import distributions as torchs
 from torch.distributions import Categorical, Distribution, Independent, MultivariateNormal, Normal
 
+from framework.distributions.description import CategoricalDensity
 from framework.distributions.protocol import (
     Estimate,
     Normals,
@@ -134,7 +135,7 @@ def _(density: MultivariateNormal, samples: int) -> Tensor:
 
 @pick.register
 def _(density: Categorical, index: Tensor) -> Distribution:
-    return Categorical(logits=take(density.logits, index), validate_args=False)
+    return CategoricalDensity(logits=take(density.logits, index), validate_args=False)
 
 
 @pick.register

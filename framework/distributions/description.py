@@ -2,7 +2,7 @@
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Categorical, Distribution
 
 LONGEST = 200
 """Most characters of a line."""
@@ -20,17 +20,32 @@ def one_line(self: Distribution) -> str:
     names = getattr(self, "names", ())
     if names:
         said.append(f"names={', '.join(map(str, names[:WHOLE]))}{', …' * (len(names) > WHOLE)}")
-    said += [f"{key}={text}" for key, value in vars(self).items() if (text := _parameter(key, value))]
+    said += _parameters(self)
     line = f"{type(self).__name__}({', '.join(said)})"
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 2]}…)"
 
 
-def _parameter(key: str, value: object) -> str:
+class CategoricalDensity(Categorical):
+    """A categorical density that prints as others do."""
+
+    __repr__ = one_line
+
+
+def _parameters(density: Distribution, inner: bool = True) -> list[str]:
+    """Return what the parameters of a density are, and of a density in it where it is the `inner` one's turn."""
+    found = ((key, _parameter(key, value, inner)) for key, value in vars(density).items())
+    return [f"{key}={text}" for key, text in found if text]
+
+
+def _parameter(key: str, value: object, inner: bool) -> str:
     """Return a parameter in a few characters; '' for what is none."""
     if key.startswith("_"):
         return ""
     if isinstance(value, Distribution):
-        return type(value).__name__
+        own = _parameters(value, inner=False) if inner else []
+        return f"{type(value).__name__}({', '.join(own)})" if own else type(value).__name__
+    if isinstance(value, float):
+        return f"{value:.4g}"
     if not isinstance(value, Tensor) or not value.numel():
         return ""
     numbers = value.detach()

@@ -9,11 +9,11 @@ from typing import ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Categorical, Distribution, constraints
+from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular, grid, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.description import one_line
+from framework.distributions.description import CategoricalDensity, one_line
 from framework.distributions.protocol import (
     Estimate,
     Slope,
@@ -107,7 +107,7 @@ def divided(log_density: Tensor, temperature: Tensor) -> Tensor:
     return torch.where(ruled_out, -math.inf, log_density.masked_fill(ruled_out, 0.0) / temperature)
 
 
-class RescaledClasses(Categorical):
+class RescaledClasses(CategoricalDensity):
     """Classes whose log-probabilities are `slope` times those of another density, plus constants, normalised.
 
     Args:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 
 from framework.density_head import DensityHead
+from framework.distributions.description import CategoricalDensity
 from framework.errors import ConfigError
 from framework.heads.parameters import require_finite
 from framework.target import Target
@@ -81,4 +82,4 @@ def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:
     """Their softmax; logits so large that their differences overflow are cut off first."""
     most = torch.finfo(logits.dtype).max / 4
     # normalised here, the largest logit subtracted first: torch's own normalisation loses the digits of large logits
-    return Categorical(logits=logits.clamp(-most, most).log_softmax(-1), validate_args=False)
+    return CategoricalDensity(logits=logits.clamp(-most, most).log_softmax(-1), validate_args=False)
