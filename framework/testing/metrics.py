@@ -263,7 +263,7 @@ def _on_one_device(build: Make, some: "Predictions", worst: Worst) -> None:
         mode.move(metric)
         fields = ("target", "place", "breadth", "outliers", "fields")
         received = replace(some, **mode.receive({name: getattr(some, name) for name in fields}))
-        parts = mode.receive(list(torch.arange(SAMPLES).split(SAMPLES // 2)))
+        parts = mode.receive(list(torch.arange(SAMPLES // 2).split(SAMPLES // 4)))
         for part in parts:
             yield "update", lambda part=part: _feed(metric, received, part)
         yield "compute", metric.compute
