@@ -1,1 +1,1 @@
-"""Training steps, the order of batches, checkpoints, cached features, fitting without gradient."""
+"""Training steps, the order of batches, checkpoints, cached features, and fitting without gradient."""

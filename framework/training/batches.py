@@ -23,28 +23,29 @@ from framework.target import Target
 from framework.tracking.signals import SIGNALS
 
 Position = tuple[int, int]
-"""(epoch, first batch within it), both from 0."""
+"""Pair (epoch, first batch within it), both counted from 0."""
 
 
 @final
 class SeededBatches(Sampler[list[int]]):
-    """Indices of one epoch's batches; under several ranks, this rank's share of each.
+    """Sample indices of the batches of one epoch; with several ranks, this rank's share of each batch.
 
-    The order depends on (seed, epoch) alone, not on the ranks: rank r of R takes the r-th of R equal slices
-    of each batch, so that all ranks have equally many batches and no sample comes twice.
+    The order depends on (seed, epoch) only, not on the ranks. Rank r of R takes the r-th of R equal slices of each
+    batch, so that all ranks have equally many batches and no sample occurs twice.
 
     Args:
         length: number of samples.
         batch_size: samples of a batch over all ranks.
-        orders: so many orders of their own; a batch holds one batch of each, one after the other.
-        position: where to start, asked with the number of batches of an epoch, once per iteration and not
-            before its first batch is wanted (a DataLoader calls `iter` earlier, with workers once too often).
-        seed: of the order; None keeps the samples' own order.
-        drop_last: leave out the samples that do not fill a batch (a different few each epoch). Fewer samples
-            than one batch make one smaller batch all the same.
+        orders: number of independent orders; a batch concatenates one batch of each order.
+        position: function from the number of batches of an epoch to the starting position. It is called once per
+            iteration, when the first batch is requested (a DataLoader calls `iter` earlier, and with workers once too
+            often).
+        seed: seed of the order; None keeps the samples' own order.
+        drop_last: leave out the samples that do not fill a batch (different ones in each epoch). If there are fewer
+            samples than one batch, they still make one smaller batch.
 
     Raises:
-        ConfigError: the batch is smaller than the number of ranks.
+        ConfigError: the batch size is smaller than the number of ranks.
         DataError: there are fewer samples than ranks, or none.
     """
 
@@ -80,7 +81,7 @@ class SeededBatches(Sampler[list[int]]):
 
     def __len__(self) -> int:
         whole, rest = divmod(self.length, self.batch_size)
-        # A rest too small to give each rank a sample joins the batch before it.
+        # A remainder too small to give each rank a sample joins the batch before it.
         return max(1, whole + (not self.drop_last and rest >= self.ranks))
 
     def __iter__(self) -> Iterator[list[int]]:
@@ -90,6 +91,7 @@ class SeededBatches(Sampler[list[int]]):
             yield [sample for order in orders for sample in self._part(order, number)]
 
     def _part(self, order: list[int], number: int) -> list[int]:
+        """Return this rank's share of batch `number` of an order."""
         start = number * self.batch_size
         last = number == len(self) - 1
         batch = order[start:] if last and not self.drop_last else order[start : start + self.batch_size]
@@ -97,10 +99,14 @@ class SeededBatches(Sampler[list[int]]):
 
 
 def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> list[int]:
-    """The permutation of `length` samples that (seed, epoch) gives; None gives 0, 1, 2, …
+    """Return the permutation of `length` samples for (seed, epoch); without a seed it is 0, 1, 2, …
 
     Args:
-        member: of several models that train together: the first has the order of one that trains alone.
+        length: number of samples.
+        seed: seed of the order; None keeps the samples' own order.
+        epoch: counted from 0.
+        member: number of the model among several that train together; the first one has the order of a model that
+            trains alone.
     """
     if seed is None:
         return list(range(length))
@@ -110,19 +116,19 @@ def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> l
 
 @final
 class Batches(pl.LightningDataModule):
-    """Batches of a data set for every stage, resumable in mid-epoch to the same next batch.
+    """Batches of a data set for every stage; a training resumes within an epoch with the same next batch.
 
-    Call `attach` before `fit`, and give the Trainer `use_distributed_sampler=False`: ranks are served here.
-    Training drops the samples that do not fill a batch; the other stages see every sample once, in the data
-    set's order.
+    Call `attach` before `fit`, and give the Trainer `use_distributed_sampler=False`, because this class handles ranks.
+    Training drops the samples that do not fill a batch. The other stages see every sample once, in the data set's
+    order.
 
     Args:
-        data: prepared.
+        data: a prepared data set.
         batch_size: samples of a batch over all devices.
-        workers: loading processes of each stage; 0 loads in this one.
-        seed: of the training order.
-        files: what `predict` reads.
-        orders: of models that train together, each with an order of its own; on one device alone.
+        workers: number of loading processes of each stage; 0 loads in this process.
+        seed: seed of the training order.
+        files: files that `predict` reads.
+        orders: number of models that train together, each with its own order; on a single device only.
     """
 
     def __init__(
@@ -144,26 +150,30 @@ class Batches(pl.LightningDataModule):
         self.orders = orders
 
     def attach(self, trainer: pl.Trainer) -> None:
-        """Name the trainer whose progress says where to go on, and for whose rank and device it is."""
+        """Set the trainer whose progress gives the starting position, and whose rank and device the batches are for."""
         self.trainer = trainer
 
     def train_dataloader(self) -> DataLoader[Batch]:
+        """Return the training batches, starting at the position of the trainer."""
         orders = self.orders if self.trainer is None or self.trainer.world_size == 1 else 1
         split = self.data.splits().train
         return self._loader(split, position=self._position, seed=self.seed, drop_last=True, orders=orders)
 
     def val_dataloader(self) -> DataLoader[Batch]:
+        """Return the batches of the validation split."""
         return self._loader(self.data.splits().validation, seed=None, drop_last=False)
 
     def test_dataloader(self) -> DataLoader[Batch]:
+        """Return the batches of the test split."""
         return self._loader(self.data.splits().test, seed=None, drop_last=False)
 
     def of(self, dataset: Dataset[Batch]) -> DataLoader[Batch]:
-        """Batches of a dataset that is none of the four stages', in its own order; its targets may be any."""
+        """Return batches of any other dataset in its own order, without a check of its targets."""
         return self._loader(dataset, as_batch, seed=None, drop_last=False)
 
     def predict_dataloader(self) -> DataLoader[Batch]:
-        # Plain, since Lightning rebuilds a loader of predict to keep track of indices, and cannot ours.
+        """Return the batches of the user's own files."""
+        # A plain loader, because Lightning rebuilds the loader of predict to track indices, and cannot rebuild ours.
         return DataLoader(
             self.data.read(self.files),
             batch_size=self.batch_size,
@@ -196,15 +206,18 @@ class Batches(pl.LightningDataModule):
         )
 
     def _generator(self) -> torch.Generator:
-        """For the workers' seeds, which a DataLoader else draws from the global generator at each start."""
+        """Return the generator of the workers' seeds.
+
+        Without it a DataLoader would draw these seeds from the global generator at each start.
+        """
         return torch.Generator().manual_seed(self.seed)
 
     def _position(self, batches: int) -> Position:
-        """Where training is, from the counters Lightning keeps in a checkpoint.
+        """Return the position of the training, from the counters that Lightning keeps in a checkpoint.
 
-        `processed` counts the batches whose step was taken: `completed` is one behind in a checkpoint written
-        at a batch's end, `ready` one ahead in one written after an exception. It belongs to the last epoch
-        *started*.
+        `processed` counts the batches whose step was taken, in the last epoch that was *started*. The other counters do
+        not: `completed` is one behind in a checkpoint written at the end of a batch, and `ready` is one ahead in a
+        checkpoint written after an exception.
         """
         trainer: Any = self.trainer  # Any: Lightning types its counters by a base class that lacks them
         if trainer is None:
@@ -222,7 +235,7 @@ class Batches(pl.LightningDataModule):
 
 
 def outlive_signals(worker: int) -> None:
-    """Let a data-loading process go on after a signal to all processes of a run.
+    """Let a data-loading process go on after a signal that all processes of a run receive.
 
     The run then saves its checkpoint and ends its workers itself. A second SIGTERM ends a worker at once.
     """
@@ -235,15 +248,17 @@ def _end_at_second(number: int, frame: FrameType | None) -> None:
 
 
 def with_targets(target: Target, items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """As `as_batch`; of targets that `require_targets` refuses a DataError."""
+    """Return samples as a batch, as `as_batch` does, and check their targets with `require_targets`."""
     return require_targets(as_batch(items), target)
 
 
 def require_targets(batch: Batch, target: Target) -> Batch:
-    """The batch itself, if its targets are laid out as `target` says: others would broadcast, and be trained on.
+    """Return the batch itself if its targets have the layout of `target`.
+
+    Targets of another shape would broadcast, and the model would be trained on them.
 
     Raises:
-        DataError: they are of another shape, or a label is that of no class.
+        DataError: the targets have another shape, or a label belongs to no class.
     """
     found, wanted = batch["target"], (len(batch["input"]), *target.event_shape)
     if tuple(found.shape) != wanted:
@@ -257,6 +272,11 @@ def require_targets(batch: Batch, target: Target) -> Batch:
 
 
 def told(loader: DataLoader[Batch], what: str) -> Iterator[Batch]:
-    """Its batches; meanwhile the user is told how many samples `what` is done for."""
+    """Yield the batches of a loader and show the user how many samples are done.
+
+    Args:
+        loader: the batches.
+        what: name of the activity.
+    """
     samples: int = len(loader.dataset)  # type: ignore[arg-type]
     return tracked(loader, what, samples, "samples", lambda batch: len(batch["input"]))

@@ -1,4 +1,4 @@
-"""A data set whose inputs are features, computed once per sample: what precedes everything that is learned."""
+"""A data set whose inputs are features that fixed encoders computed once per sample."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -16,18 +16,21 @@ from framework.errors import ConfigError
 from framework.training.batches import Batches, told
 
 LARGEST = 8 * 2**30
-"""Bytes of features of one split that are held in memory; more are computed in every epoch."""
+"""Size of the features of one split, in bytes, up to which they are held in memory.
+
+Larger features are computed in every epoch.
+"""
 
 
 @final
 class CachedFeatures(Data):
-    """Another data set's samples with features for inputs; each split is computed when it is first asked for.
+    """Another data set's samples with features as inputs; each split is computed when it is first requested.
 
     Args:
-        data: prepared, and such that `augment` leaves its batches as they are.
-        features: of a batch of inputs.
-        batch_size: samples encoded at once.
-        workers: loading processes.
+        data: a prepared data set whose `augment` leaves batches as they are.
+        features: function from a batch of inputs to features.
+        batch_size: number of samples encoded at once.
+        workers: number of loading processes.
     """
 
     bibtex = ""
@@ -48,30 +51,35 @@ class CachedFeatures(Data):
         self._splits = Splits(train, validation, test)
 
     def prepare(self) -> None:
-        """Nothing: the data is prepared."""
+        """Do nothing, because the data set is prepared."""
 
     def splits(self) -> Splits:
+        """Return the splits, with features as inputs."""
         return self._splits
 
     def compute(self) -> int:
-        """Compute what training reads, now; of how many samples."""
+        """Compute now the features that training reads, and return the number of their samples."""
         return sum(len(split.fields) for split in self.computed)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
+        """Return the features of a user's own files."""
         return _Computed(self.data.read(files), self._computed)
 
     def augment(self, batch: Batch) -> Batch:
+        """Return the batch itself."""
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:
+        """Return what identifies the data set."""
         return self.data.fingerprint()
 
     def picture(self, inputs: Tensor) -> np.ndarray:
+        """Refuse to draw features."""
         raise ConfigError("Features have no picture; ask the data they were computed from.")
 
     @torch.no_grad()
     def _computed(self, dataset: Dataset[Batch]) -> Fields:
-        """Every field in memory, in the order of the data set."""
+        """Return all fields in memory, in the order of the data set."""
         count: int = len(dataset)  # pyright: ignore[reportArgumentType]
         fields: dict[str, Tensor] = {}
         row = 0
@@ -95,6 +103,7 @@ class _Computed(Dataset[Batch]):
 
     @cached_property
     def fields(self) -> Fields:
+        """All fields of the split."""
         return self.compute(self.dataset)
 
     def __len__(self) -> int:
@@ -108,7 +117,7 @@ class _Computed(Dataset[Batch]):
 
 
 def fits(data: Data, features: Callable[[Tensor], Tensor]) -> bool:
-    """Whether the features of the training split, its largest, can be held in memory."""
+    """Return whether the features of the training split, which is the largest, can be held in memory."""
     dataset = data.splits().train
     count: int = len(dataset)  # pyright: ignore[reportArgumentType]
     if count == 0:

@@ -13,14 +13,17 @@ from framework.training.batches import Batches
 
 @torch.no_grad()
 def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
-    """Fit every such head to the features of the training split; the members of an ensemble with seeds of their own.
+    """Fit every head of the kind `Fitted` to the features of the training split.
+
+    The members of an ensemble use different seeds.
 
     Args:
-        predictor: what reads the batches' inputs.
-        batches: not augmented.
+        predictor: the predictor that reads the batches' inputs.
+        batches: batches without augmentation.
+        seed: seed of the first head; each further head gets the next one.
 
     Raises:
-        DataError: a feature is not finite; names the sample.
+        DataError: a feature is not finite; the message names the sample.
     """
     if not fitted_models(predictor):
         return
@@ -41,6 +44,6 @@ def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
 
 @torch.no_grad()
 def mean_loss(predictor: Predictor, batches: Iterable[Batch]) -> float:
-    """Over the samples, nats."""
+    """Return the mean loss over all samples of the batches, nats."""
     losses = [predictor.loss(batch["input"], batch["target"]) for batch in batches]
     return float(torch.cat(losses).mean())

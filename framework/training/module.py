@@ -1,4 +1,4 @@
-"""The one LightningModule of the density pipeline, and the callbacks that keep a run whole."""
+"""The LightningModule of the density pipeline, and the callbacks that save, stop and report a run."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,22 +31,26 @@ OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
     "nadam": torch.optim.NAdam,
     "radam": torch.optim.RAdam,
 }
+"""Optimisers by their names in the config."""
 FUSED = ("adam", "adamw", "sgd")
-"""One pass over the memory of each parameter instead of several, half the time of a small network's step."""
+"""Optimisers that are used in their fused form, which takes half the time for the step of a small network.
+
+It makes one pass over the memory of each parameter instead of several.
+"""
 
 ONE_VALUE = "Expected more than 1 value per channel"
-"""What torch says of batch norm over one value."""
+"""Beginning of torch's message about batch norm over a single value."""
 
 
 class Training(pl.LightningModule):
     """Minimises the predictor's mean loss plus the objectives.
 
-    Noise (dropout, latent draws, augmentation) is a function of (seed, step); a loss that is not finite stops the
-    run before the optimiser sees it.
+    Noise (dropout, latent samples, augmentation) is a function of (seed, step). A loss that is not finite stops the run
+    before the optimiser uses it.
 
     Args:
-        cached: whether batches hold cached features (training.cached_features) and not inputs; the predictor is a
-            `FrozenFrontEnd` then.
+        cached: True if batches hold cached features (training.cached_features) instead of inputs; the predictor is then
+            a `FrozenFrontEnd`.
     """
 
     def __init__(
@@ -71,15 +75,20 @@ class Training(pl.LightningModule):
 
     @property
     def learner(self) -> Predictor:
-        """What reads the batches."""
+        """The predictor that reads the batches: of a `FrozenFrontEnd` with cached features, the predictor inside."""
         if self.cached:
             assert isinstance(self.predictor, FrozenFrontEnd)
             return self.predictor.predictor
         return self.predictor
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        """Return the loss of a batch, averaged so that the mean gradient over ranks is that of the whole batch.
+
+        Raises:
+            NonFiniteLoss: the loss is NaN or infinite.
+        """
         rows = self._share(batch)
-        # by batches, not by optimiser steps: those stand still while gradients are accumulated
+        # Count batches, not optimiser steps, which do not advance while gradients are accumulated.
         seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train")
         own = own_batches(self.learner) if self._orders() > 1 else nullcontext()
         with WholeBatch(rows) if rows else own, one_pass(self.learner):
@@ -88,7 +97,7 @@ class Training(pl.LightningModule):
             loss = losses.mean()
             for objective in self.objectives:
                 loss = loss + objective(self.learner, batch)
-        if rows:  # gradients are averaged over ranks, whose shares may differ by a row
+        if rows:  # Gradients are averaged over ranks, whose shares may differ by a row.
             loss = loss * (rows.count * self.trainer.world_size / rows.whole)
             value = summed(loss).item() / self.trainer.world_size
         else:
@@ -99,6 +108,7 @@ class Training(pl.LightningModule):
         return loss
 
     def _losses(self, batch: Batch) -> Tensor:
+        """Return the predictor's loss per sample; errors of the network become sentences."""
         try:
             return self.learner.loss(batch["input"], batch["target"])
         except NonFiniteAnswer as answer:
@@ -117,33 +127,39 @@ class Training(pl.LightningModule):
             ) from error
 
     def _orders(self) -> int:
-        """How many models' batches a batch holds, one after the other (training.batches)."""
+        """Return how many batches, one per model that trains, are concatenated in a batch (training.batches)."""
         trainer: Any = self.trainer
         return trainer.datamodule.orders
 
     def _share(self, batch: Batch) -> Share | None:
-        """This rank's part of the batch; None where one process trains."""
+        """Return this rank's part of the batch; None if a single process trains."""
         return share(len(batch["index"]), self.device) if self.trainer.world_size > 1 else None
 
     def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
+        """Seed the noise of a validation batch by (seed, batch)."""
         seed_step(self.seed, batch_index, "validation")
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
+        """Log the mean loss of a validation batch, over all ranks."""
         rows = self._share(batch)
         with WholeBatch(rows) if rows else nullcontext():
             loss = self._losses(batch).mean()
         count = len(batch["target"])
-        if rows:  # by rows here, since Lightning averages the ranks' numbers of rows as whole numbers
+        if rows:  # weighted by rows here, because Lightning averages the ranks' numbers of rows as integers
             loss, count = summed(loss * rows.count) / rows.whole, rows.whole
         self.log("validation/loss", loss, on_epoch=True, batch_size=count, sync_dist=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
+        """Return the optimiser and the schedule of its learning rates.
+
+        Each adversary has its own group of parameters and its own schedule.
+        """
         chosen = self.optimizer_settings
         more: dict[str, Any] = {} if chosen.momentum is None else {"momentum": chosen.momentum}
         scaler = getattr(getattr(self.trainer, "precision_plugin", None), "scaler", None)
         if (
             chosen.name in FUSED and scaler is None
-        ):  # else a fused one would unscale gradients after they are clipped
+        ):  # with a scaler a fused optimiser would unscale gradients after they are clipped
             more["fused"] = True
         groups: list[dict[str, Any]] = [{"params": self._own()}]
         groups += [
@@ -168,16 +184,18 @@ class Training(pl.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rates, "interval": "step"}}
 
     def on_validation_end(self) -> None:
+        """Give the validation loss to a schedule that depends on it."""
         if self.trainer.state.fn == "fit" and not self.trainer.sanity_checking:
             loss = float(self.trainer.callback_metrics["validation/loss"])
             see(self.lr_schedulers(), loss, self.current_epoch + 1)
 
     def _rivals(self) -> list[tuple[Objective, Rival]]:
+        """Return the objectives whose parameters are trained against the predictor, with their optimiser settings."""
         objectives = [one for one in self.objectives if isinstance(one, Objective)]
         return [(one, one.rival) for one in objectives if one.rival is not None]
 
     def _own(self) -> list[nn.Parameter]:
-        """What the predictor's own optimiser moves."""
+        """Return the parameters that the predictor's own optimiser settings train."""
         apart = {id(parameter) for one, _ in self._rivals() for parameter in one.parameters()}
         return [parameter for parameter in self.parameters() if id(parameter) not in apart]
 
@@ -187,8 +205,10 @@ class Training(pl.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """As Lightning does, but each rival's gradients by themselves, and those of models that train together; of
-        fused optimisers in mixed precision too, which Lightning refuses."""
+        """Clip gradients as Lightning does, but separately for each adversary and for each of several models.
+
+        It also clips for fused optimisers in mixed precision, which Lightning refuses.
+        """
         if not gradient_clip_val:
             return
         clipped: set[nn.Parameter] = set()
@@ -204,10 +224,10 @@ class Training(pl.LightningModule):
                 nn.utils.clip_grad_norm_(left, gradient_clip_val)
 
     def _planned_steps(self) -> tuple[int, int]:
-        """Optimiser steps until the end, and of one epoch, for the schedule.
+        """Return the number of optimiser steps of the whole training, and of one epoch, for the schedule.
 
-        Not `trainer.estimated_stepping_batches`: it starts the loader, whose workers then fetch from the first batch
-        before a resumed run knows where it is.
+        `trainer.estimated_stepping_batches` is not used: it starts the loader, whose workers then fetch from the first
+        batch before a resumed run knows its position.
         """
         trainer: Any = self.trainer
         batches = len(trainer.datamodule.train_dataloader())
@@ -218,9 +238,11 @@ class Training(pl.LightningModule):
         return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps), epoch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the description of the run to the checkpoint."""
         checkpoint["framework"] = self.description
 
     def _blame(self, losses: Tensor, batch: Batch, value: float) -> str:
+        """Return the message about a loss that is not finite, with the samples that caused it."""
         bad = (~losses.detach().isfinite()).nonzero().flatten().tolist()
         rows = [int(batch["index"][row]) for row in bad]
         if self.trainer.world_size > 1:
@@ -234,15 +256,16 @@ class Training(pl.LightningModule):
 
 
 class KeepCheckpoints(pl.Callback):
-    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, where it is to be kept, best.ckpt.
+    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, with `keep="best"`, best.ckpt.
 
-    Training goes on from the first two; `best` holds weights alone, with Adam a third of the size. `last` is saved at
-    the end of every epoch that was validated, of the last one, and every `every_steps` steps; `best` whenever the
-    validation loss is lower than ever. Each write is whole or absent (framework.storage.checkpoints).
+    Training resumes from the first two. `best` holds weights only; with Adam it takes a third of the size. `last` is
+    saved at the end of every epoch with a validation, at the end of the last epoch, and every `every_steps` steps.
+    `best` is saved whenever the validation loss reaches a new minimum. Each write is whole or absent
+    (framework.storage.checkpoints).
 
     Attributes:
         kept_loss: validation loss of the weights that will be tested, nats.
-        kept_epoch: theirs, from 0.
+        kept_epoch: epoch of these weights, from 0.
     """
 
     def __init__(self, folder: Path, every_steps: int | None, keep: Literal["best", "last"] = "best") -> None:
@@ -254,24 +277,28 @@ class KeepCheckpoints(pl.Callback):
 
     @property
     def kept(self) -> Path:
-        """The checkpoint whose weights will be tested."""
+        """Path of the checkpoint whose weights will be tested."""
         return self.folder / f"{self.keep}.ckpt"
 
     def state_dict(self) -> dict[str, Any]:
+        """Return the loss and epoch of the kept weights."""
         return {"kept_loss": self.kept_loss, "kept_epoch": self.kept_epoch}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the loss and epoch of the kept weights."""
         self.kept_loss = state_dict["kept_loss"]
         self.kept_epoch = state_dict["kept_epoch"]
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        # not at an epoch's last batch: a run resumed from there would skip the validation that is about to come
+        """Save last.ckpt every `every_steps` steps."""
+        # Not at an epoch's last batch: a run resumed from there would skip the validation that follows.
         if self.every_steps and trainer.global_step % self.every_steps == 0 and not trainer.is_last_batch:
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save best.ckpt if the validation loss is the lowest so far."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         loss = float(trainer.callback_metrics["validation/loss"])
@@ -281,11 +308,13 @@ class KeepCheckpoints(pl.Callback):
                 trainer.save_checkpoint(self.kept, weights_only=True)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save last.ckpt after an epoch with a validation, and after the last epoch."""
         done, every = trainer.current_epoch + 1, trainer.check_val_every_n_epoch or 1
         if done % every == 0 or done == trainer.max_epochs or trainer.should_stop:
             self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
+        """Save last.ckpt, and keep the one before it as previous.ckpt."""
         last = self.folder / "last.ckpt"
         if last.exists() and trainer.is_global_zero:
             last.replace(self.folder / "previous.ckpt")
@@ -293,11 +322,11 @@ class KeepCheckpoints(pl.Callback):
 
 
 class StopEarly(EarlyStopping):
-    """Stops when the validation loss was not lower than ever for `patience` validations, or is not finite.
+    """Stops when the validation loss had no new minimum for `patience` validations, or is not finite.
 
-    It looks when a validation ends, since last.ckpt is written after that and must hold what was found. Lightning
-    restores what was found, but not that the trainer was told to stop: a run that was killed in its test would train
-    on where it is resumed.
+    It checks at the end of a validation, because last.ckpt is written after that and must hold the result. Lightning
+    restores this result, but not that the trainer was told to stop. Without `on_train_start`, a run that was killed in
+    its test would therefore train on when it is resumed.
     """
 
     def __init__(self, patience: int) -> None:
@@ -307,15 +336,16 @@ class StopEarly(EarlyStopping):
 
     @property
     def stopped(self) -> bool:
-        """Whether the trainer was told to stop; it goes on until its `min_epochs` and `min_steps` all the same."""
+        """True if the trainer was told to stop; it still trains until its `min_epochs` and `min_steps`."""
         return self.stopping_reason is not EarlyStoppingReason.NOT_STOPPED
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Tell the trainer of a resumed run to stop if that was decided before."""
         trainer.should_stop = trainer.should_stop or self.stopped
 
 
 class Report(pl.Callback):
-    """Sends losses and the learning rate to the tracker, every so many steps and at the end of an epoch."""
+    """Sends losses and the learning rate to the tracker, every `every_steps` steps and at the end of an epoch."""
 
     def __init__(self, tracker: Tracker, every_steps: int) -> None:
         self.tracker = tracker
@@ -324,6 +354,7 @@ class Report(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        """Send the training loss, the learning rate and the scalars of the objectives."""
         if (trainer.global_step % self.every_steps == 0 or trainer.is_last_batch) and trainer.is_global_zero:
             assert isinstance(pl_module, Training)
             rate = trainer.optimizers[0].param_groups[0]["lr"]
@@ -340,41 +371,48 @@ class Report(pl.Callback):
             )
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Send the validation loss."""
         if not trainer.sanity_checking and trainer.is_global_zero and trainer.state.fn == "fit":
             loss = float(trainer.callback_metrics["validation/loss"])
             self.tracker.log_metrics({"validation/loss": loss}, trainer.global_step, trainer.current_epoch)
 
 
 class StopAtBatch(pl.Callback):
-    """While fitting, a signal waits for the batch to end, or for the epoch's end if it is the last one; then last.ckpt
-    is saved and the run stops."""
+    """Delays a signal during the fit until the batch ends; then last.ckpt is saved and the run stops.
+
+    In the last batch of an epoch the signal waits for the end of the epoch.
+    """
 
     def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:
         self.stopper = stopper
         self.keep = keep
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Delay signals from now on."""
         self.stopper.wait = True
-        # Lightning has put its own handler before ours, whose broadcast from inside of a signal hangs several ranks
+        # Lightning has installed its own handler, whose broadcast inside a signal makes several ranks hang.
         self.stopper.install()
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Let signals act at once again."""
         self.stopper.wait = False
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        """Save last.ckpt and stop if a signal has come, except at the last batch of an epoch."""
         if self._told(trainer) and not trainer.is_last_batch:
             self.keep.save_last(trainer)
             self.stopper.stop()
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save last.ckpt and stop if a signal has come."""
         if self._told(trainer):
             self.keep.save_last(trainer)
             self.stopper.stop()
 
     def _told(self, trainer: pl.Trainer) -> bool:
-        """Whether a signal has come, to whichever rank: they save and stop together."""
+        """Return whether any rank has received a signal, so that all ranks save and stop together."""
         return trainer.strategy.reduce_boolean_decision(self.stopper.received is not None, all=False)
 
     def on_validation_batch_end(
@@ -386,6 +424,7 @@ class StopAtBatch(pl.Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        # The last checkpoint stands: one saved inside validation would skip the rest of it on resuming.
+        """Stop without saving if a signal has come."""
+        # No checkpoint is saved here: a run resumed from it would skip the rest of the validation.
         if self._told(trainer):
             self.stopper.stop()

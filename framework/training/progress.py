@@ -1,4 +1,4 @@
-"""What a training says of itself while it runs: a bar on a terminal; in a log a line an epoch, or every half minute."""
+"""Progress of a training: a bar on a terminal; in a log one line per epoch, or every half minute."""
 
 import time
 from typing import Any, final
@@ -15,8 +15,8 @@ class Progress(pl.Callback):
     """Shows the epoch, counted from 1, its mean training loss so far, and the last validation loss.
 
     Args:
-        console: where; a quiet one in ranks other than the first.
-        seconds: after which a log gets a line within a long epoch.
+        console: the console to write to; a quiet one in ranks other than the first.
+        seconds: time after which a log gets a line within a long epoch.
     """
 
     def __init__(self, console: Console, seconds: float = 30.0) -> None:
@@ -27,6 +27,7 @@ class Progress(pl.Callback):
         self._task = progress.TaskID(0)
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start the bar, if the console is a terminal."""
         self._told = time.monotonic()
         if self.console.is_terminal and not self.console.quiet:
             shown = (
@@ -40,6 +41,7 @@ class Progress(pl.Callback):
             self._bar.start()
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Reset the bar and the mean loss."""
         self._total, self._steps = 0.0, 0
         if self._bar is not None:
             self._bar.reset(self._task, total=trainer.num_training_batches, description=self._said(trainer))
@@ -47,6 +49,7 @@ class Progress(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        """Advance the bar or, after `seconds`, write a line."""
         assert isinstance(pl_module, Training)
         self._total += pl_module.last_loss
         self._steps += 1
@@ -56,16 +59,19 @@ class Progress(pl.Callback):
             self._line(trainer, f", step {batch_idx + 1} of {trainer.num_training_batches}")
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Write the line of an epoch, if there is no bar."""
         if self._bar is None:
             self._line(trainer)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Stop the bar."""
         if self._bar is not None:
             self._bar.stop()
 
     def on_exception(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
     ) -> None:
+        """Stop the bar."""
         self.on_train_end(trainer, pl_module)
 
     def _line(self, trainer: pl.Trainer, step: str = "") -> None:

@@ -1,4 +1,4 @@
-"""The processes of several ranks, of which none outlives another: whichever dies, all end, and the run is closed."""
+"""The processes of several ranks: none outlives another. If one dies, all end, and the run is closed."""
 
 import os
 import select
@@ -25,19 +25,20 @@ from framework.errors import UserError
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, Stopper, ending_with_parent
 
 _GRACE = 4.0
-"""Seconds that this rank has to leave the training by itself, after another one has died."""
+"""Seconds in which this rank may leave the training by itself after another rank has died."""
 _CLOSING = 3.0
-"""Seconds for closing the run where this rank has not left by itself."""
+"""Seconds for closing the run if this rank has not left the training by itself."""
 _MOMENT = 5.0
-"""Seconds within which a rank that has closed its connections has ended."""
+"""Seconds within which a rank ends after it has closed its connections."""
 _TOLD = ("gloo", "NCCL", "c10d", "ProcessGroup", "Connection")
-"""Words of an error that a collective raises from compiled code."""
+"""Words by which an error that a collective operation raises from compiled code is recognised."""
 _PAUSE = 0.1
+"""Seconds between two checks."""
 
 
 @final
 class RankStopped(Stopped):
-    """Another rank was killed, or told to stop alone."""
+    """Another rank was killed, or received a signal to stop that this rank did not receive."""
 
     def __init__(self, rank: int, number: int) -> None:
         super().__init__(number)
@@ -51,14 +52,16 @@ class RankFailed(UserError):
 
 @final
 class RankLauncher(_SubprocessScriptLauncher):
-    """Lightning's launcher of ranks, but that they die with this process, and that nobody kills this process for one.
+    """Lightning's launcher of ranks, changed so that the ranks die with this process.
 
-    Lightning kills it, with a signal that leaves no time to close the run (`_ChildProcessObserver`).
+    It also never kills this process because of another rank. Lightning does so with a signal that leaves no time to
+    close the run (`_ChildProcessObserver`).
     """
 
     def launch(
         self, function: Callable[..., Any], *args: Any, trainer: pl.Trainer | None = None, **kwargs: Any
     ) -> Any:
+        """Start the other ranks and call `function` in this one."""
         self.cluster_environment.validate_settings(num_devices=self.num_processes, num_nodes=self.num_nodes)
         if not self.cluster_environment.creates_processes_externally:
             self._call_children_scripts()
@@ -84,7 +87,10 @@ class RankLauncher(_SubprocessScriptLauncher):
 
 
 def _command(rank: int) -> tuple[Sequence[str], str | None]:
-    """What starts a rank: Lightning's command, with the options that this Python was started with (-P above all)."""
+    """Return the command and the folder in which a rank starts.
+
+    It is Lightning's command with the options of this Python (above all -P).
+    """
     if HydraConfig.initialized():
         command, folder = _hydra_subprocess_cmd(rank)
     else:
@@ -96,13 +102,16 @@ def _command(rank: int) -> tuple[Sequence[str], str | None]:
 def sharing_one_fate(
     trainer: pl.Trainer, stopper: Stopper, close: Callable[[BaseException], None]
 ) -> Iterator[None]:
-    """Train inside the block, with however many ranks; in an error of this rank, see whether another one caused it.
+    """Train inside the block with any number of ranks, and check after an error whether another rank caused it.
 
-    This rank has a few seconds to leave the block after another one has died, or after a signal that it does not take
-    notice of, since it waits in a collective. Then its run is closed from here, and the process ended.
+    This rank has a few seconds to leave the block after another rank has died, or after a signal that it does not
+    notice because it waits in a collective operation. After that its run is closed from another thread, and the process
+    ends.
 
     Args:
-        close: the run as that error asks for; whatever it takes longer than a few seconds for is left.
+        trainer: the trainer of the block.
+        stopper: the receiver of signals.
+        close: closes the run as the given error requires; it is abandoned after a few seconds.
 
     Raises:
         RankStopped: another rank was killed or told to stop.
@@ -112,7 +121,7 @@ def sharing_one_fate(
     register = connector.register_signal_handlers
 
     def register_ours_last() -> None:
-        register()  # one of Lightning's broadcasts from inside of a signal, which hangs several ranks
+        register()  # Lightning's handler broadcasts inside a signal, which makes several ranks hang
         stopper.install()
 
     connector.register_signal_handlers = register_ours_last
@@ -139,7 +148,7 @@ def sharing_one_fate(
 
 
 def _of_a_collective(error: BaseException) -> bool:
-    """Return whether an error says that another rank is away."""
+    """Return whether an error says that another rank is gone."""
     frames = traceback.walk_tb(error.__traceback__)
     names = (str(frame.f_globals.get("__name__")) for frame, _ in frames)
     return any(word in str(error) for word in _TOLD) or any(
@@ -149,9 +158,9 @@ def _of_a_collective(error: BaseException) -> bool:
 
 @final
 class _Guard(threading.Thread):
-    """Looks after the ranks that this process has started, beside the training.
+    """Thread that watches the ranks that this process has started, during the training.
 
-    Signals that come are read from a pipe, since Python's own handlers wait for the main thread.
+    It reads signals from a pipe, because Python's own handlers wait for the main thread.
     """
 
     def __init__(
@@ -169,11 +178,12 @@ class _Guard(threading.Thread):
         self._before = signal.set_wakeup_fd(self._writes, warn_on_full_buffer=False)
         self._over = threading.Event()
         self._left: float | None = None
-        """When the main thread has left the training with an error."""
+        """Time at which the main thread left the training with an error; None before."""
         self._caused = False
-        """Whether another rank has caused that error."""
+        """True if another rank has caused that error."""
 
     def run(self) -> None:
+        """Check the ranks and the signals until the training is over."""
         died: float | None = None
         signalled: tuple[float, int] | None = None
         while not self._over.is_set():
@@ -187,14 +197,14 @@ class _Guard(threading.Thread):
                 if now - self._left > _GRACE:
                     self._kill()
                 if self._caused and died is not None and now - died > 2 * _GRACE:
-                    os._exit(1)  # the run is closed; what the store lacks is sent by a later sync
+                    os._exit(1)  # the run is closed; a later sync sends what the store lacks
             elif died is not None and now - died > _GRACE:
                 self._end(self.cause(0.0) or RankFailed("Another rank ended before the training did."))
             elif signalled and self._stopper.received is None and now - signalled[0] > ENDING:
                 self._end(Stopped(signalled[1]))
 
     def cause(self, patience: float) -> RankStopped | RankFailed | Stopped | None:
-        """Why this rank cannot go on; None where nothing says so within so many seconds."""
+        """Return why this rank cannot go on; None if no reason is found within `patience` seconds."""
         deadline = time.monotonic() + patience
         while True:
             for rank, process in enumerate(self._ranks, 1):
@@ -208,20 +218,24 @@ class _Guard(threading.Thread):
                         f"Rank {rank} of the training failed (exit code {code}), so the others cannot go on. Its own "
                         "error stands above."
                     )
-            if self._stopper.received is not None:  # by a launcher that ends all ranks for one
+            if self._stopper.received is not None:  # from a launcher that ends all ranks because of one
                 return Stopped(self._stopper.received)
             if time.monotonic() >= deadline:
                 return None
             time.sleep(_PAUSE)
 
     def leave(self, cause: BaseException | None) -> None:
-        """See that the other ranks end, of which one may have caused the error that this rank leaves training with."""
+        """Let the other ranks end after this rank has left the training with an error.
+
+        Args:
+            cause: the error of another rank that caused it; None if this rank's error is its own.
+        """
         self._release()
         self._caused = cause is not None
         self._left = time.monotonic()
 
     def end(self) -> None:
-        """Training has ended."""
+        """End the watch after the training has ended."""
         self._over.set()
         self.join()
         self._release()
@@ -229,7 +243,7 @@ class _Guard(threading.Thread):
             os.close(descriptor)
 
     def _signal(self) -> int | None:
-        """The number of a signal that has come; waits a moment for one."""
+        """Wait a moment for a signal and return its number; None if none has come."""
         if select.select([self._reads], [], [], _PAUSE)[0]:
             numbers = [number for number in os.read(self._reads, 64) if number in SIGNALS]
             return numbers[0] if numbers else None
@@ -244,7 +258,7 @@ class _Guard(threading.Thread):
                 process.kill()
 
     def _end(self, error: BaseException) -> None:
-        """Close the run in place of the main thread, which waits in a collective, and end this process."""
+        """Close the run in place of the main thread, which waits in a collective operation, and end this process."""
         self._kill()
         closing = threading.Thread(target=self._close, args=(error,), daemon=True)
         closing.start()

@@ -13,10 +13,13 @@ from torch.overrides import TorchFunctionMode
 DROPOUTS = {
     F.dropout, F.alpha_dropout, F.dropout1d, F.dropout2d, F.dropout3d, F.feature_alpha_dropout,
 }  # fmt: skip
+"""Functions that drop elements at random."""
 FACTORIES: set[Callable[..., Tensor]] = {torch.rand, torch.randn}
+"""Functions that draw a new tensor of a given shape."""
 LIKE: dict[Callable[..., Tensor], Callable[..., Tensor]] = {
     torch.rand_like: torch.rand, torch.randn_like: torch.randn,
 }  # fmt: skip
+"""Functions that draw a tensor in the shape of another one, and their counterparts for a given shape."""
 IN_PLACE = {
     getattr(Tensor, f"{name}_")
     for name in (
@@ -30,11 +33,12 @@ IN_PLACE = {
         "random",
     )
 }
+"""Methods that fill a tensor with random numbers."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """A rank's part of a batch: rows `start` to `start + count` of `whole`."""
+    """A rank's part of a batch: the rows from `start` to `start + count` of `whole` rows."""
 
     start: int
     count: int
@@ -42,7 +46,7 @@ class Share:
 
 
 def share(count: int, device: torch.device) -> Share:
-    """Of this rank, which has `count` rows; every rank calls it."""
+    """Return the part of this rank, which has `count` rows; every rank must call it."""
     counts = [torch.zeros((), dtype=torch.int64, device=device) for _ in range(dist.get_world_size())]
     dist.all_gather(counts, torch.tensor(count, device=device))
     sizes = [int(one) for one in counts]
@@ -50,21 +54,21 @@ def share(count: int, device: torch.device) -> Share:
 
 
 def summed(value: Tensor) -> Tensor:
-    """The sum over all ranks, without a gradient; every rank calls it."""
+    """Return the sum over all ranks, without a gradient; every rank must call it."""
     total = value.detach().clone()
     dist.all_reduce(total)
     return total
 
 
 def gathered(rows: list[int]) -> list[list[int]]:
-    """Of each rank, in their order; every rank calls it."""
+    """Return the rows of each rank, in the order of ranks; every rank must call it."""
     found: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(found, rows)
     return found
 
 
 class _Sum(torch.autograd.Function):
-    """The sum over ranks; a rank's gradient is the sum of what all ranks make of it."""
+    """Sum over ranks whose gradient on a rank is the sum of the gradients on all ranks."""
 
     @staticmethod
     def forward(context: Any, value: Tensor) -> Tensor:
@@ -77,11 +81,11 @@ class _Sum(torch.autograd.Function):
 
 @final
 class WholeBatch(TorchFunctionMode):
-    """While active, what is drawn for a rank's rows is drawn for the whole batch, and the rank keeps its rows.
+    """Mode in which noise for a rank's rows is drawn for the whole batch, and the rank keeps its rows.
 
-    All ranks seed their generators alike; so each row gets the noise that one process would give it. The first
-    dimension of as many items as the rank has rows is taken for the batch; what is drawn in a shape without one is the
-    same on all ranks. Batch norm in training takes its statistics from the rows of all ranks.
+    All ranks seed their generators alike, so each row gets the noise that one process would give it. The first
+    dimension whose length is the number of the rank's rows is taken for the batch. Noise in a shape without such a
+    dimension is the same on all ranks. Batch norm in training takes its statistics from the rows of all ranks.
     """
 
     def __init__(self, rows: Share) -> None:
@@ -122,12 +126,12 @@ class WholeBatch(TorchFunctionMode):
         return func(*args, **kwargs)
 
     def _axis(self, shape: Iterable[int]) -> int | None:
-        """The dimension of the batch; None where there is none, or nothing to share."""
+        """Return the dimension of the batch; None if there is none, or if this rank has all rows."""
         found = [axis for axis, size in enumerate(shape) if size == self.rows.count]
         return found[0] if found and self.rows.count < self.rows.whole else None
 
     def _kept(self, size: Iterable[int], draw: Callable[[list[int]], Tensor]) -> Tensor:
-        """The rank's rows of what `draw` gives in the shape of the whole batch."""
+        """Return the rank's rows of what `draw` gives in the shape of the whole batch."""
         shape = list(size)
         axis = self._axis(shape)
         if axis is None:
@@ -136,6 +140,8 @@ class WholeBatch(TorchFunctionMode):
         return draw(shape).narrow(axis, self.rows.start, self.rows.count).contiguous()
 
     def _padded_bernoulli(self, probability: Tensor, **keywords: Any) -> Tensor:
+        """Draw from probabilities that exist only for the rank's rows; the other rows use 0.5."""
+
         def draw(shape: list[int]) -> Tensor:
             axis = self._axis(probability.shape)
             if axis is None:
@@ -154,12 +160,13 @@ class WholeBatch(TorchFunctionMode):
         training: bool = True,
         inplace: bool = False,
     ) -> Tensor:
+        """Apply a dropout to the whole batch, with zeros for the other ranks' rows, and keep the rank's rows."""
         axis = self._axis(input.shape)
         if not training or p == 0 or axis is None:
             return func(input, p, training, inplace)
         shape = list(input.shape)
         shape[axis] = self.rows.whole
-        # of the other ranks' rows only the noise is needed, which does not depend on what they hold
+        # The noise of the other ranks' rows does not depend on their values, so zeros stand for them.
         whole = input.new_zeros(shape)
         whole = torch.cat(
             [
@@ -182,7 +189,7 @@ class WholeBatch(TorchFunctionMode):
         momentum: float = 0.1,
         eps: float = 1e-5,
     ) -> Tensor:
-        """With mean and (biased) variance over all ranks (Ioffe & Szegedy 2015, Algorithm 1)."""
+        """Normalise with mean and (biased) variance over all ranks (Ioffe & Szegedy 2015, Algorithm 1)."""
         if not training:
             return F.batch_norm(input, running_mean, running_var, weight, bias, False, momentum, eps)
         total: Callable[[Tensor], Tensor] = _Sum.apply  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""How a learning rate changes while a model trains: factors on it, one for each optimiser step."""
+"""Changes of the learning rate during training: factors on it, one for each optimiser step."""
 
 import math
 from collections.abc import Callable
@@ -10,21 +10,25 @@ from torch.optim.lr_scheduler import LambdaLR
 from framework.configuration.settings import OptimizerSettings
 
 WARMUP_SHARE = 0.25
-"""Largest part of a training that its warm-up takes: a training shorter than four times `warmup_steps` warms up for a
-quarter of its steps. Longer ones are not changed by this; `cest` has 400 steps, for 100 of which it warms up."""
+"""Largest share of a training that its warm-up takes.
+
+A training shorter than four times `warmup_steps` warms up for a quarter of its steps. Longer trainings are not
+affected; `cest` has 400 steps and warms up for 100 of them.
+"""
 
 
 def warmup(chosen: OptimizerSettings, steps: int) -> int:
-    """Return the steps of the warm-up in a training of so many `steps`."""
+    """Return the number of warm-up steps in a training of this many `steps`."""
     return min(chosen.warmup_steps, int(WARMUP_SHARE * steps))
 
 
 def schedule(chosen: OptimizerSettings, steps: int, epoch: int) -> Callable[[int], float]:
-    """The factor by the number of the optimiser step, from 0.
+    """Return the function from the number of an optimiser step, from 0, to the factor on the learning rate.
 
     Args:
-        steps: of the whole training.
-        epoch: steps of one epoch.
+        chosen: settings of the optimiser.
+        steps: number of steps of the whole training.
+        epoch: number of steps of one epoch.
     """
     warming = warmup(chosen, steps)
     if chosen.schedule == "plateau":
@@ -37,26 +41,31 @@ def schedule(chosen: OptimizerSettings, steps: int, epoch: int) -> Callable[[int
 
 
 def warm(step: int, warmup_steps: int) -> float:
+    """Return the factor of the warm-up: it rises linearly to 1."""
     return min(1.0, (step + 1) / (warmup_steps + 1))
 
 
 def smooth(step: int, *, total: int | None, warmup_steps: int = 0) -> float:
-    """1 all along, or half a cosine from 1 to 0 over `total` steps."""
+    """Return the factor at a step: 1 throughout if `total` is None, or half a cosine from 1 to 0 over `total` steps.
+
+    It is multiplied by the factor of the warm-up.
+    """
     if total is None:
         return warm(step, warmup_steps)
     return warm(step, warmup_steps) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
 
 
 def stepped(step: int, *, starts: list[int], factor: float, warmup_steps: int = 0) -> float:
-    """Times `factor` from each of `starts` on, steps."""
+    """Return the factor at a step, which is multiplied by `factor` at each of the steps in `starts`."""
     return warm(step, warmup_steps) * factor ** sum(step >= start for start in starts)
 
 
 class Plateau:
-    """Times `factor` whenever the validation loss has not been lower than ever for `patience` epochs.
+    """Schedule that multiplies by `factor` after `patience` epochs without a new minimum of the validation loss.
 
-    Not torch's ReduceLROnPlateau, which Lightning steps after an epoch's checkpoint is written: a resumed run would
-    miss that step. What this has seen is in the checkpoint, since LambdaLR keeps the attributes of what it calls.
+    Torch's ReduceLROnPlateau is not used: Lightning steps it after an epoch's checkpoint is written, so a resumed run
+    would miss that step. The state of this class is in the checkpoint, because LambdaLR keeps the attributes of the
+    functions that it calls.
     """
 
     def __init__(self, factor: float, patience: int, warmup_steps: int = 0) -> None:
@@ -68,10 +77,11 @@ class Plateau:
         self.since = 0
 
     def __call__(self, step: int) -> float:
+        """Return the factor at a step."""
         return warm(step, self.warmup_steps) * self.factor**self.reductions
 
     def see(self, loss: float, epochs: int) -> None:
-        """Take in the validation loss after so many epochs."""
+        """Add the validation loss after `epochs` epochs."""
         if loss < self.best:
             self.best, self.since = loss, epochs
         elif epochs - self.since >= self.patience:
@@ -80,7 +90,7 @@ class Plateau:
 
 
 def see(schedules: Any, loss: float, epochs: int) -> None:
-    """Tell a `LambdaLR` over a `Plateau` the validation loss; the next step already has the new rate."""
+    """Give the validation loss to the plateaus of a `LambdaLR`; the next step already has the new rate."""
     if not isinstance(schedules, LambdaLR):
         return
     plateaus = [one for one in schedules.lr_lambdas if isinstance(one, Plateau)]
