@@ -28,16 +28,16 @@ from framework.distributions.protocol import (
 
 
 class Gaussian(Distribution):
-    """Gaussian with a full covariance, written as regressions of each number on those before it.
+    """A Gaussian with a full covariance, written as regressions of each number on the previous ones.
 
     With d = y - μ, every e_i = d_i - Σ_{j<i} φ_ij d_j is an independent N(0, σ_i²): the modified Cholesky factors of
-    the inverse covariance (Pourahmadi 1999, eq. 2). Any φ and any σ > 0 give a covariance, the log-determinant is a
-    sum of logarithms, and neither a density nor a sample inverts a matrix.
+    the inverse covariance (Pourahmadi 1999, eq. 2). Any φ and any σ > 0 give a covariance, the log-determinant is a sum
+    of logarithms, and neither a density nor a sample inverts a matrix.
 
     Args:
         mean: (*batch, number).
-        scale: (*batch, number), σ > 0; the standard deviations where there are no coefficients.
-        coefficients: (*batch, number, number), φ strictly below the diagonal, 0 elsewhere; None for all 0.
+        scale: (*batch, number), σ > 0; the standard deviations if there are no coefficients.
+        coefficients: (*batch, number, number), φ strictly below the diagonal, 0 elsewhere; None if all are 0.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -69,23 +69,23 @@ class Gaussian(Distribution):
 
     @property
     def variance(self) -> Tensor:
-        """Of each number, (*batch, number)."""
+        """Variance of each number, (*batch, number)."""
         return self.stddev.square()
 
     @property
     def stddev(self) -> Tensor:
-        """Of each number, (*batch, number)."""
+        """Standard deviation of each number, (*batch, number)."""
         if self.coefficients is None:
             return self.scale
         parts = self._representable(self._mixing * self.scale.unsqueeze(-2))
-        largest = parts.abs().amax(-1, keepdim=True)  # whose square may overflow
+        largest = parts.abs().amax(-1, keepdim=True)  # its square may overflow
         return self._representable(
             ((parts / largest).square().sum(-1, keepdim=True).sqrt() * largest).squeeze(-1)
         )
 
     @cached_property
     def _mixing(self) -> Tensor:
-        """(I - φ)⁻¹, unit lower triangular: d = (I - φ)⁻¹ e."""
+        """The matrix (I - φ)⁻¹, unit lower triangular: d = (I - φ)⁻¹ e."""
         assert self.coefficients is not None
         identity = torch.eye(self.event_shape[0], dtype=self.scale.dtype, device=self.scale.device)
         found = torch.linalg.solve_triangular(
@@ -97,10 +97,10 @@ class Gaussian(Distribution):
         return self._representable(found)
 
     def _representable(self, numbers: Tensor) -> Tensor:
-        """The numbers themselves.
+        """Return the numbers unchanged.
 
         Raises:
-            ValueError: the coefficients multiply to more than the number type holds.
+            ValueError: the products of the coefficients exceed the range of the dtype.
         """
         assert self.coefficients is not None
         if not bool(numbers.isfinite().all()) and bool(self.coefficients.isfinite().all()):
@@ -130,7 +130,7 @@ class Gaussian(Distribution):
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """The product, in the numbers' own type: `@` is computed in bfloat16 under mixed precision."""
+    """Return the product in the dtype of the numbers: `@` is computed in bfloat16 under mixed precision."""
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
@@ -158,7 +158,8 @@ def _(density: Gaussian, value: Tensor) -> Slope:
     stiffness = density.scale.square().reciprocal().expand(residual.shape)
     if density.coefficients is None:
         return Slope(density.log_prob(value), -residual * stiffness, stiffness)
-    # Σ⁻¹ = Aᵀ A, A = (I - φ)/σ; a diagonal that exceeds it has the sums of its rows' sizes (Gershgorin)
+    # Σ⁻¹ = Aᵀ A, A = (I - φ)/σ; the sums of the absolute values of its rows are a diagonal matrix that is an upper
+    # bound (Gershgorin)
     identity = torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
     root = (identity - density.coefficients) / density.scale.unsqueeze(-1)
     pull = -_times(root.mT, _times(root, residual))

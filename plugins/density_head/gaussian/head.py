@@ -1,4 +1,4 @@
-"""The Gaussian head: a mean, and how far off it may be."""
+"""The Gaussian head: a mean and standard deviations for each input."""
 
 import math
 from collections.abc import Mapping
@@ -18,10 +18,10 @@ from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
 
 LARGEST_MEAN = 1e8
-"""Means and residuals are cut off here: beyond it squares of standardised residuals overflow float32."""
+"""Bound to which means are clamped; beyond it squares of standardised residuals overflow float32."""
 LARGEST_SCALE = 1e12
 WIDEST_SCALE = 1e18
-"""The largest standard deviation that is calibrated, and taken from a file."""
+"""Largest standard deviation that is calibrated, and accepted from a file."""
 LARGEST_COEFFICIENT = 1e3
 SMALLEST_SCALE = 1e-6
 
@@ -29,16 +29,16 @@ SMALLEST_SCALE = 1e-6
 class GaussianHead(DensityHead):
     """Gaussian over one or more reals, heteroscedastic or not (thesis eq. 2.7-2.8).
 
-    With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With
-    "fixed" it trains by squared error, which is likelihood with σ = 1, and `calibrate` fits one covariance to the
-    validation residuals by maximum likelihood. Raw numbers are in standard deviations from the mean of the training
-    targets, where `Target` has these; the density is in the target's own unit, and then in double precision.
+    With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With "fixed"
+    it trains by squared error, which is likelihood with σ = 1, and `calibrate` fits one covariance to the validation
+    residuals by maximum likelihood. Raw parameters are in standard deviations from the mean of the training targets, if
+    `Target` has these; the density is then in the target's own unit and in double precision.
 
     Args:
-        scale: where the spread comes from.
-        covariance: "diagonal": numbers independent of one another; "full": with regression coefficients of each
-            number on those before it.
-        floor: the least σ, in the same deviations: no density can collapse onto a training value beyond it.
+        scale: source of the standard deviations.
+        covariance: "diagonal": independent numbers; "full": with regression coefficients of each number on the previous
+            ones.
+        floor: smallest σ, in the same deviations: no density can become narrower around a training value.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -71,9 +71,11 @@ class GaussianHead(DensityHead):
         self.unit = Unit.of(target)
         if not self.predicted:
             self.register_buffer("scale", torch.ones(self.numbers, dtype=torch.float64))
-            side = self.numbers if self.full else 0  # of a diagonal covariance none: numbers may be very many
+            side = (
+                self.numbers if self.full else 0
+            )  # none for a diagonal covariance, which may have very many numbers
             self.register_buffer("coefficients", torch.zeros(side, side, dtype=torch.float64))
-            # no calibration ends below the floor, but for rounding; squares above the largest overflow float32
+            # no calibration gives less than the floor, except for rounding; squares above the largest overflow float32
             coefficient = (-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
             require_state(self, scale=(0.99 * floor, WIDEST_SCALE), coefficients=coefficient)
 
@@ -91,7 +93,7 @@ class GaussianHead(DensityHead):
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         if self.predicted:
             return -self(raw).log_prob(target)
-        # σ = 1, whatever was calibrated; in few passes over the numbers, which may be very many
+        # σ = 1, whatever was calibrated. Few passes over the numbers, since there may be very many.
         target = self.unit.standardised(target).to(raw)
         mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target)
         constant = self.numbers * math.log(2 * math.pi) / 2 + self.unit.log_volume
@@ -106,7 +108,7 @@ class GaussianHead(DensityHead):
         residual = (
             self.unit.standardised(target).double() - self._mean(require_finite(raw, self.size)).double()
         )
-        if not self.full:  # each σ by itself
+        if not self.full:  # each σ on its own
             self.scale.copy_(residual.square().mean(0).sqrt().clamp(self.floor, WIDEST_SCALE))
             return
         scale, coefficients = fit(residual)
@@ -126,7 +128,7 @@ class GaussianHead(DensityHead):
 
 
 def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_SCALE.
+    """Return exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_SCALE.
 
     The Fisher information of log σ is constant, so a logarithmic map trains best; the power keeps an outlier from
     exploding.
@@ -139,14 +141,14 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def fit(
     residual: Float[Tensor, "sample number"],
 ) -> tuple[Float[Tensor, "number"], Float[Tensor, "number number"]]:
-    """Maximum-likelihood σ and φ of zero-mean residuals: least squares of each number on those before it."""
+    """Return the maximum-likelihood σ and φ of zero-mean residuals: least squares of each number on those before it."""
     count = residual.shape[-1]
     scale, coefficients = residual.new_zeros(count), residual.new_zeros(count, count)
     for number in range(count):
         left = residual[:, number]
         if number:
             before = residual[:, :number]
-            # the driver that copes with collinear residuals
+            # this driver handles collinear residuals
             solution = torch.linalg.lstsq(before, left[:, None], driver="gelsd").solution[:, 0]
             coefficients[number, :number] = solution.clamp(-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
             left = left - before @ coefficients[number, :number]

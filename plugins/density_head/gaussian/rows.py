@@ -16,7 +16,7 @@ OFFSETS = (0.0, 1e-6, 1.0, -3.0, 40.0, 1e6)
 
 
 def exact(residual: list[float], scale: list[Any]) -> Any:
-    """Σ -(d/σ)²/2 - log σ - log(2π)/2 (eq. 2.8)."""
+    """Return Σ -(d/σ)²/2 - log σ - log(2π)/2 (eq. 2.8)."""
     return sum(
         -((mpmath.mpf(d) / s) ** 2) / 2 - mpmath.log(s) - mpmath.log(2 * mpmath.pi) / 2
         for d, s in zip(residual, scale, strict=True)
@@ -24,7 +24,7 @@ def exact(residual: list[float], scale: list[Any]) -> Any:
 
 
 def predicted(head: DensityHead) -> Iterator[Case]:
-    """σ = floor + exp(r) or floor + (1 + r/4)⁴, mean 0, and for three numbers coefficients of 0."""
+    """Yield cases with σ = floor + exp(r) or floor + (1 + r/4)⁴, mean 0, and coefficients of 0 for three numbers."""
     numbers = 1 if head.size == 2 else 3
     floor = mpmath.mpf(head.floor)  # pyright: ignore[reportArgumentType]  # a number of this head
     for log_scale in (-100.0, -9.0, -1.0, 0.0, 2.0, 40.0, 1e4):

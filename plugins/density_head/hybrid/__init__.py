@@ -1,1 +1,1 @@
-"""A learned density about a mean that the encoder gives."""
+"""A learned density around a mean that the encoder gives."""

@@ -1,4 +1,4 @@
-"""A density about a mean that an encoder gives, such as that of a physical model: a network says what it looks like."""
+"""A density around a mean that an encoder gives, such as a physical model; a network predicts its shape."""
 
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
@@ -16,23 +16,23 @@ from framework.heads.unit import Unit
 from framework.target import Target
 
 LARGEST = 1e4
-"""Bound on the magnitude of the features; larger ones are cut off."""
+"""Bound on the magnitude of the features; larger ones are clamped."""
 LARGEST_LOG_UNIT = 20.0
 
 
 class HybridHead(DensityHead):
-    """A learned density about a mean that the encoder gives: that of the physics, say.
+    """A learned density around a mean that the encoder gives, such as that of a physical model.
 
-    The first numbers that it reads are the mean, in the target's unit and order, and as many logarithms of units, in
-    which the component says how far the target is from the mean. A network of two hidden layers over all that is read
-    says what the component's density looks like. Its last layer begins at 0, unless the component has layers of its
-    own behind it: at first the mean is the encoder's alone.
+    The first numbers that the head reads are the mean, in the target's unit and order. As many logarithms of units
+    follow; in these units the component describes the distance of the target from the mean. A network of two hidden
+    layers reads all numbers and predicts the parameters of the component. Its last layer begins at 0, unless the
+    component has layers of its own: at first the mean is the encoder's alone.
 
     Args:
-        further: how many numbers the encoder gives beside the mean and the units.
+        further: number of features of the encoder beside the mean and the units.
         hidden: width of the network.
-        share: of these units, the component's.
-        component: the head whose density is moved.
+        share: unit of the component, as a share of the encoder's units.
+        component: the head whose density is shifted and scaled.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -76,12 +76,12 @@ class HybridHead(DensityHead):
         return Moved(self.component(numbers), location, scale)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """The component's, of the target where the component sees it, and the logarithm of the unit."""
+        """Return the component's loss of the target in the component's frame, plus the logarithm of the unit."""
         numbers, location, scale = self._read(raw)
         return self.component.loss(numbers, (target - location) / scale) + scale.log().sum(-1)
 
     def _read(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What the component reads; location and scale of its frame, (*batch, number) each."""
+        """Return the parameters of the component, and location and scale of its frame, (*batch, number) each."""
         raw = require_finite(raw, self.size)
         weight = self.network[-1].weight
         assert isinstance(weight, Tensor)
@@ -93,7 +93,7 @@ class HybridHead(DensityHead):
         location, spread = self.unit.location, self.unit.scale
         if location is None or spread is None:
             return numbers, mean, scale
-        # the component's density is about the targets' mean and in their standard deviations
+        # the component's density is relative to the targets' mean and in units of their standard deviations
         scale = (scale / spread.to(mean.device)).to(mean)
         return numbers, mean - scale * location.to(mean), scale
 

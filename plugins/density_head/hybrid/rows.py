@@ -1,4 +1,4 @@
-"""Rows of the contract: a Gaussian, and a CVAE over the numbers of two frames, about the mean that comes."""
+"""Rows of the contract: a Gaussian, and a CVAE over the numbers of two frames, around the mean in the input."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ BOUND: Mapping[str, str] = dict.fromkeys(
     "log_prob is the importance-weighted bound (eq. 3.19), the rest is of the mixture drawn from the prior",
 )
 DEEP = {"float32 against float64": 256.0}
-"""Of seven layers one behind the other, the last of which multiplies numbers of the one before with a latent vector."""
+"""Limits for seven layers in sequence; the last one multiplies outputs of the previous one with a latent vector."""
 ROWS = {
     "hybrid": (
         HeadRow("three numbers", THREE, {"further": 4, "hidden": 8}),

@@ -19,20 +19,21 @@ from framework.target import Target
 
 
 class LorentzianHead(DensityHead, Fitted):
-    """Least squares of each spectrum (`framework.spectra.fit`), with the covariance of its Jacobian.
+    """A least-squares fit of Lorentzian lines to each spectrum (`framework.spectra.fit`).
 
-    Reads spectra of `data=cest` as they are, without an encoder, and needs no training: what the target asks for says
-    which preset is fitted. The density's gradient in the spectrum is said to be 0.
+    The covariance of the parameters follows from the Jacobian. The head reads spectra of `data=cest` unchanged, without
+    an encoder, and needs no training. The target decides which preset is fitted. The gradient of the density in the
+    spectrum is set to 0.
 
     Attributes:
-        steps: most steps of a fit (a knob).
+        steps: largest number of steps of a fit (a knob).
 
     Args:
-        steps: the same.
-        offsets: of the data, ppm.
+        steps: as the attribute.
+        offsets: frequency offsets of the data, ppm.
 
     Raises:
-        ConfigError: a target of other numbers.
+        ConfigError: the target is that of no preset.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30, 100)}
@@ -63,7 +64,7 @@ class LorentzianHead(DensityHead, Fitted):
         self.size = len(self.offsets)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
-        """Nothing: each spectrum is fitted by itself."""
+        """Do nothing, since each spectrum is fitted on its own."""
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         raw = require_finite(raw, self.size)
@@ -76,14 +77,14 @@ class LorentzianHead(DensityHead, Fitted):
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Nothing: the residuals of each fit say how sure it is."""
+        """Do nothing, since the residuals of each fit determine its uncertainty."""
 
 
 def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
-    """The preset whose target has these names.
+    """Return the preset whose target has these names.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: no preset has them.
     """
     for preset in PRESETS.values():
         if preset.target == names:

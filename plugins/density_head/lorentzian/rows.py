@@ -1,4 +1,4 @@
-"""Rows of the contract: few steps of a fit at few offsets, of both presets."""
+"""Rows of the contract: few steps of a fit to few offsets, for both presets."""
 
 from framework.spectra.spectrum import PRESETS
 from framework.target import Target

@@ -29,33 +29,33 @@ from plugins.density_head.trees.stored_forest import require_forest
 
 INTEGERS = ("feature", "branch", "root", "start", "label", "count")
 ROUNDS = 200
-"""Of expectation and maximisation at most; they end when no width changes by a millionth."""
+"""Largest number of rounds of expectation and maximisation; they end when no width changes by a millionth."""
 
 
 class ExtraTreesHead(DensityHead, Fitted):
     """A forest of trees with random thresholds, fitted to all training samples at once (Geurts et al. 2006).
 
-    Classes: with f_k the mean over T trees of the share of class k in the leaf, p_k = (T f_k + a) / (T + a K), which is
-    Laplace's rule on T votes: no class has probability 0, and their order is the forest's. `smoothing` is a.
-    Reals: the mixture over the trees of normal densities about each tree's mean, with one width for each number of the
-    target. After the fit that is the targets' standard deviation; `calibrate` fits it to the validation set by maximum
-    likelihood. What the trees say is piecewise constant in the features, and its gradient 0.
+    Classes: with f_k the mean over T trees of the share of class k in the leaf, p_k = (T f_k + a) / (T + a K). This is
+    Laplace's rule on T votes: no class has probability 0, and the order of the classes is the forest's. `smoothing` is
+    a. Reals: the mixture over the trees of normal densities around each tree's mean, with one width for each number of
+    the target. After the fit the width is the targets' standard deviation; `calibrate` fits it to the validation set by
+    maximum likelihood. The output of the trees is piecewise constant in the features, and its gradient is 0.
 
-    Stored are flat arrays of whole numbers and thresholds; scikit-learn grows the forest and is not needed to use it.
+    The forest is stored as flat arrays of integers and thresholds; scikit-learn grows it and is not needed to use it.
 
     Attributes:
-        trees: how many of the forest's trees are used, the first ones (a knob).
+        trees: number of the forest's trees that are used, the first ones (a knob).
 
     Args:
-        trees: how many are grown.
+        trees: number of trees that are grown.
         features: share of the features tried at each split; None: their square root for classes, all for reals.
-        leaf: least training samples of a leaf.
-        depth: most splits from root to leaf.
+        leaf: smallest number of training samples of a leaf.
+        depth: largest number of splits from root to leaf.
         smoothing: a.
 
     Raises:
         ConfigError: the target is an angle.
-        UserError: it is used before it was fitted.
+        UserError: the head is used before it was fitted.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"trees": (1, 3, 10, 30, 100, 300)}
@@ -168,15 +168,16 @@ class ExtraTreesHead(DensityHead, Fitted):
         require_forest(arrays, self.classes, self.numbers)
 
     def _open(self, *_: Any) -> None:
-        """Read how many features the stored forest asks for."""
+        """Read the number of features that the stored forest reads."""
         self.size = int(self.read)
 
 
 def fitted_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "number"]:
-    """Widths σ of greatest Σ_i log (1/T) Σ_t Π_d N(residual_itd; 0, σ_d²), by expectation and maximisation.
+    """Return widths σ that maximise Σ_i log (1/T) Σ_t Π_d N(residual_itd; 0, σ_d²), by expectation maximisation.
 
     r_it = N(residual_it; 0, σ²) / Σ_s N(residual_is; 0, σ²) and σ_d² = mean_i Σ_t r_it residual_itd² (Dempster, Laird &
-    Rubin 1977), from the widest that can be of use, at which every tree has a say. Each round raises the likelihood.
+    Rubin 1977). The start is the largest useful width, at which every tree has weight. Each round raises the
+    likelihood.
     """
     squares = residual.square()
     variance = squares.mean((0, 1)).clamp(min=FLOOR**2)

@@ -1,12 +1,12 @@
-"""A forest in flat arrays, and the compiled functions that walk it; nothing here needs the library that grew it.
+"""A forest in flat arrays, and the compiled functions that walk it; the library that grew the forest is not needed.
 
 Arrays:
-    feature: (node,) int32, which feature a node asks for; -1 at a leaf.
+    feature: (node,) int32, the feature that a node compares; -1 at a leaf.
     threshold: (node,) float32; samples whose feature is at most this go left.
-    branch: (node, 2) int32, the nodes to the left and right; at a leaf the number of the leaf, twice.
-    root: (tree,) int32, nodes.
+    branch: (node, 2) int32, the nodes to the left and right; at a leaf its number, twice.
+    root: (tree,) int32, the root node of each tree.
 
-`no_type_check` keeps the type checks that tests switch on from wrapping a kernel before it is compiled.
+`no_type_check` prevents the type checks that tests switch on from wrapping a kernel before it is compiled.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ compiled = compiler(kept_in("forest", [Path(__file__)]))
 
 
 def at_most(threshold: np.ndarray) -> np.ndarray:
-    """The largest float32 that is no larger: a float32 is at most the one where it is at most the other."""
+    """Return the largest float32 that is at most `threshold`; comparisons of float32 features with either agree."""
     rounded = threshold.astype(np.float32)
     return np.where(rounded > threshold, np.nextafter(rounded, np.float32(-np.inf)), rounded)
 
@@ -28,7 +28,7 @@ def at_most(threshold: np.ndarray) -> np.ndarray:
 @compiled
 @no_type_check
 def leaves(samples, feature, threshold, branch, root):
-    """The leaf of each sample (sample, feature) float32 in each tree: (tree, sample) int32."""
+    """Return the leaf of each sample in each tree, (tree, sample) int32, for samples (sample, feature) float32."""
     found = np.empty((len(root), len(samples)), np.int32)
     for tree in range(len(root)):
         for sample in range(len(samples)):
@@ -43,13 +43,13 @@ def leaves(samples, feature, threshold, branch, root):
 @compiled
 @no_type_check
 def frequencies(leaf, start, label, count, classes):
-    """Mean over the trees of the shares of the classes in a sample's leaves: (sample, class) float64.
+    """Return the mean over the trees of the shares of the classes in a sample's leaves, (sample, class) float64.
 
     Args:
         leaf: (tree, sample).
-        start: (leaf + 1,), where the entries of each leaf begin.
-        label, count: (entry,), the classes in a leaf, and how many training samples of each.
-        classes: how many there are.
+        start: (leaf + 1,), the first entry of each leaf.
+        label, count: (entry,), the classes in a leaf, and the number of training samples of each.
+        classes: number of classes.
     """
     trees, samples = leaf.shape
     found = np.zeros((samples, classes))

@@ -32,31 +32,33 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class XGBoostHead(DensityHead, Fitted):
-    """Trees that each correct the sum of those before, fitted to all training samples at once.
+    """Trees that each correct the sum of the previous ones, fitted to all training samples at once.
 
-    Classes: the softmax of the trees' sums, one for each class, trained by cross-entropy. Reals: a normal density about
-    the trees' sum, trained by squared error, of one standard deviation for each number of the target: the root of the
-    mean squared residual, after the fit of the training set and after `calibrate` of the validation set. What the trees
-    say is piecewise constant in the features, and its gradient 0. Predictions are float32.
+    Classes: the softmax of the sums of the trees, one sum for each class, trained by cross-entropy. Reals: a normal
+    density around the sum of the trees, trained by squared error. It has one standard deviation for each number of the
+    target: the root mean squared residual on the training set after the fit, and on the validation set after
+    `calibrate`. The output of the trees is piecewise constant in the features, and its gradient is 0. Predictions are
+    float32.
 
-    Stored is the library's own portable binary format (UBJSON) as bytes, in which there is no code.
+    The model is stored as bytes in the library's own portable binary format (UBJSON), which contains no code.
 
     Attributes:
-        rounds: how many rounds' trees are used, the first ones (a knob).
+        rounds: number of rounds whose trees are used, the first ones (a knob).
 
     Args:
-        rounds: of boosting.
-        depth: most splits from root to leaf.
-        rate: by which each round's trees are shrunk.
+        rounds: number of boosting rounds.
+        depth: largest number of splits from root to leaf.
+        rate: factor by which each round's trees are shrunk.
         samples: share of the training samples drawn in each round.
         features: share of the features drawn for each tree.
-        weight: least sum of second derivatives of the loss in a leaf.
-        splits: "hist" tries the borders of at most 256 bins of each feature, "exact" every sample's; for few samples of
-            very many features the latter is faster and takes less memory, which for bins grows with the features.
+        weight: smallest sum of second derivatives of the loss in a leaf.
+        splits: "hist" tries the borders of at most 256 bins of each feature, "exact" the values of every sample. For
+            few samples of very many features "exact" is faster and takes less memory, since the memory for bins grows
+            with the features.
 
     Raises:
         ConfigError: the target is an angle, or a single class.
-        UserError: it is used before it was fitted.
+        UserError: the head is used before it was fitted.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"rounds": (1, 3, 10, 30, 100)}
@@ -154,7 +156,7 @@ class XGBoostHead(DensityHead, Fitted):
         self.width.copy_(residual.square().mean(0).sqrt().clamp(FLOOR, WIDEST))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:
-        """Of the trees, float32."""
+        """Return the sums of the trees, float32."""
         assert self.booster is not None
         rounds = min(max(1, self.rounds), self.booster.num_boosted_rounds())
         found = self.booster.inplace_predict(

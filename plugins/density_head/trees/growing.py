@@ -1,4 +1,4 @@
-"""Grows the forest with scikit-learn and lays it out flat; a stored forest is read without this module."""
+"""Growing of forests with scikit-learn and their layout in flat arrays; a stored forest is read without this module."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,11 +23,11 @@ def grown(
     depth: int | None,
     seed: int,
 ) -> Arrays:
-    """The arrays of a forest: its nodes (plugins.density_head.trees.forest), and what its leaves hold.
+    """Return the arrays of a forest: its nodes (plugins.density_head.trees.forest), and the content of its leaves.
 
     Args:
         features: (sample, feature) float32.
-        target: (sample,) labels below `classes`; or (sample, number) float64, where `classes` is 0.
+        target: (sample,) labels below `classes`; or (sample, number) float64 if `classes` is 0.
         trees, share, leaf, depth: `trees`, `features`, `leaf` and `depth` of the head.
     """
     options: dict[str, Any] = {
@@ -50,7 +50,7 @@ def grown(
 
 
 def nodes(trees: Sequence[Any]) -> Arrays:
-    """Of all trees one after the other; leaves are numbered in the order of their nodes."""
+    """Return the nodes of all trees, concatenated; leaves are numbered in the order of their nodes."""
     count = np.array([tree.node_count for tree in trees])
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     feature = np.concatenate([np.where(tree.children_left < 0, -1, tree.feature) for tree in trees])
@@ -67,11 +67,11 @@ def nodes(trees: Sequence[Any]) -> Arrays:
 
 
 def votes(trees: Sequence[Any], labels: np.ndarray) -> Arrays:
-    """How many training samples of which classes each leaf holds; `labels` are the classes that occur."""
+    """Return the number of training samples of each class in each leaf; `labels` are the classes that occur."""
     counts = []
     for tree in trees:
         leaf = tree.children_left < 0
-        # a share times a number of samples is a whole number but for its rounding
+        # a share times a number of samples is an integer, except for rounding
         counts.append(np.rint(tree.value[leaf, 0] * tree.n_node_samples[leaf, None]).astype(np.int32))
     table = np.concatenate(counts)
     leaf, column = np.nonzero(table)

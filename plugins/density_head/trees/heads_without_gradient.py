@@ -1,4 +1,4 @@
-"""What heads without gradient share (framework.density_head.Fitted): state of any shape, inputs, and refusals."""
+"""Shared parts of heads without gradient (framework.density_head.Fitted): loading of state, inputs, and refusals."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -14,13 +14,13 @@ from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FLOOR = 1e-4
-"""The least standard deviation of a density over reals, in those of the training targets where `Target` has them."""
+"""Smallest standard deviation of a density over reals, in units of the training targets' one where `Target` has it."""
 WIDEST = 1e18
-"""The largest standard deviation of such a density: the square of a wider one is more than float32 holds."""
+"""Largest standard deviation of such a density: the square of a larger one exceeds float32."""
 
 
 def require_class_or_real(target: Target, by: str) -> None:
-    """Refuse targets other than classes and real numbers.
+    """Require a target of classes or real numbers.
 
     Raises:
         ConfigError: the target is an angle or an image.
@@ -33,7 +33,7 @@ def require_class_or_real(target: Target, by: str) -> None:
 
 
 def require_fitted(raw: Float[Tensor, "*batch size"], size: int, by: str) -> Float[Tensor, "*batch size"]:
-    """`raw` itself, half precision upcast to float32.
+    """Return `raw`, with half precision converted to float32.
 
     Raises:
         UserError: `size` is 0, as it is before `fit`.
@@ -47,7 +47,7 @@ def require_fitted(raw: Float[Tensor, "*batch size"], size: int, by: str) -> Flo
 
 
 def single(features: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """On the CPU in float32, in which trees compare; what exceeds it is cut off."""
+    """Return the features on the CPU in float32, the type in which trees compare, clamped to its range."""
     most = torch.finfo(torch.float32).max
     return features.detach().clamp(-most, most).to("cpu", torch.float32).contiguous()
 
@@ -55,7 +55,10 @@ def single(features: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def with_gradient_of_0(
     numbers: Float[Tensor, "*batch_and_more"], raw: Float[Tensor, "*batch size"]
 ) -> Float[Tensor, "*batch_and_more"]:
-    """What trees say of `raw` is piecewise constant in it; a gradient is asked for as of any head, and is 0."""
+    """Return `numbers` with a gradient of 0 in `raw`.
+
+    The output of trees is piecewise constant in `raw`. The framework asks for a gradient as of any head; it is 0.
+    """
     if not raw.requires_grad:
         return numbers
     zero = (raw * 0).sum(-1)
@@ -68,14 +71,14 @@ Arrays = Mapping[str, np.ndarray]
 def load_any_shape(
     head: nn.Module, require: Callable[[Any, Arrays], None], then: Callable[[Any, Any], None]
 ) -> None:
-    """Let `load_state_dict` give the head's own buffers the shapes they have in the state, and call `then` afterwards.
+    """Let `load_state_dict` give the head's own buffers the shapes of the state, and call `then` afterwards.
 
-    A state is a stranger's: of its arrays nothing is taken before `require` has seen them all.
+    A state comes from an untrusted source: nothing of its arrays is used before `require` has checked them all.
 
     Args:
-        require: given the head and the arrays that it would have, with the types of its buffers; raises a ValueError
-            with a clause that says what is wrong where they do not fit.
-        then: given the head and torch's lists of missing and unexpected keys; reads what was loaded.
+        require: receives the head and the arrays that it would have, with the dtypes of its buffers; raises a
+            ValueError with a clause that says what is wrong if they do not fit.
+        then: receives the head and torch's lists of missing and unexpected keys; reads what was loaded.
     """
     head.register_load_state_dict_pre_hook(partial(_take_shapes, require))
     head.register_load_state_dict_post_hook(then)
@@ -88,10 +91,10 @@ def _take_shapes(
     prefix: str,
     *_: Any,
 ) -> None:
-    """Buffers of a state's shapes, of their own type and device; torch copies the numbers afterwards.
+    """Replace buffers by ones with the state's shapes, and their own dtype and device; torch copies the numbers later.
 
     Raises:
-        CheckpointError: the state is not of such a head.
+        CheckpointError: the state is not one of such a head.
     """
     own = dict(head.named_buffers(recurse=False))
     stored = {name: state.get(prefix + name, buffer) for name, buffer in own.items()}
@@ -106,7 +109,7 @@ def _take_shapes(
 
 
 def _array(name: str, found: Any, buffer: Tensor) -> np.ndarray:
-    """What a buffer will hold; floating-point numbers may be of another width, as a model's that was cast."""
+    """Return the array that a buffer will hold; the width of floating-point numbers may differ, as in a cast model."""
     if not isinstance(found, Tensor) or found.layout != torch.strided or found.is_quantized:
         raise ValueError(f"{name} is no array of numbers")
     if found.dtype != buffer.dtype and not (found.is_floating_point() and buffer.is_floating_point()):

@@ -1,7 +1,7 @@
-"""Rows of the contract: few trees, for classes and for reals. The checks fit them to drawn features first.
+"""Rows of the contract: few trees, for classes and for reals. The checks first fit them to random features.
 
-No reference is given: the trees against the libraries that grow them are in test_extra_trees.py and
-test_gradient_boosting.py.
+No reference is given: test_extra_trees.py and test_gradient_boosting.py compare the trees with the libraries that grow
+them.
 """
 
 from framework.target import Target

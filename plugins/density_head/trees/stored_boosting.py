@@ -1,4 +1,4 @@
-"""Refuses bytes that are no model as XGBoostHead trains it, before the compiled library reads them."""
+"""Validation of stored XGBoostHead models, before the compiled library reads their bytes."""
 
 import math
 import re
@@ -10,7 +10,7 @@ import numpy as np
 from plugins.density_head.trees.ubjson import parse
 
 NOBODY = 2**31 - 1
-"""The parent of a root."""
+"""Number that stands for the missing parent of a root."""
 FLOATS = ("base_weights", "loss_changes", "split_conditions", "sum_hessian")
 LINKS = ("left_children", "right_children", "parents", "split_indices")
 FLAGS = ("default_left", "split_type")
@@ -24,18 +24,19 @@ TREE = {*FLOATS, *LINKS, *FLAGS, *CATEGORIES, "id", "tree_param"}
 
 
 def require_boosting(content: bytes, classes: int, numbers: int, features: int) -> None:
-    """Check that these bytes are trees of numbers for one target, and that every walk through one ends at a leaf.
+    """Require that these bytes are trees for one target, and that every walk through a tree ends at a leaf.
 
-    A node is the child of at most one, which names it, and the root of none: so no walk comes to a node twice.
+    A node is the child of at most one node, whose number it holds as its parent; the root is the child of none. So no
+    walk visits a node twice.
 
     Args:
         content: UBJSON, as `xgboost.Booster.save_raw` writes it.
-        classes: of the target; 0 where it is of reals.
-        numbers: sums of trees: one for each class, or for each number.
-        features: that the trees read.
+        classes: number of classes of the target; 0 for reals.
+        numbers: number of sums of trees: one for each class, or for each real number.
+        features: number of features that the trees read.
 
     Raises:
-        ValueError: they are something else; a clause says what came and what was wanted.
+        ValueError: the bytes are something else; the message is a clause with what came and what was wanted.
     """
     model = _keys(parse(content), "the model", {"learner", "version"})
     version = model["version"]
@@ -75,7 +76,7 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
     wanted_keys = {"gbtree_model_param", "iteration_indptr", "tree_info", "trees"}
     forest = _keys(
         booster["model"], "gradient_booster.model", wanted_keys, {"cats"}
-    )  # "cats" since xgboost 3.1
+    )  # xgboost writes "cats" since version 3.1
     for name, part in _keys(
         forest.get("cats", {}), "cats", set(), {"enc", "feature_segments", "sorted_idx"}
     ).items():
@@ -133,7 +134,7 @@ def _tree(tree: Mapping[str, Any], number: int, features: int) -> None:
 
 
 def _base_score(text: Any, numbers: int) -> None:
-    """A number, or since xgboost 3.1 one for each sum: "[5E-1,1E0]"."""
+    """Require one finite number, or since xgboost 3.1 one for each sum: "[5E-1,1E0]"."""
     if not isinstance(text, str) or not re.fullmatch(r"\[?[-+.,\dE]{1,100000}\]?", text):
         raise ValueError("base_score is no list of numbers")
     found = [float(part) for part in text.strip("[]").split(",")]

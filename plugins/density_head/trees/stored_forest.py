@@ -1,4 +1,4 @@
-"""Refuses stored arrays that are no forest, before compiled code walks them without looking where it goes."""
+"""Validation of stored forest arrays, before compiled code walks them without bounds checks."""
 
 from collections.abc import Mapping
 
@@ -8,18 +8,19 @@ from plugins.density_head.trees.heads_without_gradient import FLOOR, WIDEST
 
 
 def require_forest(arrays: Mapping[str, np.ndarray], classes: int, numbers: int) -> None:
-    """Check that every walk through these arrays ends at a leaf, and that every leaf holds something.
+    """Require that every walk through these arrays ends at a leaf, and that every leaf holds something.
 
-    The nodes of a tree stand between its root and the next tree's, and each branch leads to a later node of the same
-    tree, which no other leads to, as scikit-learn lays them out. So no walk is longer than its tree has nodes.
+    The nodes of a tree stand between its root and the root of the next tree. Each branch leads to a later node of the
+    same tree to which no other branch leads, as scikit-learn lays trees out. So no walk is longer than its tree has
+    nodes.
 
     Args:
-        arrays: as in plugins.density_head.trees.forest and ExtraTreesHead, with the types of the head's own.
-        classes: of the target; 0 where it is of reals.
-        numbers: of the target; 0 where it is of classes.
+        arrays: as in plugins.density_head.trees.forest and ExtraTreesHead, with the dtypes of the head's buffers.
+        classes: number of classes of the target; 0 for reals.
+        numbers: number of reals of the target; 0 for classes.
 
     Raises:
-        ValueError: they are not; a clause says what came and what was wanted.
+        ValueError: the arrays are no such forest; the message is a clause with what came and what was wanted.
     """
     feature, threshold, branch = arrays["feature"], arrays["threshold"], arrays["branch"]
     read = int(_shaped(arrays, "read", ()))
@@ -68,12 +69,12 @@ def require_forest(arrays: Mapping[str, np.ndarray], classes: int, numbers: int)
 
 
 def require_widths(width: np.ndarray, numbers: int) -> None:
-    """Check standard deviations, one for each number of the target.
+    """Require valid standard deviations, one for each number of the target.
 
     Raises:
-        ValueError: they are something else.
+        ValueError: the array is something else.
     """
-    # no fit ends below the floor, but for rounding
+    # no fit gives less than the floor, except for rounding
     if width.shape != (numbers,) or not ((width > 0.99 * FLOOR) & (width <= WIDEST)).all():
         raise ValueError(f"width is no row of {numbers} numbers from {FLOOR} to {WIDEST}")
 
@@ -89,7 +90,7 @@ def _votes(arrays: Mapping[str, np.ndarray], leaves: int, classes: int) -> None:
 
 
 def _shaped(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """One of the arrays; -1 stands for any length."""
+    """Return one of the arrays, after a check of its shape; -1 stands for any length."""
     found = arrays[name].shape
     if len(found) != len(shape) or any(
         side not in (-1, came) for side, came in zip(shape, found, strict=True)

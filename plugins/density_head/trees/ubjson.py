@@ -1,6 +1,6 @@
-"""Reads UBJSON as xgboost writes it, strictly and within bounds.
+"""A strict and bounded parser of UBJSON as xgboost writes it.
 
-Own code: xgboost offers no check of a model, and its loader aborts the process on an empty one (xgboost 3.2).
+It is own code: xgboost offers no check of a model, and its loader aborts the process on an empty one (xgboost 3.2).
 """
 
 import struct
@@ -20,15 +20,15 @@ NUMBERS = {
     "D": struct.Struct(">d"),
 }
 ARRAYS = {"U": ">u1", "l": ">i4", "L": ">i8", "d": ">f4", "D": ">f8"}
-"""Of numbers of one type, which stand once before them."""
+"""NumPy dtypes of typed arrays, by the type marker that precedes their numbers."""
 WORDS = {"T": True, "F": False, "Z": None}
 
 
 def parse(content: bytes) -> Any:
-    """The object, array or number that the bytes stand for, all of them; arrays of one type are NumPy's.
+    """Return the object, array or number that all bytes together encode; typed arrays become NumPy arrays.
 
     Raises:
-        ValueError: they are cut short, go on, say a key twice, or hold what xgboost does not write.
+        ValueError: the bytes are cut short, continue after the end, repeat a key, or hold what xgboost does not write.
     """
     reader = _Reader(content)
     found = reader.value(0)
@@ -96,6 +96,6 @@ class _Reader:
         if kind:
             dtype = np.dtype(ARRAYS[kind])
             return np.frombuffer(self.taken(count * dtype.itemsize), dtype)
-        if not 0 <= count <= len(self.content) - self.place:  # each takes a byte at least
+        if not 0 <= count <= len(self.content) - self.place:  # each value takes at least one byte
             raise ValueError(f"byte {self.place} announces {count} values, and it ends before")
         return [self.value(depth + 1) for _ in range(count)]

@@ -1,4 +1,4 @@
-"""A density with a uniform floor."""
+"""The mixture of a density and a uniform density."""
 
 import math
 from collections.abc import Collection
@@ -31,12 +31,12 @@ from framework.distributions.uniform import uniform
 
 
 class Floored(Distribution):
-    """(1 - γ) p + γ u.
+    """The density (1 - γ) p + γ u.
 
     Args:
         density: p, over classes or angles.
         weight: γ in (0, 1).
-        floor: u, the uniform law over p's support unless it is given.
+        floor: u; the uniform density over p's support if None.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -65,7 +65,7 @@ class Floored(Distribution):
         return self.floored(value, self.density.log_prob(value))[0]
 
     def floored(self, value: Tensor, log_prob: Tensor) -> tuple[Tensor, Tensor]:
-        """log_prob where that of p is `log_prob`, and the part of it that is p's: log (1 - γ) p."""
+        """Return the log-density, if that of p is `log_prob`, and log (1 - γ) p, the part of it from p."""
         above = log_prob + math.log1p(-self.weight)
         below = self.floor.log_prob(value).double() + math.log(self.weight)
         return torch.logaddexp(above, below.to(above.dtype)), above
@@ -78,7 +78,10 @@ class Floored(Distribution):
         return torch.where((chance < self.weight)[(..., *(None,) * len(self.event_shape))], below, drawn)
 
     def entropy(self) -> Tensor:
-        """Nats: exact for classes, by quadrature for one angle; otherwise the mean of -log_prob over 1000 samples."""
+        """Return the entropy, nats.
+
+        It is exact for classes, by quadrature for one angle, and otherwise the mean of -log_prob over 1000 samples.
+        """
         if self.event_shape == ():
             log_prob = self.log_prob(self.enumerate_support())
             return -(log_prob.exp() * log_prob).sum(0)
@@ -116,7 +119,7 @@ def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
 @slope.register
 def _(density: Floored, value: Tensor) -> Slope | None:
     if isinstance(density.support, Circular) and density.support.ranges is not None:
-        return None  # where the floor itself has a slope
+        return None  # the floor itself has a slope there
     found = slope(density.density, value)
     if found is None:
         return None
@@ -132,7 +135,7 @@ def _(density: Floored) -> Tensor:
 
 @images.register
 def _(density: Floored, channels: Collection[str]) -> dict[str, Tensor]:
-    return images(density.density, channels)  # drawn at the mode, which a floor does not move
+    return images(density.density, channels)  # drawn at the mode, which a floor does not change
 
 
 @scales.register
@@ -149,7 +152,7 @@ def _(density: Floored, index: tuple[Tensor, ...], place: Tensor) -> Floored:
 def _(density: Floored, samples: int) -> Tensor:
     if isinstance(density.support, Circular) and density.support.ranges is not None:
         return median.dispatch(Distribution)(density, samples)
-    # every angle is as far from the uniform density as any other, and every label as wrong
+    # the expected error under a uniform density is equal for every angle and every label
     return median(density.density, samples)
 
 
@@ -160,7 +163,11 @@ def _(density: Floored, index: Tensor) -> Floored:
 
 @tempered.register
 def _(density: Floored, temperature: Tensor) -> Distribution:
-    """As of any mixture: of classes the whole; of angles p is tempered and the floor, whose power it is, stays."""
+    """Return the tempered density, as of any mixture.
+
+    For classes the whole density is tempered. For angles p is tempered; the floor stays, since its power is uniform
+    too.
+    """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
     return Floored(tempered(density.density, temperature), density.weight, density.floor)

@@ -23,13 +23,13 @@ COMPONENT = {"name": "von_mises"}
 class UniformFloorHead(DensityHead):
     """A declared uniform floor under a component's density: (1 - γ) p + γ u, so that no target is impossible.
 
-    No loss exceeds log(1/(γu)). The authors' original code adds such a floor to its mixtures without a word. Here it
-    is a head of its own: it stands in the config, in the run's parameters and in the method's name, and with γ = 0 it
-    is its component.
+    No loss exceeds log(1/(γu)). The authors' original code adds such a floor to its mixtures without saying so. Here it
+    is a head of its own: it appears in the config, in the run's parameters and in the method's name, and with γ = 0 it
+    equals its component.
 
     Args:
         weight: γ.
-        component: the head under whose density the floor lies.
+        component: the head whose density the floor is added to.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -57,7 +57,7 @@ class UniformFloorHead(DensityHead):
         self.weight = weight
         self.component = require_trained(component)
         self.size = component.size
-        self._law(torch.zeros(1, self.size))  # refused here where there is none
+        self._law(torch.zeros(1, self.size))  # raises here if there is no uniform density
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         density = self.component(raw)
@@ -66,13 +66,13 @@ class UniformFloorHead(DensityHead):
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         if self.weight == 0:
             return self.component.loss(raw, target)
-        # a variational component's loss is a bound, under which the floor lies as under a density
+        # the loss of a variational component is a bound; the floor is added to it as to a density
         above = math.log1p(-self.weight) - self.component.loss(raw, target)
         below = self._law(raw).log_prob(target).double() + math.log(self.weight)
         return -torch.logaddexp(above, below.to(above.dtype))
 
     def _law(self, raw: Tensor) -> Distribution:
-        """The uniform one over the component's support; what a component draws for its density is not missed later."""
+        """Return the uniform density over the component's support; the state of the random generator is kept."""
         with torch.no_grad(), torch.random.fork_rng([raw.device] if raw.is_cuda else []):
             return uniform(self.component(raw))
 
