@@ -1,1 +1,1 @@
-"""Metrics over splits, what a prediction costs, and error against run time."""
+"""Metrics over splits, the cost of a prediction, and error against run time."""

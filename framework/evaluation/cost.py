@@ -1,4 +1,4 @@
-"""What a prediction costs: run time, FLOPs, parameters and memory, measured on the machine at hand."""
+"""The cost of a prediction: run time, FLOPs, parameters and memory, measured on this machine."""
 
 import ctypes
 import math
@@ -16,24 +16,23 @@ from torch.utils.flop_counter import FlopCounterMode
 
 @dataclass(frozen=True)
 class Cost:
-    """What one prediction costs.
+    """Cost of one prediction.
 
     Attributes:
         milliseconds_per_sample: median wall time of a batch divided by its size.
         latency_milliseconds: median wall time of a batch of one.
-        flops_per_sample: floating-point operations of matrix products, convolutions and attention, one
-            multiply-add counted as two. Not counted: element-wise and special functions, normalisation,
-            pooling, sorting, random numbers, compiled graphs, and what runs outside torch; 0 says that
-            nothing of the first kind ran, not that the work was free. None where `parameters` is.
-        parameters: numbers the predictor holds, as the caller counted them; None where what it has learned is no
-            numbers that torch computes with (trees), so that neither they nor FLOPs can be counted.
-        peak_memory_mib: the most memory one call on the batch held beyond what was held before it, MiB:
-            neither weights nor inputs are in it. On a CPU the growth of resident memory, on CUDA of
-            allocated memory; NaN where the system does not tell (a CPU without Linux's /proc or without
-            glibc).
-        batch_size: samples in the batch.
-        device: what it ran on, e.g. "cpu (AMD EPYC)".
-        threads: CPU threads torch used for one operation.
+        flops_per_sample: floating-point operations of matrix products, convolutions and attention; one multiply-add
+            counts as two. Not counted are element-wise and special functions, normalisation, pooling, sorting, random
+            numbers, compiled graphs, and everything outside torch. So 0 says that no operation of the counted kinds
+            ran, not that the work was free. None if `parameters` is None.
+        parameters: number of parameters of the predictor, as the caller counted them. None if what it has learned is
+            not numbers that torch computes with (trees), so that neither parameters nor FLOPs can be counted.
+        peak_memory_mib: largest amount of memory that one call on the batch held beyond what was held before it, MiB;
+            it contains neither weights nor inputs. On a CPU it is the growth of resident memory, on CUDA of allocated
+            memory. NaN if the system does not report it (a CPU without Linux's /proc or without glibc).
+        batch_size: number of samples in the batch.
+        device: the device, e.g. "cpu (AMD EPYC)".
+        threads: number of CPU threads that torch used for one operation.
     """
 
     milliseconds_per_sample: float
@@ -55,19 +54,20 @@ def measure(
     repeats: int = 20,
     budget_seconds: float = 5.0,
 ) -> Cost:
-    """The cost of `predict` on a batch of inputs.
-
-    Args:
-        predict: what a user waits for, the density and the point prediction, say; without gradient.
-        inputs: a batch, first dimension the samples, on the device to measure.
-        parameters: to be reported beside; None as of `Cost`.
-        repeats: timed calls of the batch, and of the batch of one.
-        budget_seconds: where `repeats` calls would take longer than this, fewer are timed; three at least.
+    """Return the cost of `predict` on a batch of inputs.
 
     Random numbers drawn by `predict` leave torch's global generators as they were.
 
+    Args:
+        predict: function whose result a user waits for, such as the density and the point prediction; it is called
+            without gradient.
+        inputs: a batch, first dimension the samples, on the device to measure.
+        parameters: number of parameters for the report; None as in `Cost`.
+        repeats: number of timed calls with the batch, and with a batch of one.
+        budget_seconds: if `repeats` calls would take longer than this, fewer calls are timed, but at least three.
+
     Raises:
-        ValueError: an empty batch, or `repeats` or `budget_seconds` not positive.
+        ValueError: the batch is empty, or `repeats` or `budget_seconds` is not positive.
     """
     if inputs.dim() == 0 or len(inputs) == 0:
         raise ValueError(
@@ -98,9 +98,9 @@ def measure(
 def wall_time(
     call: Callable[[], object], device: torch.device, *, repeats: int = 20, budget_seconds: float = 5.0
 ) -> float:
-    """Median wall time of `call` after two calls to warm up, seconds.
+    """Return the median wall time of `call` after two calls to warm up, seconds.
 
-    Three calls are timed at least, then no more than fit in `budget_seconds`, and `repeats` at most.
+    At least three calls are timed, at most `repeats`, and after the third no more than fit in `budget_seconds`.
     """
     if repeats < 1 or not budget_seconds > 0:
         raise ValueError(f"wanted repeats >= 1 and budget_seconds > 0, got {repeats} and {budget_seconds}.")
@@ -116,7 +116,7 @@ def wall_time(
 
 
 def seconds(call: Callable[[], object], device: torch.device) -> float:
-    """Wall time of one call, until the device has finished, seconds."""
+    """Return the wall time of one call until the device has finished, seconds."""
     _finish(device)
     start = time.perf_counter()
     call()
@@ -125,7 +125,7 @@ def seconds(call: Callable[[], object], device: torch.device) -> float:
 
 
 def peak_memory(call: Callable[[], object], device: torch.device) -> float:
-    """The most memory one call holds beyond what is held before it, bytes; NaN where nothing tells."""
+    """Return the most memory that one call holds beyond what is held before it, bytes; NaN if it cannot be measured."""
     if device.type == "cuda":
         _finish(device)
         torch.cuda.reset_peak_memory_stats(device)
@@ -135,13 +135,13 @@ def peak_memory(call: Callable[[], object], device: torch.device) -> float:
         return float(torch.cuda.max_memory_allocated(device) - before)
     if device.type != "cpu" or not Path("/proc/self/clear_refs").exists():
         return math.nan
-    # Pages that the allocator kept from earlier calls would be filled again without growth: give them back.
+    # The call would fill pages that the allocator kept from earlier calls, without growth, so they are given back.
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is None:
         return math.nan
     trim(0)
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the resident peak starts anew: proc(5)
+        Path("/proc/self/clear_refs").write_text("5")  # resets the resident peak: proc(5)
     except OSError:  # a container may forbid it
         return math.nan
     before = _resident_peak()
@@ -150,7 +150,7 @@ def peak_memory(call: Callable[[], object], device: torch.device) -> float:
 
 
 def device_name(device: torch.device) -> str:
-    """Kind and model of a device, e.g. "cuda (NVIDIA H200)"."""
+    """Return the kind and model of a device, e.g. "cuda (NVIDIA H200)"."""
     if device.type == "cuda":
         return f"cuda ({torch.cuda.get_device_name(device)})"
     if device.type != "cpu":
@@ -165,7 +165,7 @@ def device_name(device: torch.device) -> str:
 
 
 def _resident_peak() -> float:
-    """The most memory that was resident since the peak was last reset, bytes."""
+    """Return the most memory that was resident since the peak was last reset, bytes; NaN if it is not reported."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return 1024.0 * int(line.split()[1])
@@ -173,6 +173,6 @@ def _resident_peak() -> float:
 
 
 def _finish(device: torch.device) -> None:
-    """Wait until a device that works asynchronously is done."""
+    """Wait until a device that works asynchronously has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""What a model promises beside its density, as predictions print it: the set in which the target is said to lie."""
+"""Sets and intervals in which a model says that the target lies, as columns of a table of predictions."""
 
 import json
 import math
@@ -15,19 +15,21 @@ from framework.prediction import Prediction
 from framework.target import Target
 
 Ends = Sequence[tuple[float, float]]
+"""Pairs (low, high) of the ends of intervals."""
 
 
 @torch.no_grad()
 def promised(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
-    """Columns of the set that comes with each density (`protocol.value_set`), in the user's names and units; none of a
-    density without one.
+    """Return the columns of the set that comes with each density (`protocol.value_set`), in the user's names and units.
 
-    - of classes `set`, a JSON list of their names, and `set_size`, how many;
-    - of one real `x_set`, a JSON list of [low, high] pairs, with its first and last end, `x_low` and `x_high`, and
-      `set_size`, the length of all pairs together; ends may be infinite, and of an empty set they are NaN;
-    - of one angle the same in degrees, counter-clockwise from `x_low_deg` in [-180, 180) to `x_high_deg`, which may lie
-      beyond 180: the shortest arc that holds the set;
-    - of several numbers `set_size` alone, the volume: in radians of angles.
+    A density without a set has no columns.
+
+    - For classes: `set`, a JSON list of their names, and `set_size`, their number.
+    - For one real: `x_set`, a JSON list of [low, high] pairs, with its first and last end, `x_low` and `x_high`, and
+    `set_size`, the total length of the pairs. Ends may be infinite; for an empty set they are NaN.
+    - For one angle: the same in degrees, counter-clockwise from `x_low_deg` in [-180, 180) to `x_high_deg`, which may
+    lie beyond 180. These are the ends of the shortest arc that holds the set.
+    - For several numbers: only `set_size`, the volume; in radians for angles.
     """
     sets = value_set(prediction.density)
     if sets is None:
@@ -53,11 +55,12 @@ def promised(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
 
 
 def _around(ends: Ends) -> tuple[float, float]:
+    """Return the first and the last end of ascending intervals; NaN if there is no interval."""
     return (ends[0][0], ends[-1][1]) if ends else (math.nan, math.nan)
 
 
 def _arc_around(arcs: Ends) -> tuple[float, float]:
-    """The shortest arc that holds ascending arcs, degrees: all but the widest gap between two of them."""
+    """Return the ends of the shortest arc that holds ascending arcs, degrees: the complement of their widest gap."""
     if not arcs:
         return math.nan, math.nan
     starts = [low for low, _ in arcs]
@@ -69,7 +72,12 @@ def _arc_around(arcs: Ends) -> tuple[float, float]:
 
 
 def require_interval(target: Target, mass: float, by: str) -> None:
-    """Refuse to give intervals of what has none.
+    """Refuse intervals of a target that has none.
+
+    Args:
+        target: the predicted quantity.
+        mass: probability of the requested intervals.
+        by: setting that requests them.
 
     Raises:
         ConfigError: the target is not of reals or angles.
@@ -83,10 +91,10 @@ def require_interval(target: Target, mass: float, by: str) -> None:
 
 
 def require_promised(sets: ValueSet, mass: float, by: str) -> None:
-    """Refuse an interval beside a set that promises something else: its columns would be read as the promise.
+    """Refuse an interval beside a set of another probability, because the interval would be taken for that set.
 
     Raises:
-        ConfigError: says which mass is promised.
+        ConfigError: the probabilities differ, or the set has no ends; the message says the probability of the set.
     """
     if (
         sets.promised is not None
@@ -106,8 +114,10 @@ def require_promised(sets: ValueSet, mass: float, by: str) -> None:
 
 
 def ends(target: Target, interval: Interval) -> dict[str, Tensor]:
-    """Columns of the ends of intervals, (batch,) each, and of their standard errors; angles in degrees, `low` in
-    [-180, 180), from there counter-clockwise to `high`."""
+    """Return columns of the ends of intervals and of their standard errors, (batch,) each.
+
+    Angles are in degrees. `low` is in [-180, 180), and the interval runs counter-clockwise from `low` to `high`.
+    """
     unit, end = (180 / math.pi, "_deg") if target.kind == "angle" else (1.0, "")
     return {
         f"{name}_{field}{end}": unit * values[:, index]

@@ -1,4 +1,4 @@
-"""The error of log-likelihoods against a reference: the same ones at a value of a knob that costs far more."""
+"""Error of log-likelihoods against a reference: the log-likelihoods at a far more expensive value of the knob."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,28 +15,28 @@ COLUMNS = {
     "sample_error_nats": "one sample's error (nats)",
     "log_likelihood_nats": "log-likelihood (nats)",
 }
-"""What `errors` tells, with the headings."""
+"""Keys of the numbers that `errors` returns, with their headings."""
 BETTER: Mapping[str, Literal["higher", "lower"]] = {
     "error_nats": "lower",
     "bias_nats": "lower",
     "sample_error_nats": "lower",
 }
-"""Which way those that are errors are better."""
+"""Direction in which the errors are better."""
 
 LogProbs = Callable[[int, int], Tensor]
-"""Log-likelihoods of all samples at a value of the knob and with a seed: (value, seed) → (samples,), nats."""
+"""Function that returns the log-likelihoods of all samples: (value of the knob, seed) → (samples,), nats."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What log-likelihoods are compared with.
+    """Log-likelihoods that others are compared with.
 
     Attributes:
-        value: where the knob stood.
-        log_probs: of each sample, nats: the logarithm of the density averaged over the repeats.
-        mean: of these.
-        standard_error: of that mean, over the repeats (jackknife), nats; errors below it mean nothing.
-        repeats: how many seeds.
+        value: value of the knob.
+        log_probs: of each sample the logarithm of its density averaged over the repeats, nats.
+        mean: mean of `log_probs` over the samples.
+        standard_error: standard error of `mean` over the repeats (jackknife), nats; smaller errors mean nothing.
+        repeats: number of seeds.
     """
 
     value: int
@@ -47,18 +47,19 @@ class Reference:
 
 
 def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Reference:
-    """The log-likelihood at a large value of the knob, averaged over seeds.
+    """Return the log-likelihood at a large value of the knob, averaged over seeds.
 
-    The densities are averaged, not their logarithms: where the knob counts Monte Carlo samples this equals
-    one estimate with len(seeds) times as many, and the bias of the logarithm (Jensen) shrinks as much. The
-    standard error is the jackknife's over the seeds, sqrt((R - 1)/R Σ_r (θ_(r) - θ_(·))²) (Efron &
-    Tibshirani 1993, eq. 11.5).
+    The densities are averaged, not their logarithms. If the knob counts Monte Carlo samples, this equals one estimate
+    with len(seeds) times as many samples, and the bias of the logarithm (Jensen) shrinks accordingly. The standard
+    error is the jackknife's over the seeds, sqrt((R - 1)/R Σ_r (θ_(r) - θ_(·))²) (Efron & Tibshirani 1993, eq. 11.5).
 
     Args:
-        seeds: two at least.
+        log_probs: log-likelihoods at a value and a seed.
+        value: the large value of the knob.
+        seeds: at least two.
 
     Raises:
-        ValueError: a log-likelihood is not finite; there is nothing to compare with.
+        ValueError: a log-likelihood is not finite, so that there is nothing to compare with.
     """
     found = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
     pooled = torch.logsumexp(found, 0) - math.log(len(seeds))
@@ -76,13 +77,14 @@ def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Re
 
 
 def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Reference) -> dict[str, float]:
-    """How far log-likelihoods at one value of the knob are from the reference, nats; infinite where one is.
+    """Return the errors of log-likelihoods at one value of the knob, nats; they are infinite if a log-likelihood is.
 
-    "error_nats" is the root mean square, over the seeds, of the mean log-likelihood minus the reference;
-    "bias_nats" the absolute value of their mean difference; "sample_error_nats" the root mean square, over seeds and
-    samples, of one sample's log-likelihood minus its reference: what a user who asks about one sample sees;
+    "error_nats" is the root mean square, over the seeds, of the mean log-likelihood minus the reference. "bias_nats" is
+    the absolute value of their mean difference. "sample_error_nats" is the root mean square, over seeds and samples, of
+    one sample's log-likelihood minus its reference; it is the error for a user who asks about one sample.
     "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the seeds, NaN
-    of one; that of a root mean square sqrt(m) is that of m divided by 2 sqrt(m) (delta method).
+    for a single seed. The standard error of a root mean square sqrt(m) is that of m divided by 2 sqrt(m) (delta
+    method).
     """
     found = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
     means = found.mean(1)
@@ -99,5 +101,5 @@ def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Ref
 
 
 def _standard_error(values: Tensor) -> float:
-    """Of the mean of independent values; NaN for one."""
+    """Return the standard error of the mean of independent values; NaN for a single value."""
     return float(values.std() / len(values) ** 0.5) if len(values) > 1 else math.nan

@@ -1,4 +1,4 @@
-"""Runs a predictor over a split: metrics, per group and in all, and what the prediction costs."""
+"""Evaluation of a predictor on a split: metrics, per group and in total, and the cost of a prediction."""
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -17,22 +17,25 @@ from framework.model import Predictor
 from framework.prediction import Prediction, Split
 
 BLOCK = 64
-"""Samples that are evaluated at once. Draws are a function of (seed, sample) only where it is one number for all: a
-density may draw for a whole batch at once. No gradient is kept: it takes less memory than training on as many."""
+"""Number of samples that are evaluated at once.
+
+Draws are a function of (seed, sample) only if this number is the same everywhere, because a density may draw for a
+whole batch at once. No gradient is kept, so evaluation takes less memory than training on as many samples.
+"""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Numbers of one split: over everything, and per group where there are several."""
+    """Numbers of one split: over all samples, and per group if there are several groups."""
 
     total: dict[str, float]
     groups: dict[str, dict[str, float]]
     metrics: list[Metric]
-    """Those over everything, as they stood at the end."""
+    """Metrics over all samples, in their final state."""
 
 
 def on_device(batches: Iterable[Batch], device: torch.device) -> Iterator[Batch]:
-    """The same batches on `device`."""
+    """Yield the batches on `device`."""
     for batch in batches:
         yield {name: tensor.to(device, non_blocking=True) for name, tensor in batch.items()}
 
@@ -49,13 +52,19 @@ def evaluate(
     device: torch.device,
     outliers: Iterable[Batch] = (),
 ) -> Evaluation:
-    """Every metric over every batch; noise is a function of (seed, batch, metric).
+    """Return every metric over all batches; noise is a function of (seed, batch, metric).
 
-    So a second call gives the same bits, also with other metrics beside.
+    A second call therefore gives the same bits, also if other metrics are computed beside.
 
     Args:
-        batches: of BLOCK samples, so that the numbers do not depend on the batch size of training.
-        outliers: of another data set; seen by the metrics that read them, in every group.
+        predictor: the trained predictor; it is moved to `device`.
+        batches: batches of BLOCK samples, so that the numbers do not depend on the batch size of training.
+        metrics: metrics to compute; they are copied.
+        groups: names of the groups.
+        samples: as in `Prediction`.
+        seed: seed of the noise.
+        device: device to predict on.
+        outliers: batches of another data set, given to the metrics that read outliers, in every group.
     """
     predictor.eval().to(device)
     several = len(groups) > 1
@@ -75,6 +84,7 @@ def evaluate(
 
 
 def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
+    """Return copies of metrics on a device."""
     return [cast(Metric, metric.clone().to(device)) for metric in metrics]
 
 
@@ -86,7 +96,7 @@ def predicted(
     split: Split = "test",
     reads: Collection[str] = (),
 ) -> Prediction:
-    """What is predicted for a batch, whatever mode asks: what is drawn for it is a function of `draw`."""
+    """Return the prediction for a batch, the same in every mode: its random numbers are a function of `draw`."""
     with draw(split):
         density = predictor(batch["input"])
     return Prediction(density, batch, samples, split, draw, reads)
@@ -100,6 +110,7 @@ def _update(
     draw: Draw,
     split: Split = "test",
 ) -> None:
+    """Give the prediction for a batch to the metrics that read its split."""
     readers = [metric for metric in metrics if split in metric.splits]
     reads = {channel for metric in readers for channel in metric.reads}
     prediction = predicted(predictor, batch, samples, draw, split, reads)
@@ -109,10 +120,10 @@ def _update(
 
 
 def numbers(metrics: Sequence[Metric]) -> dict[str, float]:
-    """What all of them compute.
+    """Return the numbers that all metrics compute, by name.
 
     Raises:
-        ConfigError: something is not one number, or two metrics call theirs the same.
+        ConfigError: a value is not a single number, or two metrics use the same name.
     """
     found: dict[str, float] = {}
     owners: dict[str, Metric] = {}
@@ -131,13 +142,15 @@ def numbers(metrics: Sequence[Metric]) -> dict[str, float]:
 
 
 def require_own(owners: dict[str, Metric], name: str, metric: Metric) -> None:
-    """Refuse a name that another metric has already, whose number one of the two would hide.
+    """Refuse a name that another metric already uses; one of the two numbers would be hidden.
 
     Args:
         owners: the metric of each name so far; `name` is added.
+        name: the name to check.
+        metric: the metric that uses it.
 
     Raises:
-        ConfigError: says which two.
+        ConfigError: the name is in use; the message names both metrics.
     """
     other = owners.setdefault(name, metric)
     if other is not metric:
@@ -149,13 +162,13 @@ def require_own(owners: dict[str, Metric], name: str, metric: Metric) -> None:
 
 @torch.no_grad()
 def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.device) -> Cost:
-    """What one prediction costs: the density and the point prediction drawn from it."""
+    """Return the cost of one prediction: the density and the point prediction derived from it."""
     predictor.eval().to(device)
 
     def predict(inputs: torch.Tensor) -> torch.Tensor:
         return Prediction(predictor(inputs), {}, samples).point
 
-    # what a head fitted at once holds is no weights
+    # a head that is fitted at once has no weights to count
     fitted = any(isinstance(part, Fitted) for part in predictor.modules())
     parameters = None if fitted else sum(parameter.numel() for parameter in predictor.parameters())
     return measure(predict, batch["input"].to(device), parameters=parameters)

@@ -29,12 +29,12 @@ from framework.uncertainty import Uncertainty
 
 @dataclass(frozen=True)
 class Point:
-    """What one value of a knob gives.
+    """Results at one value of a knob.
 
     Attributes:
-        value: where the knob stood.
-        numbers: of each metric "<key>", its mean over the repeats, and "<key>_std", their standard deviation; and
-            what `framework.evaluation.reference.errors` tells.
+        value: value of the knob.
+        numbers: for each metric "<key>" its mean over the repeats, and "<key>_std", their standard deviation; also the
+            numbers that `framework.evaluation.reference.errors` returns.
         milliseconds: median wall time per sample, from input to log-likelihood.
     """
 
@@ -45,7 +45,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """The points of one method, in the order of the knob's values, and how they were measured."""
+    """Points of one method, in the order of the knob's values, and the conditions of the measurement."""
 
     knob: str
     points: list[Point]
@@ -58,10 +58,10 @@ class Curve:
 
 
 def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
-    """The parts that have a knob of that name: wrappers, or else heads. None of the name "", which turns nothing.
+    """Return the parts that have a knob of that name: wrappers, or else heads; no parts for the name "".
 
     Raises:
-        ConfigError: none has; says which knobs there are.
+        ConfigError: no part has the knob; the message lists the existing knobs.
     """
     if not knob:
         return []
@@ -78,10 +78,10 @@ def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
 
 
 def first_knob(predictor: Predictor) -> str:
-    """The knob of the outermost part that has one.
+    """Return the first knob of the outermost part that has knobs.
 
     Raises:
-        ConfigError: no part has one.
+        ConfigError: no part has a knob.
     """
     for part in parts_with_knobs(predictor):
         return next(iter(part.knobs))
@@ -89,7 +89,7 @@ def first_knob(predictor: Predictor) -> str:
 
 
 def parts_with_knobs(predictor: Predictor) -> list[Uncertainty | DensityHead]:
-    """Wrappers and heads that have knobs, from the outermost to the innermost."""
+    """Return the wrappers and heads that have knobs, from the outermost to the innermost."""
     parts = [part for part in predictor.modules() if isinstance(part, Uncertainty | DensityHead)]
     return [part for part in parts if part.knobs]
 
@@ -108,24 +108,28 @@ def tradeoff(
     timed_calls: int = 20,
     budget_seconds: float = 20.0,
 ) -> Curve:
-    """The curve of one trained predictor: metrics, and errors against a reference, for each value of its knob.
+    """Return the curve of a trained predictor: metrics, and errors against a reference, for each value of its knob.
 
-    The times are those of the whole predictor, input to log-likelihood, on the first batch. The predictor, its knob
-    and torch's random numbers are left as they were.
+    The times are those of the whole predictor, from input to log-likelihood, on the first batch. The predictor, its
+    knob and torch's random numbers are left as they were.
 
     Args:
-        batches: labelled, on the predictor's device.
-        knob: as of `owners`.
-        values: of the knob, to be tried.
-        reference: a value so large that its own error does not matter, at least the largest of `values`; None where
-            nothing is compared with a reference.
-        samples: as of `Prediction`.
-        repeats: seeds for each value and for the reference, which needs two.
-        seed: of all random numbers.
-        timed_calls, budget_seconds: as of `run_times`.
+        predictor: the trained predictor.
+        batches: labelled batches on the predictor's device.
+        metrics: metrics to compute at each value.
+        knob: name of the knob, as in `owners`.
+        values: values of the knob to try.
+        reference: a value so large that its own error does not matter, at least the largest of `values`; None: no
+            comparison with a reference.
+        samples: as in `Prediction`.
+        repeats: number of seeds for each value and for the reference, which needs two.
+        seed: seed of all random numbers.
+        timed_calls: number of timed calls, as in `run_times`.
+        budget_seconds: limit of the timing, as in `run_times`.
 
     Raises:
-        ConfigError: no batch, no value, no such knob, a reference below the largest value or too few repeats for it.
+        ConfigError: there is no batch, no value or no such knob; the reference is below the largest value; or there are
+            too few repeats for a reference.
     """
     kept, parts = list(batches), owners(predictor, knob)
     _check(kept, parts, knob, values, reference, repeats)
@@ -154,7 +158,7 @@ def tradeoff(
 
     points: list[Point] = []
     with _undisturbed(predictor, parts, knob, inputs.device), torch.no_grad():
-        # no two estimates share random numbers
+        # No two estimates share random numbers.
         *own, last = (
             _seeds(stream, repeats) for stream in np.random.SeedSequence(seed).spawn(len(values) + 1)
         )
@@ -174,7 +178,7 @@ def tradeoff(
 
 
 def averaged(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Of each number its mean over the runs and, as "<key>_std", its standard deviation; NaN of one run.
+    """Return for each number its mean over the runs and, as "<key>_std", its standard deviation, NaN for one run.
 
     The standard errors "<key>_sem" over the samples of a run are left out.
     """
@@ -194,11 +198,11 @@ def run_times(
     calls: int = 20,
     budget_seconds: float = 20.0,
 ) -> list[float]:
-    """Median wall time of `predict(value)` for each value, seconds, after two calls to warm up.
+    """Return the median wall time of `predict(value)` for each value, seconds, after two calls to warm up.
 
-    The values take turns, so that a machine that slows down meanwhile slows all of them; an untimed call goes
-    before each timed one, so that none pays for the caches its neighbour left behind. Where turns would last
-    longer than `budget_seconds`, there are fewer than `calls`, but three.
+    The values take turns, so that a machine that slows down affects all of them. An untimed call precedes each timed
+    call, so that no call pays for the caches that another value left behind. If the turns would last longer than
+    `budget_seconds`, there are fewer than `calls`, but at least three.
     """
     taken: list[list[float]] = [[] for _ in values]
     start = perf_counter()
@@ -216,11 +220,13 @@ def run_times(
 def rows(
     curves: Mapping[str, Curve], better: Mapping[str, Literal["higher", "lower"]], *, synthetic: bool
 ) -> list[dict[str, object]]:
-    """A row per method and value, for a result table; every number that has a unit has it in its key.
+    """Return one row per method and value for a result table; the key of a number with a unit contains the unit.
 
     Args:
-        better: the metrics to tell of, and which way they are better; each gets a column "<key>_pareto", true
-            on the front of its own curve, beyond noise (`framework.evaluation.pareto.front`).
+        curves: curves by method.
+        better: metrics to report, with the direction in which each is better. Each gets a column "<key>_pareto", which
+            is true on the front of its own curve, beyond noise (`framework.evaluation.pareto.front`).
+        synthetic: whether the data are generated.
     """
     told = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
     found: list[dict[str, object]] = []
@@ -248,6 +254,8 @@ def rows(
 
 
 def _log_probs(predictor: Predictor, batches: Sequence[Batch], turn: Callable[[int], None]) -> LogProbs:
+    """Return the function that computes log-likelihoods of all samples at a value and a seed."""
+
     def unchanged(inputs: Tensor) -> Tensor:
         return inputs
 
@@ -255,7 +263,7 @@ def _log_probs(predictor: Predictor, batches: Sequence[Batch], turn: Callable[[i
         (predictor.head, predictor.raw) if isinstance(predictor, Model) else (predictor, unchanged)
     )
 
-    @cache  # the encoder of a model runs once, since the knob is the head's
+    @cache  # the encoder of a model runs once, because the knob belongs to the head
     def pairs() -> list[tuple[Tensor, Tensor]]:
         return [(read(batch["input"]), batch["target"]) for batch in batches]
 
@@ -294,7 +302,7 @@ def _check(
 def _undisturbed(
     predictor: Predictor, parts: Sequence[Uncertainty | DensityHead], knob: str, device: torch.device
 ) -> Iterator[None]:
-    """Evaluation mode inside; afterwards mode, knob and random numbers are as before."""
+    """Set evaluation mode inside the block, and restore mode, knob and random numbers afterwards."""
     training = predictor.training
     before = [getattr(part, knob) for part in parts]
     try:
@@ -308,4 +316,5 @@ def _undisturbed(
 
 
 def _seeds(stream: np.random.SeedSequence, count: int) -> list[int]:
+    """Return `count` seeds of a stream of random numbers."""
     return [int(seed) for seed in stream.generate_state(count, np.uint64) >> np.uint64(1)]
