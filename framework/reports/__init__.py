@@ -1,1 +1,1 @@
-"""What a run says at its end: tables and pictures."""
+"""Tables and figures at the end of a run."""

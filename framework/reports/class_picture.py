@@ -1,4 +1,4 @@
-"""Classified samples as a contact sheet: certain, ambiguous and failed ones, each with its likeliest classes."""
+"""Contact sheet of classified samples: certain, ambiguous and failed ones, each with its most likely classes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,18 +12,18 @@ from framework.figures.style import BLUE, GREEN, RED
 from framework.reports.sample_sheet import sample_sheet
 
 LISTED = 3
-"""Classes named below each sample."""
+"""Number of classes that are named below each sample."""
 LONGEST = 18
-"""Letters of a class's name that fit."""
+"""Largest number of letters of a class name that fits."""
 
 
 def choose_classified(
     probability: Float[np.ndarray, "samples classes"], label: Int[np.ndarray, "samples"], count: int = 6
 ) -> dict[str, list[int]]:
-    """Up to `count` samples for each row; the same arguments give the same samples, and none stands twice.
+    """Return up to `count` samples for each row; the same arguments give the same samples, and no sample occurs twice.
 
-    "failed": wrong, the surest first. "ambiguous": right or wrong, with the least between the two likeliest classes.
-    "certain": right, the surest of each class before a second one of any.
+    "failed": wrong, highest probability first. "ambiguous": right or wrong, smallest difference between the two most
+    likely classes first. "certain": right, the surest sample of each class before a second one of any class.
     """
     if len(probability) == 0:
         return {"certain": [], "ambiguous": [], "failed": []}
@@ -60,12 +60,16 @@ def classified(
     title: str,
     synthetic: bool,
 ) -> Figure:
-    """Each sample's picture, and bars for its likeliest classes and the true one.
+    """Draw each sample's image, and bars for its most likely classes and the true one.
 
     Args:
-        images: of the samples, as `Data.picture` gives them.
-        names: of the classes.
-        rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
+        images: images of the samples, as `Data.picture` gives them.
+        probability: predicted probabilities.
+        label: true classes.
+        names: names of the classes.
+        rows: heading of each row, and its number of samples in their order; may be 0.
+        title: title of the figure.
+        synthetic: whether the data are generated.
     """
     size = {"least": 4, "width": 1.75, "heights": (1.24, 0.496), "flat": (0.186, 0.031), "margin": 1.2}
     figure, panels = sample_sheet(rows, **size, title=title, synthetic=synthetic)
@@ -83,7 +87,7 @@ def classified(
 
 
 def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]) -> None:
-    """The likeliest classes, the true one in place of the last where it is not among them."""
+    """Draw the most likely classes; the true class replaces the last of them if it is not among them."""
     shown: list[int] = np.argsort(-probability, kind="stable")[:LISTED].tolist()
     if label not in shown:
         shown[-1] = label

@@ -1,4 +1,4 @@
-"""The probability landscape of classifiers over a plane of two inputs, a panel a model (thesis Figure 2.3)."""
+"""Figure of classifiers' probabilities over a plane of two inputs, one panel per model (thesis Figure 2.3)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,21 +14,22 @@ from framework.figures.style import BLUE, ORANGE, titled_figure
 from framework.model import Predictor
 
 POINTS = 61
-"""Along each side of the plane."""
+"""Number of points along each side of the plane."""
 SHOWN = 300
-"""Points of each kind drawn over a landscape, at most."""
+"""Largest number of points of each kind that are drawn over a landscape."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """What is drawn over the landscapes.
+    """Points and axes that are drawn over the landscapes.
 
     Attributes:
-        points, labels: of the two inputs, and their classes.
-        outliers: inputs of no class, (count, 2); none where there are none.
-        names: of the classes.
+        points: the two inputs of each sample.
+        labels: classes of the samples.
+        outliers: inputs of no class, (count, 2); may be empty.
+        names: names of the classes.
         axes: names of the two inputs.
-        half_width: the square shown reaches from minus to plus this around 0.
+        half_width: half the side of the square shown, which is centred at 0.
     """
 
     points: Float[np.ndarray, "count 2"]
@@ -40,13 +41,16 @@ class Plane:
 
 
 def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
-    """Such that the square holds every point, and a tenth more."""
+    """Return half the side of a square around 0 that holds every point, plus a tenth."""
     return 1.1 * max((float(np.abs(some).max()) for some in points if len(some)), default=1.0)
 
 
 @torch.no_grad()
 def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4096) -> np.ndarray:
-    """Of two classes p(y = 1), of more the entropy over its largest, log K: (POINTS, POINTS), rows from below."""
+    """Return what is shown at each point of the plane: (POINTS, POINTS), first row at the bottom.
+
+    With two classes it is p(y = 1), with more the entropy divided by its largest value, log K.
+    """
     axis = torch.linspace(-half_width, half_width, POINTS)
     plane = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).reshape(-1, 2)
     found = []
@@ -61,10 +65,13 @@ def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4
 
 
 def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, synthetic: bool) -> Figure:
-    """One panel for each model, in rows of three; all to one scale of colours.
+    """Draw one panel for each model, in rows of three, with one scale of colours.
 
     Args:
-        panels: caption → what `probabilities` found.
+        panels: caption → result of `probabilities`.
+        plane: points and axes.
+        title: title of the figure.
+        synthetic: whether the data are generated.
     """
     across = min(3, len(panels))
     down = -(-len(panels) // across)
@@ -72,7 +79,7 @@ def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, sy
     axes = figure.subplots(down, across, squeeze=False)
     edge, two = plane.half_width, len(plane.names) == 2
     extent = (-edge, edge, -edge, edge)
-    # blue and orange are the classes; white is where neither is likelier
+    # Blue and orange are the classes; white means that neither is more likely.
     colours = LinearSegmentedColormap.from_list("classes", [BLUE, "white", ORANGE]) if two else "viridis"
     image = None
     for place, (caption, found) in zip(axes.flat, panels.items(), strict=False):

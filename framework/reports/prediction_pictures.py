@@ -1,4 +1,4 @@
-"""Pictures of what is predicted for samples of the test split, as the kind of data calls for."""
+"""Figures of the predictions for samples of the test split, according to the kind of data."""
 
 import math
 from collections.abc import Iterator
@@ -23,15 +23,18 @@ from framework.reports.viewing_circles import choose, viewing_circles
 from framework.runs.session import Session
 
 PICTURED = 128
-"""How many test samples those that are shown are chosen from."""
+"""Number of test samples from which the samples in a figure are chosen."""
 
 
 UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10
-"""A grid whose mass is off by more does not resolve the density; so many draws, so many times, then do."""
+"""Limit on the error of a grid's total probability, above which the grid does not resolve the density.
+
+The density is then estimated from DRAWS samples, drawn TIMES times.
+"""
 
 
 def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
-    """The pictures with their names."""
+    """Yield the names and figures."""
     kind = session.target.kind
     if kind == "angle":
         yield "predicted_densities", _densities(session)
@@ -43,7 +46,10 @@ def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
 
 @torch.no_grad()
 def _densities(session: Session) -> Figure:
-    """Of the first angle, on the viewing circle over their images, chosen from the first samples of the test split."""
+    """Return the figure of the densities of the first angle on the viewing circle.
+
+    The samples are chosen from the first PICTURED samples of the test split.
+    """
     predictor, data = session.predictor, session.data
     inputs: list[Tensor] = []
     columns: list[tuple[Tensor, ...]] = []
@@ -82,7 +88,7 @@ def _densities(session: Session) -> Figure:
 
 @torch.no_grad()
 def _classified(session: Session) -> Figure:
-    """Chosen from all over the test split."""
+    """Return the figure of classified samples, chosen from the whole test split."""
     predictor, data = session.predictor, session.data
     dataset = data.splits().test
     length: int = len(dataset)  # pyright: ignore[reportArgumentType]
@@ -108,7 +114,7 @@ def _classified(session: Session) -> Figure:
 
 
 def _landscape(session: Session) -> Figure:
-    """Class probabilities over the plane of the inputs, with test samples and outliers."""
+    """Return the figure of class probabilities over the plane of the inputs, with test samples and outliers."""
     predictor, data, outliers = session.predictor, session.data, session.outliers
     points, labels = _first(data)
     others = _first(outliers)[0] if outliers is not None else points[:0]
@@ -125,43 +131,44 @@ def _landscape(session: Session) -> Figure:
 
 
 def around(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
-    """Angles (points,) and the log-density there (points, batch) of one angle, however narrow it is.
+    """Return angles (points,) and the log-density of one angle there, (points, batch), however narrow the density is.
 
-    Where it is too narrow for the grid, the share of draws between two of its points stands for the density there.
+    If the density is too narrow for the grid, it is estimated by the share of draws in each cell of the grid.
     """
     angles, log_density = circular_grid(density, points)
     width = 2 * math.pi / points
-    on_grid = DRAWS * TIMES * width * log_density.double().exp()  # draws to expect
+    on_grid = DRAWS * TIMES * width * log_density.double().exp()  # expected number of draws
     unresolved = (on_grid.sum(0) / (DRAWS * TIMES) - 1).abs() > UNRESOLVED
     if not bool(unresolved.any()):
         return angles, log_density
     drawn = torch.cat([density.sample(torch.Size((DRAWS,))) for _ in range(TIMES)]).squeeze(-1)
     place = ((wrap(drawn).double() + math.pi) / width).round().long() % points
     found = torch.zeros_like(on_grid).scatter_add_(0, place, torch.ones_like(place, dtype=on_grid.dtype))
-    # what the grid says stands unless the draws contradict it: tails stay smooth
+    # Values on the grid are kept unless the draws contradict them, so that tails stay smooth.
     wrong = unresolved & ((found - on_grid).abs() > 5 * (on_grid + 1).sqrt())
     return angles, torch.where(wrong, (found / (DRAWS * TIMES * width)).log(), log_density.double())
 
 
 def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:
-    """Angular distance to the nearest angle that is as true as the annotated one, radians; 0 where all angles are."""
+    """Return the angular distance to the nearest of the equally true angles, radians; 0 if all angles are true."""
     folds = symmetry.clamp(min=1)
     return torch.where(symmetry == 0, 0.0, angular_distance(folds * truth, folds * point) / folds)
 
 
 def _caption(error: float, entropy: float, symmetry: int) -> str:
+    """Return the text below a panel."""
     said = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
     note = f", {symmetry}-fold symmetric" if symmetry > 1 else ""
     return f"{said}, entropy {entropy:.2f} nats{note}"
 
 
 def _equally_true(truth: float, symmetry: int) -> np.ndarray:
-    """Every angle that is as right as the annotated one; none marked where all angles are."""
+    """Return every angle that is as true as the annotated one; none if all angles are true."""
     return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
 
 
 def _first(data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs and targets of the first PICTURED test samples."""
+    """Return inputs and targets of the first PICTURED test samples."""
     dataset = data.splits().test
     count = min(PICTURED, len(dataset))  # type: ignore[arg-type]
     items = [dataset[index] for index in range(count)]

@@ -1,4 +1,4 @@
-"""What a run says at its end: the result table, its numbers as JSON, the pictures, and where to look next."""
+"""Report at the end of a run: the result table, its numbers as JSON, figures, and where to look next."""
 
 import json
 import math
@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 
 
 def report_test(run: Run, session: Session) -> None:
-    """Test, measure the cost, print the table, write results.json and the pictures, tell the tracker.
+    """Test, measure the cost, print the table, write results.json and the figures, and log the numbers.
 
     Args:
-        session: after `tested`.
+        run: the run, whose folder and tracker receive the results.
+        session: the session of the run, after `tested`.
     """
     settings, data, outliers, metrics = session.settings, session.data, session.outliers, session.metrics
     blocks = session.blocks()
@@ -57,7 +58,7 @@ def report_test(run: Run, session: Session) -> None:
         named = {f"{part}/{key}": value for key, value in values.items()}
         run.tracker.log_metrics({name: value for name, value in named.items() if name not in known}, 0, 0)
     run.tracker.log_artifact(path)
-    rows = [  # groups of test samples are no rivals: nothing is bold
+    rows = [  # nothing is bold, because groups of test samples do not compete
         results,
         *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
     ]
@@ -69,13 +70,16 @@ def report_test(run: Run, session: Session) -> None:
 
 
 def _logged(run: Run) -> set[str]:
-    """Return the names of the numbers that a run logged before it was killed: what it computes is the same again."""
+    """Return the names of numbers that a resumed run logged before it was killed; computed again, they are the same."""
     return {name for line in run.tracker.journal.lines() for name in line.values} if run.resumed else set()
 
 
 def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) -> None:
-    """Those of predictions and of metrics. What a density does not know for the first costs that picture alone: nobody
-    asked for it, and the numbers are there."""
+    """Save the figures of predictions and of metrics.
+
+    If a density lacks a function that the figures of predictions need, only these are left out, because nobody
+    requested them and the numbers exist.
+    """
     from framework.reports.prediction_pictures import prediction_pictures
 
     try:
@@ -91,6 +95,7 @@ def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) ->
 def _results(
     run: Run, session: Session, found: Evaluation, spent: Cost, columns: dict[str, str], better: Better
 ) -> dict[str, Any]:
+    """Return the numbers of a run as they are written to results.json."""
     return {
         "method": session.method,
         "experiment": run.settings.experiment_name,
@@ -108,12 +113,18 @@ def _results(
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no NaN: a number that could not be had is null, which tables print as "not available"."""
+    """Return a value for JSON, which has no NaN: NaN becomes null, which tables print as "not available"."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
-    """The training curve, from the journal; nothing where pictures are not wanted."""
+    """Save the training curve from the journal, unless the settings switch figures off.
+
+    Args:
+        run: the run with the journal.
+        session: the session of the run.
+        kept_epoch: epoch of the kept weights, from 0.
+    """
     if not run.settings.pictures:
         return
     from framework.reports.training_curve import training_curve
@@ -139,7 +150,7 @@ def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
 
 
 def picture(run: Run, figure: "Figure", name: str) -> Path:
-    """Save a figure into the run folder, in the format the settings name, and send it to the store."""
+    """Save a figure into the run folder, in the format of the settings, and send it to the store; return its path."""
     from framework.figures.style import saved
 
     folder = run.folder / "figures"
@@ -150,9 +161,10 @@ def picture(run: Run, figure: "Figure", name: str) -> Path:
 
 
 def _next_steps(run: Run, spent: Cost, console: Console) -> None:
+    """Print the machine, the run folder, and how to use the model."""
     holds = ("figures", "results.json", "citations.bib", "checkpoints/model.ckpt")
     there = [name for name in holds if (run.folder / name).exists()]
-    # a run that tested another's model has none of its own
+    # A run that tested the model of another run has no model of its own.
     model = run.folder if holds[-1] in there else run.settings.checkpoint
     lines = [
         f"measured on {machine(spent.device, spent.threads)}, batches of {spent.batch_size}; "

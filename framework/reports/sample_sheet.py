@@ -1,4 +1,4 @@
-"""An empty contact sheet of samples: a row for each kind of sample, which says so where there is none."""
+"""An empty contact sheet of samples: one row for each kind of sample; a row without samples says so."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,15 +19,19 @@ def sample_sheet(
     title: str,
     synthetic: bool,
 ) -> tuple[Figure, list[np.ndarray]]:
-    """The figure and, for each sample in the order of the rows, its panels from top to bottom. Lengths are in inches.
+    """Return the figure and, for each sample in the order of the rows, its panels from top to bottom.
+
+    Lengths are in inches.
 
     Args:
-        rows: heading of each row, and how many samples stand in it; may be 0.
-        least: for how many samples a row has room at least.
-        width: of a panel.
-        heights: of the panels of a sample.
-        flat: the same in a row without samples.
-        margin: for title and legend.
+        rows: heading of each row, and its number of samples; may be 0.
+        least: smallest number of samples that a row has room for.
+        width: width of a panel.
+        heights: heights of the panels of a sample.
+        flat: heights of the panels in a row without samples.
+        margin: height for title and legend.
+        title: title of the figure.
+        synthetic: whether the data are generated.
     """
     across = max(least, *rows.values())
     tall = [height for count in rows.values() for height in (heights if count else flat)]
@@ -39,7 +43,7 @@ def sample_sheet(
     for line, (heading, count) in zip(panels.reshape(len(rows), -1, across), rows.items(), strict=True):
         if count:
             line[0, 0].set_ylabel(heading, fontsize=11, weight="bold")
-        else:  # lying, since a flat row has no room for it upright
+        else:  # horizontal text, because a flat row has no room for vertical text
             line[0, 0].text(0, 0.5, f"{heading}: no such sample", ha="left", va="center", color=GREY)
         found += list(line[:, :count].T)
     return figure, found

@@ -18,41 +18,47 @@ from framework.errors import ConfigError, encodable
 from framework.evaluation.significance import RULE, mean, significantly_best
 
 Row = Mapping[str, object]
-"""Names and numbers of one result. "<key>_std" (standard deviation over runs, see `aggregate`) or
-"<key>_sem" (standard error of the mean) is printed behind "<key>" as ±; "synthetic" says whether the data
-were generated."""
+"""Names and numbers of one result.
+
+"<key>_std" (standard deviation over runs, see `aggregate`) or "<key>_sem" (standard error of the mean) is printed
+behind "<key>" as ±. "synthetic" says whether the data were generated.
+"""
 
 Better = Mapping[str, Literal["higher", "lower"]]
-"""Which way a column is better. Its best value stands in bold where it differs significantly from every other one
-(`framework.evaluation.significance`), and so never where a ± is not known."""
+"""Direction in which a column is better.
+
+Its best value is bold if it differs significantly from every other one (`framework.evaluation.significance`), so never
+if a ± is not known.
+"""
 
 COST_COLUMNS = {
     "milliseconds_per_sample": "ms / sample",
     "flops_per_sample": "FLOPs / sample",
     "parameters": "parameters",
 }
-"""What every result table says of cost (framework.evaluation.cost.Cost), with the headings."""
+"""Costs in every result table (framework.evaluation.cost.Cost), with the headings."""
 COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
+"""Direction in which costs are better."""
 NOT_AVAILABLE = "not available"
 NO_BREAK = "\u00a0"
 WIDTH = 100
-"""Characters of a terminal's line that a table should fit into."""
+"""Width of a terminal's line, in characters, that a table should fit into."""
 SPREADS = {"_std": "standard deviation over runs", "_sem": "standard error of the mean"}
+"""Suffixes of the keys of errors, and their meaning."""
 
 
 def results_table(
     rows: Sequence[Row], columns: Mapping[str, str], *, title: str, better: Better | None = None
 ) -> Table:
-    """A table for the terminal.
+    """Return a table for the terminal.
 
-    A line for each row; a column for each where lines would be wider than 100 characters and columns are not
-    wider still.
+    Each row is a line. If lines would be wider than 100 characters, each row is a column, unless that is even wider.
 
     Args:
         rows: one result each.
         columns: the keys to show with their headings, in order; the first names the row.
-        title: above the table; says "synthetic" where all rows are (a column says so where only some are).
-        better: for bold; of one row nothing is best.
+        title: title above the table; it says "synthetic" if all rows are (a column says so if only some are).
+        better: directions for bold; a single row is never best.
     """
     synthetic = [_synthetic(row) for row in rows]
     if rows and all(synthetic) and "synthetic" not in title.lower():
@@ -71,7 +77,7 @@ def results_table(
 
 
 def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
-    """The same as a Markdown table; where any row is synthetic, a column says which."""
+    """Return the table in Markdown; if any row is synthetic, a column says which."""
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     written = [[_escaped(cell) for cell in line] for line in lines]
     rule = ["---", *["---:"] * (len(written[0]) - 1)]
@@ -81,10 +87,12 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
 
 
 def csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
-    """Write the columns under their keys, all digits, errors beside; what is not available is left empty.
+    """Write the columns under their keys, with all digits and with errors beside; missing values are left empty.
 
     Args:
-        columns: the keys, in order; None: all that any row has.
+        rows: one result each.
+        columns: the keys, in order; None: all keys of any row.
+        path: file to write.
     """
     if columns is None:
         columns = dict.fromkeys(key for row in rows for key in row if not key.endswith(tuple(SPREADS)))
@@ -104,18 +112,18 @@ def csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
 
 
 def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> list[dict[str, object]]:
-    """Mean and standard deviation over runs that differ in `over` alone.
+    """Return mean and standard deviation over runs that differ in `over` only.
 
     Args:
         rows: one run each.
-        by: keys that tell the groups apart; synthetic and real results are always told apart.
-        over: the key that tells the runs of a group apart.
+        by: keys that distinguish the groups; synthetic and real results are always in different groups.
+        over: the key that distinguishes the runs of a group.
 
     Returns:
-        A row per group, in order of first appearance: the keys of `by`; of every number "<key>" the mean
-        and, as "<key>_std", the sample standard deviation (NaN for one run); "n", the number of runs; and
-        what else all runs of the group agree on. A number that one of the runs lacks is NaN. A single run
-        keeps its standard errors "<key>_sem"; of several they are left out: their mean means nothing.
+        One row per group, in order of first appearance. It has the keys of `by`; for every number "<key>" the mean and,
+        as "<key>_std", the sample standard deviation (NaN for one run); "n", the number of runs; and every other value
+        that all runs of the group share. A number that one of the runs lacks is NaN. A single run keeps its standard
+        errors "<key>_sem"; for several runs they are left out, because their mean means nothing.
 
     Raises:
         ConfigError: a row lacks a key, or two runs of a group have the same `over`.
@@ -130,10 +138,10 @@ def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> lis
 
 
 def format_number(value: int | float, spread: int | float = math.nan) -> str:
-    """A number to three significant digits, or as its error allows: "1.23 ± 0.04", "22.8 ± 1.0".
+    """Return a number to three significant digits, or as its error allows: "1.23 ± 0.04", "22.8 ± 1.0".
 
-    The error is given to one significant digit, to two where the first is 1. Whole numbers (`int`) are exact
-    below 100,000 and "1.23 M" above. NaN is "not available".
+    The error is given to one significant digit, to two if the first is 1. Whole numbers (`int`) are exact below 100,000
+    and "1.23 M" above. NaN is "not available".
     """
     if math.isnan(value):
         return NOT_AVAILABLE
@@ -148,18 +156,19 @@ def format_number(value: int | float, spread: int | float = math.nan) -> str:
         scale, unit = _unit(size)
         return f"({format_number(value / scale, spread / scale)}) {unit}"
     decimals = -_exponent(spread) + (1 if spread < 1.95 * 10.0 ** _exponent(spread) else 0)
-    if decimals > 5 - _exponent(size):  # beyond six digits of the value the error's size says enough
+    if decimals > 5 - _exponent(size):  # beyond six digits of the value, the size of the error suffices
         return f"{value:.{5 - _exponent(size)}f} ± {spread:.0e}"
     kept = max(decimals, 0)
     return f"{round(value, decimals):.{kept}f} ± {round(spread, decimals):.{kept}f}"
 
 
 def machine(device: object, threads: object) -> str:
-    """Where run times were measured, for people: "cpu (AMD EPYC), 2 threads"."""
+    """Return the machine of a measurement as text: "cpu (AMD EPYC), 2 threads"."""
     return f"{device}, {threads} thread{'' if threads == 1 else 's'}"
 
 
 def _plain(value: int | float) -> str:
+    """Return a number without its error."""
     if isinstance(value, Integral) and abs(value) < 1e15:
         if abs(value) < 1e5:
             return str(value)
@@ -173,18 +182,19 @@ def _plain(value: int | float) -> str:
 
 
 def _unit(value: int | float) -> tuple[float, str]:
-    """The decimal prefix of a large number: 1e3 "k" and so on."""
+    """Return the decimal prefix of a large number, with its factor: 1e3 and "k", and so on."""
     return next(pair for pair in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")) if abs(value) >= pair[0])
 
 
 def _exponent(value: int | float) -> int:
+    """Return the decimal exponent of a number."""
     return math.floor(math.log10(abs(value)))
 
 
 def _lines(
     rows: Sequence[Row], columns: Mapping[str, str], better: Better, *, origin: bool
 ) -> list[list[Text]]:
-    """Headings and cells; `origin` adds a column that says which data are synthetic."""
+    """Return headings and cells; `origin` adds a column that says which data are synthetic."""
     lines = [[Text(_cell(row, key)) for key in columns] for row in rows]
     for index, key in enumerate(columns):
         values = {
@@ -206,6 +216,7 @@ def _lines(
 
 
 def _cell(row: Row, key: str) -> str:
+    """Return the text of a cell."""
     value = row.get(key)
     if value is None:
         return NOT_AVAILABLE
@@ -220,13 +231,13 @@ def _cell(row: Row, key: str) -> str:
 
 
 def _spread(row: Row, key: str) -> float | None:
-    """What stands behind ±."""
+    """Return the number behind ±; None if there is none."""
     spreads = (_number(row.get(key + suffix)) for suffix in SPREADS)
     return next((spread for spread in spreads if spread is not None), None)
 
 
 def _number(value: object) -> float | None:
-    """A number that is one: neither NaN nor a truth value."""
+    """Return a value as float; None if it is not a number, is NaN, or is a truth value."""
     if isinstance(value, bool | np.bool_ | str) or not isinstance(value, SupportsFloat):
         return None
     number = float(value)
@@ -234,6 +245,7 @@ def _number(value: object) -> float | None:
 
 
 def _raw(value: object) -> object:
+    """Return a value for a CSV file."""
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -248,7 +260,7 @@ def _synthetic(row: Row) -> bool:
 
 
 def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Sequence[Text]]) -> str:
-    """Say what ± and bold mean, where the table has them."""
+    """Return the meaning of ± and bold, for those that the table has."""
     spreads = [
         meaning
         for suffix, meaning in SPREADS.items()
@@ -261,7 +273,7 @@ def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Se
 
 
 def _width(lines: Sequence[Sequence[Text]]) -> int:
-    """Characters a table needs when no cell is broken and headings are broken between words."""
+    """Return the width of a table, in characters, if cells are not broken and headings are broken between words."""
     widths = [
         max(map(len, [*_wrapped(head.plain, 0).splitlines(), *_column(lines, index)]), default=0)
         for index, head in enumerate(lines[0])
@@ -274,8 +286,8 @@ def _column(lines: Sequence[Sequence[Text]], index: int) -> list[Text]:
 
 
 def _wrapped(heading: str, width: int) -> str:
-    """Broken into lines between words, as narrow as `width` where the words allow it."""
-    # a lone sign, such as "°" or "/", stays with the word before it
+    """Return a heading broken into lines between words, at most `width` wide if the words allow it."""
+    # A single sign, such as "°" or "/", stays with the word before it.
     words = re.sub(r" (?=[^\w\s]( |$))", NO_BREAK, heading)
     width = max([1, width, *map(len, words.split(" "))])
     return textwrap.fill(words, width, break_on_hyphens=False).replace(NO_BREAK, " ")
@@ -287,6 +299,7 @@ def _escaped(cell: Text) -> str:
 
 
 def _aggregated(members: Sequence[Row], by: Sequence[str], over: str) -> dict[str, object]:
+    """Return the row of a group of runs."""
     first = members[0]
     seen = [member[over] for member in members]
     repeated = [value for index, value in enumerate(seen) if value in seen[:index]]

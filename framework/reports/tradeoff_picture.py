@@ -1,4 +1,7 @@
-"""Error against run time: a panel a metric, a colour a method; curves along a knob, or results side by side."""
+"""Figures of error against run time: one panel per metric, one colour per method.
+
+They show curves along a knob, or single results.
+"""
 
 import math
 import textwrap
@@ -19,21 +22,23 @@ from framework.evaluation.significance import mean
 from framework.figures.style import COLOURS, GREY, MARKERS, titled_figure
 from framework.reports.table import SPREADS, Better, Row
 
-# where a word may stand beside its point, in order of preference, typographical points
+# Offsets of a text from its point, in order of preference, in typographical points.
 SIDES = ((9, 6), (9, -6), (-9, 6), (-9, -6), (0, 13), (0, -13), (12, 15), (12, -15), (-12, 15))
 
 Style = dict[str, Any]
 PARETO: Style = {"ls": "", "marker": "o", "mfc": "none", "markersize": 13, "mec": "black"}
+"""Style of the rings around the points of a front."""
 FRONT = "front"
 """Mark of the lines that ring the points of a front."""
 SHADE = "0.87"
+"""Grey of the area in which errors mean nothing."""
 ACROSS = 3
-"""Panels beside each other, at most."""
+"""Largest number of panels side by side."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Below which number an error means nothing, and what the legend says of that."""
+    """The number below which an error means nothing, and the legend's text about it."""
 
     height: float
     meaning: str
@@ -41,7 +46,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class _Series:
-    """Rows that look alike: those of a method, or of a method in a group."""
+    """Rows that are drawn alike: those of a method, or of a method in a group."""
 
     method: str
     group: str
@@ -62,21 +67,25 @@ def error_against_run_time(
     floors: Mapping[str, Floor] | None = None,
     note: str = "",
 ) -> Figure:
-    """Some numbers of each result against its run time, which is logarithmic; so is an error without negative values.
+    """Draw numbers of each result against its run time.
 
-    Rows of a method that have a "knob" are joined in their order, and the knob's "value" stands beside each point.
-    Bars are a row's "<key>_std" or "<key>_sem". Rings mark the front of `framework.evaluation.pareto`, beyond noise, of
-    each group: errors on different groups do not compare. A panel without standard errors has no rings and says so. On
-    a logarithmic axis 0 sits on the lower edge and says so.
+    The axis of run time is logarithmic, and so is the axis of an error without negative values. Rows of a method that
+    have a "knob" are connected in their order, and the knob's "value" is written beside each point. Bars are a row's
+    "<key>_std" or "<key>_sem". Rings mark the front of each group, beyond noise (`framework.evaluation.pareto`); errors
+    on different groups do not compare. A panel without standard errors has no rings and says so. On a logarithmic axis
+    an error of 0 is drawn on the lower edge and labelled.
 
     Args:
         rows: as for `framework.reports.table`, each with its "method".
         labels: key → label of its axis.
-        better: which way a key is better; "lower" is an error.
-        machine: where the run times were measured, and with how many threads; it stands on every time axis.
-        time, group: keys; without `group` all rows are one. Up to 14 methods and 12 groups look different.
-        floors: of keys; shaded up to there.
-        note: below the picture.
+        better: direction in which a key is better; "lower" is an error.
+        title: title of the figure.
+        synthetic: whether the data are generated.
+        machine: machine and number of threads of the measurement; it is written on every time axis.
+        time: key of the run time.
+        group: key of the group; without it all rows are one group. Up to 14 methods and 12 groups look different.
+        floors: floors by key; the area below is shaded.
+        note: text below the figure.
     """
     across = min(ACROSS, len(labels))
     down = -(-len(labels) // across)
@@ -99,13 +108,14 @@ def error_against_run_time(
             text = f"not drawn for want of a finite error and run time: {left_out}"
             axes.set_title(text, loc="right", fontsize=8, color=GREY)
     _legends(figure, series, group, [floor.meaning for floor in floors.values() if floor.height > 0], note)
-    figure.draw_without_rendering()  # settles the layout, so that places on the page are known
+    figure.draw_without_rendering()  # computes the layout, so that positions on the page are known
     for axes, (notes, lines) in zip(panels, words, strict=False):
         _annotate(axes, notes, lines)
     return figure
 
 
 def _series(rows: Sequence[Row], group: str | None) -> list[_Series]:
+    """Return the rows by method and group, with the style of each series."""
     found: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         kind = "" if group is None else str(row.get(group))
@@ -128,7 +138,11 @@ def _series(rows: Sequence[Row], group: str | None) -> list[_Series]:
 def _panel(
     axes: Axes, series: Sequence[_Series], key: str, time: str, *, lower: bool, floor: Floor | None
 ) -> tuple[list[tuple[Any, ...]], list[np.ndarray]]:
-    """Draw one key; gives the words to stand beside points (x, y, text, colour), and the lines to stand clear of."""
+    """Draw one key.
+
+    Returns:
+        The texts beside points as (x, y, text, colour), and the lines that the texts must not cover.
+    """
     kept = [[row for row in one.rows if _drawable(row, key, time)] for one in series]
     places = [
         np.array([(_value(row, time), _value(row, key)) for row in rows]).reshape(-1, 2) for rows in kept
@@ -144,7 +158,7 @@ def _panel(
         ends = ends[ends > 0] if (ends > 0).any() else np.ones(1)
         low, high = ends.min(), ends.max()
         if floor is not None and floor.height > 0:
-            # a reference known to rounding must not stretch the panel over ten decades
+            # A reference that is exact to rounding must not stretch the panel over ten decades.
             low, high = min(low, max(floor.height, low / 100)), max(high, floor.height)
         room = _room(low, high)
         bottom = low / room
@@ -188,6 +202,7 @@ def _panel(
 def _legends(
     figure: Figure, series: Sequence[_Series], group: str | None, shaded: Sequence[str], note: str
 ) -> None:
+    """Draw the legends of methods, marks and groups."""
     handles: list[Line2D | Patch] = []
     for one in {one.method: one for one in reversed(series)}.values():
         knobs = ", ".join(dict.fromkeys(str(row["knob"]) for row in one.rows if row.get("knob")))
@@ -218,12 +233,12 @@ def _legends(
 
 
 def _room(low: float, high: float) -> float:
-    """Beyond the ends of a logarithmic axis, as a factor; one number alone stands in the middle."""
+    """Return the margin of a logarithmic axis as a factor; a single number is in the middle."""
     return (high / low) ** 0.1 if high > low else 2.0
 
 
 def _plain_ticks(axis: Axis) -> None:
-    """Numbers as people write them, and always some of them, on a logarithmic axis."""
+    """Label a logarithmic axis with plain numbers, and always with some of them."""
     low, high = axis.get_view_interval()
     decades = math.log10(high / low)
     steps = (1.0,) if decades > 3 else (1.0, 2.0, 5.0) if decades > 1.2 else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
@@ -233,7 +248,7 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.ndarray]) -> None:
-    """A word beside each point (x, y, text, colour), on the side where nothing is written or drawn yet."""
+    """Write the text of each point (x, y, text, colour) on the side where nothing is written or drawn yet."""
     pen = axes.figure.dpi / 72  # pixels a point
     edges = [np.zeros((0, 4))]  # left, bottom, right, top of what is drawn, pixels
     for line in lines:
@@ -260,14 +275,17 @@ def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.n
 
 
 def _drawable(row: Row, key: str, time: str) -> bool:
+    """Return whether a row has a finite number and a positive, finite run time."""
     return math.isfinite(_value(row, key)) and 0 < _value(row, time) < math.inf
 
 
 def _value(row: Row, key: str) -> float:
+    """Return the number of a key; NaN if the row has none."""
     value = row.get(key)
     return math.nan if value is None else float(value)  # type: ignore[arg-type]
 
 
 def _spread(row: Row, key: str) -> float:
+    """Return the half-length of a row's bar; 0 if it is not known."""
     spreads = (_value(row, key + suffix) for suffix in SPREADS)
     return next((spread for spread in spreads if math.isfinite(spread)), 0.0)

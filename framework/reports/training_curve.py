@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from framework.figures.style import BLUE, GREEN, RED, titled_figure
 
 FEW = 30
-"""With fewer points each is marked: a line through one is nothing."""
+"""Number of points below which each point is marked, because a line through a single point is invisible."""
 
 
 def training_curve(
@@ -23,12 +23,16 @@ def training_curve(
     synthetic: bool,
     y_label: str = "loss (nats per sample)",
 ) -> Figure:
-    """Training and validation loss over epochs, the epoch of the kept weights marked.
+    """Draw training and validation loss over epochs, and mark the epoch of the kept weights.
 
     Args:
-        epochs, train: where the training loss was recorded, and it.
+        epochs: epochs at which the training loss was recorded.
+        train: training loss at these epochs.
         validation: pairs (epoch, value).
-        best_epoch: whose weights were kept; None where none were.
+        best_epoch: epoch of the kept weights; None if no weights were kept.
+        title: title of the figure.
+        synthetic: whether the data are generated.
+        y_label: label of the axis of losses.
     """
     figure = titled_figure((7.0, 4.3), title, synthetic)
     axes = figure.subplots()
@@ -42,7 +46,7 @@ def training_curve(
         usual = max(abs(low), abs(high), 1e-12)
         if (
             max(abs(value - middle) for value in values) > 30 * usual
-        ):  # one wild epoch must not flatten all others
+        ):  # an epoch with an extreme loss must not flatten all others
             axes.set_yscale("symlog", linthresh=usual)
     if best_epoch is not None:
         axes.axvline(best_epoch, color=GREEN, linestyle="--", label=f"kept weights: epoch {best_epoch:g}")

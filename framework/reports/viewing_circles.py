@@ -1,4 +1,4 @@
-"""Predicted densities on the viewing circle around their images: certain, ambiguous and failed ones."""
+"""Figures of predicted densities on the viewing circle around their images: certain, ambiguous and failed ones."""
 
 import math
 import textwrap
@@ -18,8 +18,9 @@ from framework.reports.sample_sheet import sample_sheet
 LARGE_ERROR = math.pi / 6  # radians; a viewpoint further off counts as wrong (Acc_{π/6} of thesis Table 3.3)
 RING = 0.5  # thickness of the ring that holds the densities, in radii of the viewing circle
 PREDICTED: dict[str, Any] = {"color": RED, "ls": ":", "linewidth": 1.2, "marker": "o", "markersize": 4}
-"""Dotted, so that a narrow density is seen below it."""
+"""Style of a point prediction: dotted, so that a narrow density is visible below it."""
 DEGREES = ("0°", "90°", "180°", "270°")
+"""Labels of the quarters of the circle if directions have no words."""
 
 
 def choose(
@@ -28,15 +29,16 @@ def choose(
     log_density: Float[np.ndarray, "points samples"],
     count: int = 4,
 ) -> dict[str, list[int]]:
-    """Up to `count` samples for each row of Figure 3.6; the same arguments give the same samples.
+    """Return up to `count` samples for each row of Figure 3.6; the same arguments give the same samples.
 
-    "certain": one peak, entropy at most the median, error at most π/6; "ambiguous": several peaks; "failed":
-    as certain, but with a larger error, a confident mistake. Of each kind those of lowest entropy.
+    "certain": one peak, entropy at most the median, error at most π/6. "ambiguous": several peaks. "failed": as
+    "certain", but with a larger error, so a confident mistake. Each row holds its samples of lowest entropy.
 
     Args:
-        entropy: of each density, nats.
+        entropy: entropy of each density, nats.
         error: absolute angular deviation of each point prediction, radians.
-        log_density: on a regular grid over the whole circle.
+        log_density: log-density on a regular grid over the whole circle.
+        count: largest number of samples per row.
 
     Raises:
         ValueError: a number is NaN.
@@ -54,14 +56,14 @@ def choose(
 
 
 def peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
-    """How many separate arcs of the circle have more than a quarter of the highest density, (samples,)."""
+    """Return how many separate arcs of the circle have more than a quarter of the highest density, (samples,)."""
     high = log_density > log_density.max(0) - math.log(4)
     starts = (high & ~np.roll(high, 1, axis=0)).sum(0)
-    return np.maximum(starts, 1)  # an arc that is the whole circle starts nowhere
+    return np.maximum(starts, 1)  # an arc that is the whole circle has no start
 
 
 def scale(peak: float) -> float:
-    """What the outer circle stands for, per radian: 1.5, 3, 6, 15, 30, ..., the first not below the peak."""
+    """Return the density of the outer circle, per radian: the first of 1.5, 3, 6, 15, 30, ... not below the peak."""
     steps = (step * 10.0**power for power in range(308) for step in (1.5, 3.0, 6.0))
     return next(step for step in steps if step >= peak)
 
@@ -80,19 +82,24 @@ def viewing_circles(
     synthetic: bool,
     directions: Sequence[str] = (),
 ) -> Figure:
-    """Predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6.
+    """Draw predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6.
 
-    Angle 0 is at the bottom, angles turn counter-clockwise. A density is a band outside the circle, as thick as the
-    density is high; it ends within an outer circle, which stands for the density that is written beside it.
+    Angle 0 is at the bottom, and angles run counter-clockwise. A density is a band outside the circle; its thickness is
+    the density. It ends within an outer circle, which represents the density that is written beside it.
 
     Args:
-        images: of the samples, as `Data.picture` gives them.
-        log_density: nats, at `angles`, a regular grid over the whole circle, radians.
-        truths, predictions: radians; NaN where there is no true direction, which is not drawn.
-        captions: below each panel.
-        modes: for each sample all angles that are as true as its truth (of a symmetric object), radians.
-        rows: heading of each row, and how many of the samples stand in it, in their order; may be 0.
-        directions: words for 0°, 90°, 180° and 270° from which an object is seen; without them these angles.
+        images: images of the samples, as `Data.picture` gives them.
+        log_density: nats, at `angles`.
+        angles: a regular grid over the whole circle, radians.
+        truths: true angles, radians; NaN if there is no true direction, which is then not drawn.
+        predictions: point predictions, radians.
+        captions: text below each panel.
+        modes: for each sample all angles that are equally true, for a symmetric object, radians.
+        rows: heading of each row, and its number of samples in their order; may be 0.
+        title: title of the figure.
+        synthetic: whether the data are generated.
+        directions: words for the directions 0°, 90°, 180° and 270° from which an object is seen; without them the
+            angles are written.
     """
     lengths = (log_density.shape[1], sum(rows.values()), len(images), len(captions))
     if len(set(lengths)) != 1:
@@ -130,8 +137,9 @@ def viewing_circles(
 def _viewing_circle(
     axes: Axes, image: np.ndarray, density: np.ndarray, angles: np.ndarray, words: Sequence[str]
 ) -> None:
+    """Draw an image and the density around it."""
     height, width = image.shape[:2]
-    # corners stay inside the circle, and the sides leave room for the words
+    # The corners of the image stay inside the circle, and its sides leave room for the words.
     half = min(0.96 / math.hypot(height, width), 0.72 / max(height, width))
     axes.imshow(image, extent=(-half * width, half * width, -half * height, half * height))
     limit = 1 + RING + 0.2
@@ -140,7 +148,7 @@ def _viewing_circle(
     around, value = np.append(angles, angles[0]), np.append(density, density[0])
     band = np.append(1 + RING * value / outer, np.ones_like(value))
     axes.fill(*_position(np.append(around, around[::-1]), band), color=BLUE, alpha=0.6, linewidth=0)
-    # a single angle has no area, but a line
+    # A density at a single angle has no area, but a line shows it.
     axes.plot(*_position(around, 1 + RING * value / outer), color=BLUE, linewidth=0.6)
     axes.text(limit, 1.3, f"{outer:g} per rad", fontsize=6.5, color=GREY, ha="right", va="bottom")
     for radius, line in ((1.0, "-"), (1 + RING, "-"), (1 + RING / (2 * math.pi * outer), ":")):
@@ -153,6 +161,7 @@ def _viewing_circle(
 
 
 def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] | np.ndarray) -> None:
+    """Mark the true angle, the equally true ones, and the point prediction."""
     for angle, face in (*((mode, "none") for mode in modes), (truth, GREEN)):
         if math.isnan(angle):
             continue
@@ -164,5 +173,5 @@ def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] |
 
 
 def _position(angle: Any, radius: Any) -> tuple[Any, Any]:
-    """Where an angle (radians) is drawn: 0 at the bottom, counter-clockwise."""
+    """Return the position of an angle (radians) on a circle: 0 at the bottom, counter-clockwise."""
     return radius * np.sin(angle), -radius * np.cos(angle)
