@@ -1,1 +1,1 @@
-"""Densities over black and white images: how likely each pixel is white."""
+"""Densities over black and white images, with the probability of each pixel to be white."""

@@ -23,10 +23,10 @@ from framework.geometry.light import light_of
 
 
 class BernoulliImage(Distribution):
-    """Every number of an image is 1 with a probability of its own, else 0, independent of one another.
+    """Independent numbers of an image, each 1 with its own probability and otherwise 0.
 
     log p is y log σ(r) + (1 - y) log σ(-r). A value y between 0 and 1 is the share of a pixel that is 1, and log p the
-    mean over its parts; beyond, it is cut off.
+    mean over its parts; values beyond are clamped.
 
     Args:
         logits: r, (*batch, height, width, number), log-odds of 1.
@@ -56,7 +56,7 @@ class BernoulliImage(Distribution):
         return self.logits.sigmoid() * (-self.logits).sigmoid()
 
     def each_log_prob(self, value: Tensor) -> Tensor:
-        """Of every number by itself, nats."""
+        """Return the log-probability of every number on its own, nats."""
         share = value.clamp(0, 1)
         return share * logsigmoid(self.logits) + (1 - share) * logsigmoid(-self.logits)
 
@@ -100,7 +100,7 @@ def _(density: BernoulliImage, temperature: Tensor) -> BernoulliImage:
 
 @images.register
 def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
-    """As "color" the light of the probabilities; as "mask" where a single number is rather 1."""
+    """Return the probabilities in linear RGB as "color", and as "mask" the pixels whose number is at least as likely 1."""
     if (
         not channels
         or not set(channels) <= {"color", "mask"}

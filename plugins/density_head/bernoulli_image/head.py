@@ -1,4 +1,4 @@
-"""The Bernoulli image head: how likely each number of an image is 1 and not 0."""
+"""The Bernoulli image head: the probability that each number of an image is 1 and not 0."""
 
 import math
 from collections.abc import Mapping
@@ -16,19 +16,22 @@ from framework.target import Target
 from plugins.density_head.bernoulli_image.density import BernoulliImage
 
 SMALLEST = 1e-3
-"""Probabilities lie between this and 1 less this: what is wrong costs 7 nats a number at most, before calibration. A
-step of 8 bits is 4e-3: smaller ones say nothing about a picture."""
+"""Smallest probability; the largest is 1 less this.
+
+An error therefore costs at most 7 nats a number, before calibration. A step of 8 bits is 4e-3: smaller probabilities
+carry no information about an image.
+"""
 LEAST, MOST, ROUNDS = 1e-2, 1e2, 60
-"""Of the factor of log-odds, and halvings of the interval in which it is sought."""
+"""Bounds on the factor of log-odds, and number of halvings of the interval in which it is searched."""
 
 
 class BernoulliImageHead(DensityHead):
-    """Bernoulli densities over the numbers of an image (`BernoulliImage`); it reads what an encoder paints on white.
+    """Bernoulli densities over the numbers of an image (`BernoulliImage`), read from an image on white ground.
 
-    Features are (channel, height, width), one channel for each of the target's: 1, the white of the empty ground, where
-    the number is surely 0, and 0, black, where it is surely 1; what lies beyond is cut off. The loss is the
-    cross-entropy, nats a number, so that it does not grow with the image. One factor of all log-odds is fitted to the
-    validation split (Guo et al. 2017, its inverse).
+    Features are (channel, height, width), one channel for each of the target's. 1 is the white of the empty ground,
+    where the number is certainly 0; 0 is black, where it is certainly 1; values beyond are clamped. The loss is the
+    cross-entropy in nats per number, so that it does not grow with the image. One factor of all log-odds is fitted to
+    the validation split (Guo et al. 2017, its inverse).
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -56,12 +59,12 @@ class BernoulliImageHead(DensityHead):
         return BernoulliImage(logits * self.factor.to(logits))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        # before what calibrate fits: it is the same loss whenever it is asked
+        # without the calibrated factor, so that the loss does not change with calibration
         return -BernoulliImage(self._logits(raw)).each_log_prob(target).mean((-3, -2, -1))
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        # the log-likelihood is concave in the factor, so that its slope is 0 once
+        # the log-likelihood is concave in the factor, so that its derivative has a single zero
         if len(raw) == 0:
             raise ValueError("the factor of log-odds is fitted to validation data, but got none of it.")
         low, high = math.log(LEAST), math.log(MOST)
@@ -72,7 +75,7 @@ class BernoulliImageHead(DensityHead):
         self.factor.fill_(math.exp((low + high) / 2))
 
     def _slope(self, raw: Tensor, target: Tensor, factor: float) -> float:
-        """Of the log-likelihood in the factor f: Σ r (y - σ(f r)), image by image."""
+        """Return the derivative of the log-likelihood in the factor f, Σ r (y - σ(f r)), computed image by image."""
         total = 0.0
         for one, value in zip(raw, target, strict=True):
             logits = self._logits(one).double()
@@ -81,5 +84,5 @@ class BernoulliImageHead(DensityHead):
 
     def _logits(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch height width number"]:
         image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
-        # log((1 - w) / w) of white w; in float64: near 1 a float32 has no digits of what is missing
+        # log((1 - w) / w) of white w; in float64, since near 1 a float32 has too few digits of 1 - w
         return -hardtanh(image.double(), SMALLEST, 1 - SMALLEST).logit().to(image.dtype)

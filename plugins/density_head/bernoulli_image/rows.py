@@ -15,7 +15,7 @@ WHITE = (-1e30, 0.0, 1e-7, 0.0625, 0.25, 0.5, 0.875, 0.9990234375, 1.0, 3.0)
 
 
 def bernoulli(head: DensityHead) -> Iterator[Case]:
-    """Σ log w where the number is 0, Σ log(1 - w) where it is 1, white w within its bounds."""
+    """Yield cases with Σ log w where the number is 0, Σ log(1 - w) where it is 1, and white w within its bounds."""
     for given in WHITE:
         raw = torch.full((2, head.size), given, dtype=torch.float64)
         with mpmath.workdps(50):

@@ -15,7 +15,7 @@ LOGITS = ((0.0, 0.0), (1e-8, 0.0), (3.0, -2.0), (50.0, -50.0), (1e4, -1e4), (-1e
 
 
 def exact(logits: list[float], label: int) -> float:
-    """l_k - log Σ exp l_j; 50 digits do not suffice where exponents differ by thousands."""
+    """Return l_k - log Σ exp l_j, less the largest logit: 50 digits are too few if exponents differ by thousands."""
     with mpmath.workdps(50):
         largest = max(logits)
         total = mpmath.fsum(mpmath.e ** (mpmath.mpf(logit) - largest) for logit in logits)
@@ -23,7 +23,7 @@ def exact(logits: list[float], label: int) -> float:
 
 
 def softmax(head: DensityHead) -> Iterator[Case]:
-    """Two logits that differ, the others equal to the second."""
+    """Yield cases with two logits that differ; the others equal the second."""
     for first, second in LOGITS:
         raw = torch.tensor([first] + [second] * (head.size - 1), dtype=torch.float32).double()
         value = torch.arange(head.size)
@@ -34,7 +34,7 @@ def softmax(head: DensityHead) -> Iterator[Case]:
 
 
 def logistic(head: DensityHead) -> Iterator[Case]:
-    """-log(1 + exp(∓r)) (eq. 2.10-2.11)."""
+    """Yield cases with -log(1 + exp(∓r)) (eq. 2.10-2.11)."""
     for raw in (0.0, 1e-8, -2.0, 40.0, -700.0, 1e4, 1e30):
         number = torch.tensor(raw, dtype=torch.float32).double()
         log_prob = [exact([0.0, number.item()], label) for label in (0, 1)]

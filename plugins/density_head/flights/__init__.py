@@ -1,1 +1,1 @@
-"""Densities of where a ball will be: by its differential equation, and frame by frame by a recurrent network."""
+"""Densities of the future positions of a ball: by its differential equation, and by a recurrent network."""

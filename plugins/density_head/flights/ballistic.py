@@ -1,4 +1,4 @@
-"""The physics as a density head: the state from what was seen, its flight, and how sure either is."""
+"""Physics as a density head: the state of a ball from its frames, its flight, and the uncertainty of both."""
 
 import math
 from collections.abc import Mapping
@@ -24,34 +24,35 @@ from framework.target import Target
 from plugins.density_head.flights.identification import bounds_of, found_of, identified, with_found
 
 WINDOWS = 32
-"""From which `fit` finds the constants at most, evenly chosen."""
+"""Largest number of windows from which `fit` identifies the constants, evenly spaced."""
 LEAST_NOISE, MOST_NOISE = 1e-4, 1.0
-"""Metres."""
+"""Bounds of the noise, metres."""
 SPREAD = (0.1, 1e3)
-"""Least and most of the factors that `calibrate` finds."""
+"""Smallest and largest factor that `calibrate` fits."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class BallisticHead(DensityHead, Fitted):
     """A ball's flight by its differential equation (thesis §4.2, "physics-based"; Mülling et al. 2011).
 
-    Position, velocity and spin at the first frame come from the frames by robust least squares, and the equation is
-    integrated to the times asked for, through a bounce where there is one. `fit` finds the constants of ball and table,
-    and the noise, that make whole training windows likeliest; `calibrate` a factor for the spread of each number.
+    Position, velocity and spin at the first frame are estimated from the frames by robust least squares. The equation
+    is integrated to the requested times, through a bounce if there is one. `fit` identifies the constants of ball and
+    table, and the noise, that make whole training windows most likely. `calibrate` fits a factor for the spread of each
+    number.
 
-    The density is that of the state, N(found, (JᵀJ)⁻¹), carried to the future: `linearised`, a normal density, or
-    `sampled`, a mixture of as many flights as there are samples, which can go to either side of a table's edge.
-    Input and target are in metres; no gradient is given.
+    The density is that of the state, N(estimate, (JᵀJ)⁻¹), propagated to the future. `linearised` is a normal density;
+    `sampled` is a mixture of as many flights as there are samples, which can go to either side of a table's edge. Input
+    and target are in metres; the head has no gradient.
 
     Args:
-        observed, step: of the data.
-        density: how the state's uncertainty is carried.
-        samples: flights of the mixture; may be set at any time.
-        spin: standard deviation believed of each component of the spin, rad/s.
-        noise: of a coordinate, m; what `fit` starts from.
-        steps: most steps of the search for a state; real flights take some ten.
-        identify: whether `fit` finds the constants, or those of the config are believed.
-        constants: of the ball and the table; what `fit` starts from.
+        observed, step: as of the data.
+        density: method by which the state's uncertainty is propagated.
+        samples: number of flights of the mixture; may be set at any time.
+        spin: prior standard deviation of each component of the spin, rad/s.
+        noise: standard deviation of a coordinate, m; initial value of `fit`.
+        steps: largest number of steps of the search for a state; real flights take about ten.
+        identify: whether `fit` identifies the constants; otherwise those of the config are used.
+        constants: constants of the ball and the table; initial values of `fit`.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 3, 10, 30, 100)}
@@ -102,12 +103,12 @@ class BallisticHead(DensityHead, Fitted):
 
     @property
     def constants(self) -> Constants:
-        """Those of the config, with what `fit` found."""
+        """Constants of the config, with the values that `fit` found."""
         return with_found(self.given, self.found)
 
     @torch.no_grad()
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
-        """Constants and noise that make whole windows likeliest (identification.py)."""
+        """Fit constants and noise that make whole windows most likely (identification.py)."""
         chosen = torch.linspace(0, len(features) - 1, min(WINDOWS, len(features))).round().long()
         seen = seen_of(features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
         after = self._after(seen)
@@ -135,7 +136,7 @@ class BallisticHead(DensityHead, Fitted):
         seen = seen_of(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
         estimate = estimated(seen, self.constants, float(self.noise), self.prior, most=self.steps)
         build = self._linearised if self.density == "linearised" else self._sampled
-        # no gradient is claimed: a search ends where it ends
+        # The gradient is 0: the search is not differentiated.
         return build(seen, estimate, raw, (raw * 0).sum(-1, keepdim=True))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
@@ -143,7 +144,7 @@ class BallisticHead(DensityHead, Fitted):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """The variance of each number by the factor that makes its squared residuals what they are."""
+        """Fit a factor of each number's standard deviation, so that its variance equals the mean squared residual."""
         self.spread.fill_(1.0)
         seen = seen_of(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
         estimate = estimated(seen, self.constants, float(self.noise), self.prior, most=self.steps)
@@ -151,7 +152,8 @@ class BallisticHead(DensityHead, Fitted):
         variance = factor.square().sum(-1) + float(self.noise) ** 2
         ratio = (target.double().cpu() - mean).square() / variance
         if len(ratio):
-            # a count of squares has a relative error √(2/n); of few windows the factor of all counts with
+            # A mean of n squares has a relative error of √(2/n). With few windows the common factor of all numbers is
+            # weighted in.
             weight = len(ratio) / (len(ratio) + 20)
             self.spread.copy_((weight * ratio.mean(0) + (1 - weight) * ratio.mean()).sqrt().clamp(*SPREAD))
 
@@ -163,17 +165,17 @@ class BallisticHead(DensityHead, Fitted):
         return torch.cat([seen.times, self._after(seen)], 1)
 
     def _carried(self, seen: Seen, estimate: Estimate) -> tuple[Tensor, Tensor]:
-        """Mean of the future (flight, number), and a factor F of its covariance F Fᵀ (flight, number, 9)."""
+        """Return the mean of the future (flight, number), and a factor F of its covariance F Fᵀ (flight, number, 9)."""
         places, slopes = flown_with_slopes(estimate.state, self._whole(seen), self.constants)
         mean = places[:, -self.future :].flatten(1)
         self._require_course(mean, estimate)
         return mean, slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)
 
     def _require_course(self, places: Tensor, estimate: Estimate) -> None:
-        """Refuse flights without a finite course: constants of physics far from any ball's lead there.
+        """Require flights with a finite course; implausible physical constants lead to infinite ones.
 
         Raises:
-            NonFiniteAnswer: names the first such row.
+            NonFiniteAnswer: the message names the first such row.
         """
         finite = estimate.covariance.flatten(1).isfinite().all(-1) & places.flatten(1).isfinite().all(-1)
         if not finite.all():
@@ -201,7 +203,7 @@ class BallisticHead(DensityHead, Fitted):
 
     def _sampled(self, seen: Seen, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
         count, flights = self.samples, len(estimate.state)
-        # the same points whenever asked: the density is one, and no estimate of one
+        # the same points at every call, so that the density is a fixed function and no random estimate
         points = torch.quasirandom.SobolEngine(9, scramble=True, seed=0).draw(count, dtype=torch.float64)
         noise = torch.special.ndtri(points.clamp(1e-9, 1 - 1e-9))
         self._require_course(estimate.state, estimate)

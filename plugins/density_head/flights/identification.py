@@ -1,4 +1,4 @@
-"""What a ball and a table are like, from flights: constants and the states of all flights at once."""
+"""Identification of the constants of a ball and a table from flights, together with the states of all flights."""
 
 from dataclasses import asdict, replace
 
@@ -11,29 +11,29 @@ from framework.flights.physics import Constants
 from framework.flights.trajectories import flown, flown_with_slopes
 
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
-"""Constants that are found."""
+"""Names of the constants that are identified."""
 LOW, HIGH = (0.0, -0.02, 0.3, 0.0, -0.3), (1.0, 0.02, 1.0, 1.0, 0.3)
-"""Their bounds; the surface within so many metres of where the config says it is."""
+"""Bounds of the constants; those of the surface are metres from its value in the config."""
 SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
-"""Of steps that are worth while, one of each constant."""
+"""Typical step size of each constant."""
 ROUNDS = 40
-"""Most steps."""
+"""Largest number of steps."""
 ENOUGH = 3e-4
-"""Share of the cost; two steps in a row that save less end the search. Of 32 windows it is less than half a nat."""
+"""Share of the cost; the search ends after two steps in a row that save less. For 32 windows it is under half a nat."""
 
 
 def with_found(constants: Constants, numbers: Float[Tensor, "constant"]) -> Constants:
-    """The constants with `FITTED` replaced."""
+    """Return the constants with `FITTED` replaced."""
     return replace(constants, **dict(zip(FITTED, numbers.tolist(), strict=True)))
 
 
 def found_of(constants: Constants) -> Float[Tensor, "constant"]:
-    """Those of `FITTED`."""
+    """Return the values of the constants `FITTED`."""
     return torch.tensor([asdict(constants)[name] for name in FITTED], dtype=torch.float64)
 
 
 def bounds_of(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
-    """Least and most of those of `FITTED` that may be stored: what `identified` may find, or these of the config."""
+    """Return bounds of stored values of `FITTED`: the range of `identified`, extended to the config's values."""
     given = found_of(constants)
     middle = torch.zeros_like(given)
     middle[-1] = given[-1]
@@ -44,15 +44,18 @@ def bounds_of(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Te
 def identified(
     seen: Seen, given: Constants, states: Float[Tensor, "flight 9"], noise: float, prior: Prior
 ) -> tuple[Float[Tensor, "constant"], Float[Tensor, "flight 9"]]:
-    """The constants `FITTED` and the states that fit best, by Levenberg and Marquardt's method.
+    """Return the constants `FITTED` and the states that fit best, by Levenberg and Marquardt's method.
 
-    A flight's state touches no other's residuals: each is eliminated by itself, and what is left is a system of as many
-    equations as there are constants (Schur's complement, as in bundle adjustment: Triggs et al. 2000, §6.1).
+    A flight's state affects no other flight's residuals. So each state is eliminated on its own, and the remaining
+    system has as many equations as there are constants (Schur's complement, as in bundle adjustment: Triggs et al.
+    2000, §6.1).
 
     Args:
         seen: whole flights, from before the window to after it.
-        states: at the first frames, what the search starts from.
+        given: initial constants.
+        states: states at the first frames, from which the search starts.
         noise: standard deviation of each coordinate, m.
+        prior: prior of the states.
     """
     numbers = found_of(given)
     middle = torch.tensor([0.0, 0.0, 0.0, 0.0, given.surface], dtype=torch.float64)
@@ -76,7 +79,7 @@ def identified(
             bent, steep = bent.nan_to_num(0.0).flatten(1), steep.nan_to_num(0.0).unsqueeze(-1) / noise
             shifts = torch.diag(sizes / 1000)
             turn = [(paths(numbers + one, states) - places) / 1e-3 for one in shifts]
-            # one unit is that of the prior, and that of SIZES
+            # states are in units of the prior, constants in units of SIZES
             by_state = (steep * slopes).flatten(1, 2) * prior.scale
             by_constant = (steep * torch.stack(turn, -1)).flatten(1, 2)
             pull = (by_state.mT @ bent.unsqueeze(-1)).squeeze(-1) + states / prior.scale
@@ -109,9 +112,9 @@ def _step(
     damping: float,
     held: Tensor,
 ) -> tuple[Float[Tensor, "flight 9"], Float[Tensor, "constant"]]:
-    """Steps of states and constants that solve the damped normal equations; those that are held stay."""
+    """Return steps of states and constants that solve the damped normal equations; constants at a bound stay."""
     own = own + damping * torch.diag_embed(own.diagonal(dim1=-2, dim2=-1))
-    # of a constant that nothing says anything about the diagonal is 0
+    # the diagonal is 0 for a constant that no residual depends on
     whole = whole + torch.diag(damping * whole.diagonal() + 1e-9 + 1e12 * held)
     factor = torch.linalg.cholesky(own)
     solved = torch.cholesky_solve(torch.cat([both, pull.unsqueeze(-1)], -1), factor)

@@ -1,4 +1,4 @@
-"""A recurrent network that predicts a flight frame by frame, each from the one that it predicted before."""
+"""A recurrent network that predicts a flight frame by frame, each from its previous prediction."""
 
 import math
 from collections.abc import Mapping
@@ -17,20 +17,21 @@ from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FARTHEST = 100.0
-"""Metres, or seconds; numbers that are read are cut off here."""
+"""Bound, metres or seconds, to which the inputs are clamped."""
 LEAST, WIDEST = 1e-4, 1e3
-"""Standard deviations, metres."""
+"""Smallest and largest standard deviation, metres."""
 
 
 class LSTMHead(DensityHead):
-    """LSTM over the frames that were seen, and on over those to come (Hochreiter & Schmidhuber 1997; thesis [121]).
+    """LSTM over the observed frames, continued over the future ones (Hochreiter & Schmidhuber 1997; thesis [121]).
 
-    At each frame the network says how far the ball moves until the next, and how sure that is; where the next frame is
-    missing, or is to come, the place it said is read in its stead. So errors add up with time, which is what it is here
-    to show. A frame's coordinates are independent normals; it is trained by their likelihood.
+    At each frame the network predicts the ball's displacement to the next frame, and its standard deviation. If the
+    next frame is missing or in the future, the predicted position is read in its place. So errors accumulate with time,
+    which this head is meant to show. A frame's coordinates are independent normals; the head is trained by their
+    likelihood.
 
     Args:
-        observed: frames of an input, as the data says.
+        observed: number of frames of an input, as in the data.
         hidden: width of the network.
     """
 
@@ -58,7 +59,7 @@ class LSTMHead(DensityHead):
         self.future = future_frames(target.names, by="density_head lstm")
         self.observed = observed
         self.size = observed * len(PARTS)
-        self.cell = nn.LSTMCell(7, hidden)  # place, last move, and whether it was seen
+        self.cell = nn.LSTMCell(7, hidden)  # position, last displacement, and whether the ball was seen
         self.out = nn.Linear(hidden, 6)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
@@ -76,7 +77,7 @@ class LSTMHead(DensityHead):
             there = (frame[:, 4:] > 0.5).to(frames.dtype)
             expected = place + move
             now = torch.where(there > 0, frame[:, 1:4], expected)
-            # of the first frame that is seen no move is known
+            # the first frame that is seen has no known displacement
             moved = begun * (now - place)
             begun = torch.maximum(begun, there)
             place = begun * now
@@ -97,10 +98,10 @@ class LSTMHead(DensityHead):
     def _next(
         self, place: Tensor, move: Tensor, there: Tensor, state: tuple[Tensor, Tensor] | None
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """The next move (batch, 3), its width, and the network's state."""
+        """Return the next displacement (batch, 3), its standard deviation, and the network's state."""
         hidden, memory = self.cell(torch.cat([place, 10 * move, there], -1), state)
         numbers = self.out(hidden)
-        # a frame's move is a tenth of a metre; the ball goes on as it did, and the network says what changes
+        # a frame's displacement is about a tenth of a metre; the network predicts the change of the last displacement
         width = (0.05 * nn.functional.softplus(numbers[:, 3:])).clamp(max=WIDEST) + LEAST
         return move + 0.1 * numbers[:, :3], width, (hidden, memory)
 

@@ -1,4 +1,4 @@
-"""Rows of the contract: a ball's places at the next two frames, from the last four."""
+"""Rows of the contract: a ball's positions at the next two frames, from the last four."""
 
 from framework.testing.flights import TWO_FRAMES
 from framework.testing.rows import HeadRow
@@ -9,7 +9,7 @@ ROWS = {
         HeadRow(
             density,
             TWO_FRAMES,
-            # constants are found in test_flight_heads.py; of nonsense it takes a second each time
+            # test_flight_heads.py identifies constants; from random numbers it takes a second each time
             {"observed": 4, "density": density, "steps": 6, "identify": False},
             leave_out={"loss gradient": NOT_SMOOTH},
         )

@@ -1,1 +1,1 @@
-"""Densities over images: a colour for each pixel, and how far off it may be."""
+"""Densities over images: a colour for each pixel, and the scale of its error."""

@@ -23,13 +23,13 @@ from framework.geometry.light import light_of
 
 
 class LaplaceImage(Distribution):
-    """A Laplace density of every number of an image, independent of one another: log p is -|y - μ|/b - log 2b.
+    """Independent Laplace densities of the numbers of an image: log p is -|y - μ|/b - log 2b.
 
-    So the L1 distance of images is the negative log-likelihood of one b for all, up to a factor and a constant.
+    With one b for all numbers, the negative log-likelihood is the L1 distance of images, up to a factor and a constant.
 
     Args:
         location: μ, (*batch, height, width, number), in numbers as files hold them (sRGB).
-        scale: b > 0, broadcastable to it.
+        scale: b > 0, broadcastable to `location`.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -60,7 +60,7 @@ class LaplaceImage(Distribution):
         return 2 * self.scale.square()
 
     def each_log_prob(self, value: Tensor) -> Tensor:
-        """Of every number by itself, nats."""
+        """Return the log-density of every number on its own, nats."""
         return -((value - self.location).abs() / self.scale + (2 * self.scale).log())
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ estimate.register(LaplaceImage, exactly)
 
 @median.register
 def _(density: LaplaceImage, samples: int) -> Tensor:
-    # each number is symmetric about its location
+    # the density of each number is symmetric around its location
     return density.location
 
 

@@ -1,4 +1,4 @@
-"""The Laplace image head: an image, and how far off each of its numbers may be."""
+"""The Laplace image head: an image, and the scale of the error of each of its numbers."""
 
 import math
 from collections.abc import Mapping
@@ -17,36 +17,38 @@ from framework.target import Target
 from plugins.density_head.laplace_image.density import LaplaceImage
 
 FURTHEST = 1e6
-"""Locations are cut off here, so that no sum over an image overflows."""
+"""Bound to which locations are clamped, so that no sum over an image overflows."""
 SMALLEST_SCALE, LARGEST_SCALE = 1e-4, 1e6
-"""A step of 8 bits is 4e-3: no scale below a fortieth of it says anything about a stored picture."""
+"""Bounds on scales. A step of 8 bits is 4e-3: a scale below a fortieth of it carries no information."""
 WHITE = 1 - 0.5 / 255
-"""What lies above is stored as 1: no bit that is lost between light and numbers makes white ground a foreground."""
+"""Value above which a number is stored as 1: rounding of white between linear RGB and sRGB makes no foreground."""
 
 
 class LaplaceImageHead(DensityHead):
-    """Laplace densities over the numbers of an image (`LaplaceImage`); it reads an image as an encoder gives it.
+    """Laplace densities over the numbers of an image (`LaplaceImage`), read from an image of an encoder.
 
     Features are (channel, height, width): first the image, one channel for each of the target's, then log-scales. The
-    loss is the mean over the numbers of an image, nats a number, so that it does not grow with the image; with one
+    loss is the mean over the numbers of an image, in nats per number, so that it does not grow with the image. With one
     fixed scale it is the L1 distance and a constant.
 
     Args:
         scale: "fixed": one b for all images and pixels, 1 in training, fitted to the validation split; "pixel": one
-            predicted for each pixel, "number": for each number, trained by likelihood and multiplied by one factor
-            that is fitted to the validation split.
-        cover: the mass of central intervals that the factor is fitted to: as many of the validation split's numbers in
-            pixels that are not white lie in theirs (split conformal prediction). null: the likeliest factor, of all
-            pixels. Of scales for each pixel that is a bad one: three quarters of a picture of a person are a background
-            whose errors are far smaller than any useful scale, and the factor makes the person's too small with them.
-        balance: β of Seitzer et al. 2022: of each number the gradient, not the loss, is multiplied by its scale to this
-            power. By likelihood alone, 0, a location is learned the slower the wider its scale: where errors are large
-            they stay so. At 1 all locations are learned as by the L1 distance.
-        floor: added to every predicted scale. Files hold steps of 8 bits, and where a picture is exactly white the
-            likelihood would be the higher the narrower, until one wrong pixel outweighs a whole picture: half a step,
-            0.002, ends that.
-        foreground: how much more a pixel counts in the loss where the true image is not white (1 in all channels, as
-            8 bits store it): most of a picture of a person is background, and white everywhere is a good first answer.
+            predicted for each pixel, "number": for each number. Predicted scales are trained by likelihood and
+            multiplied by one factor that is fitted to the validation split.
+        cover: mass of the central intervals that the factor is fitted to: this share of the validation split's numbers,
+            in pixels that are not white, lies in their intervals (split conformal prediction). null: the most likely
+            factor, of all pixels. For scales of each pixel that factor is a bad one: three quarters of an image of a
+            person are a background with errors far smaller than any useful scale, and the factor makes the person's
+            scales too small with them.
+        balance: β of Seitzer et al. 2022: the gradient of each number, not the loss, is multiplied by its scale to this
+            power. By likelihood alone (0) a location is learned more slowly if its scale is wider, so that large errors
+            persist. At 1 all locations are learned as by the L1 distance.
+        floor: constant that is added to every predicted scale. Files hold steps of 8 bits. Where an image is exactly
+            white the likelihood would grow as the scale shrinks, until one wrong pixel outweighs a whole image. Half a
+            step, 0.002, prevents that.
+        foreground: weight in the loss of pixels where the true image is not white (1 in all channels, as 8 bits store
+            it), relative to white ones. Most of an image of a person is background, and white everywhere is a good
+            first prediction.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -94,7 +96,7 @@ class LaplaceImageHead(DensityHead):
         return LaplaceImage(location, (scale * self.factor.to(scale)).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        # before what calibrate fits: it is the same loss whenever it is asked
+        # without the calibrated factor, so that the loss does not change with calibration
         density = LaplaceImage(*self._parts(raw))
         each = -density.each_log_prob(target)
         if self.balance:
@@ -129,7 +131,7 @@ class LaplaceImageHead(DensityHead):
         self.factor.copy_(torch.as_tensor(found).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
     def _parts(self, raw: Float[Tensor, "*batch size"]) -> tuple[Tensor, Tensor]:
-        """Locations (*batch, height, width, number) and scales, broadcastable, before calibration."""
+        """Return locations (*batch, height, width, number) and scales, broadcastable, before calibration."""
         image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
         location = hardtanh(image[..., : self.numbers], -FURTHEST, FURTHEST)
         if not self.scales:
@@ -139,5 +141,5 @@ class LaplaceImageHead(DensityHead):
 
 
 def coloured(image: Float[Tensor, "*batch number"]) -> Bool[Tensor, "*batch 1"]:
-    """Which pixels are not white once they are stored."""
+    """Return which pixels are not white once they are stored."""
     return (image < WHITE).any(-1, keepdim=True)

@@ -15,7 +15,7 @@ OFFSETS = (0.0, 1e-6, 0.5, -1.0, 30.0)
 
 
 def laplace(head: DensityHead) -> Iterator[Case]:
-    """Σ -|d|/b - log 2b with b = exp(r) within its bounds, 1 where none is predicted."""
+    """Yield cases with Σ -|d|/b - log 2b, where b = exp(r) within its bounds, or 1 if no scale is predicted."""
     numbers = 3 if head.size % 9 == 0 or head.size % 6 == 0 else 1
     pixels = 6 if numbers == 3 else 1
     predicted = head.size - numbers * pixels
@@ -38,7 +38,7 @@ ROWS = {
         HeadRow("one scale", SMALL, cases=laplace),
         HeadRow("a scale for each pixel", SMALL, {"scale": "pixel"}, cases=laplace),
         HeadRow("a scale for each number", SMALL, {"scale": "number"}, cases=laplace),
-        # differences of raw numbers of size 1000 step over the kink of |d| at a draw
+        # finite differences at raw parameters of size 1000 step over the kink of |d| at a draw
         HeadRow("one grey pixel", GREY, {"scale": "number"}, cases=laplace, limits={"loss gradient": 0.1}),
         HeadRow(
             "balanced, fitted to intervals",

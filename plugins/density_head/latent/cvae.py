@@ -22,7 +22,7 @@ from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity
 from plugins.density_head.latent.monte_carlo import Effort
 
 LARGEST_LOG_SCALE = 7.0
-"""Standard deviations of z stay within e^±7, so that no ratio of two of them overflows."""
+"""Bound on log standard deviations of z, which stay within e^±7, so that no ratio of two of them overflows."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +33,23 @@ class Gaussian:
     log_scale: Tensor
 
     def draw(self, count: int) -> Tensor:
-        """z of shape (count, *batch, latent), differentiable in the parameters."""
+        """Return z of shape (count, *batch, latent), differentiable in the parameters."""
         return self.at(torch.randn(count, *self.mean.shape, dtype=self.mean.dtype, device=self.mean.device))
 
     def at(self, noise: Tensor) -> Tensor:
-        """z at standard normal numbers (*sample, *batch, latent)."""
+        """Return z at standard normal numbers (*sample, *batch, latent)."""
         return self.mean + self.log_scale.exp() * noise
 
     def log_prob(self, z: Tensor) -> Tensor:
         return self.log_prob_at((z - self.mean) * torch.exp(-self.log_scale))
 
     def log_prob_at(self, noise: Tensor) -> Tensor:
-        """log_prob of `at(noise)`, without the cancellation in z - mean where the mean is large."""
+        """Return log_prob of `at(noise)`, without the cancellation in z - mean if the mean is large."""
         return -(noise.square() / 2 + self.log_scale + math.log(2 * math.pi) / 2).sum(-1)
 
 
 def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
-    """KL(first || second), nats, (*batch,), exactly 0 of equals (Kingma & Welling 2014, appendix B)."""
+    """Return KL(first || second), nats, (*batch,), exactly 0 for equals (Kingma & Welling 2014, appendix B)."""
     log_ratio = 2 * (first.log_scale - second.log_scale)
     shift = (first.mean - second.mean) * torch.exp(-second.log_scale)
     return ((torch.expm1(log_ratio) - log_ratio + shift.square()) / 2).sum(-1)
@@ -62,11 +62,11 @@ class Networks(Latent):
     Attributes:
         prior: p(z|x), of shape (*batch, latent).
         posterior: φ of shape (*sample, *batch, *event) → q(z|x,φ) of shape (*sample, *batch, latent).
-        decode: z of shape (*sample, *batch, latent) → the component's raw numbers (*sample, *batch, number).
-        component: raw numbers → p(φ|x,z).
+        decode: z of shape (*sample, *batch, latent) → the component's raw parameters (*sample, *batch, number).
+        component: raw parameters → p(φ|x,z).
         rows: indices (rows,) into the flattened batch → the networks of these inputs.
-        width: activations one decoded z holds in memory.
-        size: how many numbers the component reads.
+        width: number of activations that one decoded z holds in memory.
+        size: number of raw parameters that the component reads.
     """
 
     prior: Gaussian
@@ -105,7 +105,7 @@ class Networks(Latent):
 
 
 def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> Tensor:
-    """log p(φ|x,z) p(z|x) / q(z|x,φ), nats, of z ~ q at standard normal `noise` (terms of eq. 3.19).
+    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, of z ~ q at standard normal `noise` (terms of eq. 3.19).
 
     Shapes: value (*sample, *batch, *event), noise (*draw, *sample, *batch, latent), result (*draw, *sample, *batch).
     """
@@ -116,7 +116,7 @@ def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> 
 
 
 def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """Lower bound on log p(φ|x), nats: the first term by `samples` draws, the second exactly (eq. 3.17)."""
+    """Return a lower bound on log p(φ|x), nats: the first term by `samples` draws, the second exactly (eq. 3.17)."""
     posterior = networks.posterior(value)
     likelihood = networks.component(networks.decode(posterior.draw(samples))).log_prob(value)
     return likelihood.mean(0) - kl_divergence(posterior, networks.prior)
@@ -125,9 +125,9 @@ def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
 class CVAEHead(DensityHead):
     """CVAE: an infinite mixture over a latent z with a learned prior (thesis §3.5.2, eq. 3.12-3.20).
 
-    Prior p(z|x), encoder q(z|x,φ) and decoder p(φ|x,z) train by the evidence lower bound (eq. 3.17-3.18);
-    log_prob is the importance-weighted bound (eq. 3.19). The framework's linear layer is
-    the part of each network's first layer that sees the features, computed once per item.
+    Prior p(z|x), encoder q(z|x,φ) and decoder p(φ|x,z) train by the evidence lower bound (eq. 3.17-3.18); log_prob is
+    the importance-weighted bound (eq. 3.19). The framework's linear layer is the part of each network's first layer
+    that reads the features; it is computed once per item.
 
     Args:
         latent: dimensions of z.
@@ -135,9 +135,9 @@ class CVAEHead(DensityHead):
         training_samples: S of the training loss.
         samples: S in evaluation, of the bound and of the mixture it is drawn as; may be set at any time.
         tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
-            estimated error is below. None: S it is.
-        backbones: "shared": prior, encoder and decoder read the features of one network; "each": of one each, of the
-            same architecture (thesis §3.6.1).
+            estimated error is below the tolerance. None: S samples.
+        backbones: "shared": prior, encoder and decoder read the features of one network; "each": each reads those of
+            its own network of the same architecture (thesis §3.6.1).
         component: the head whose densities are mixed.
     """
 
@@ -197,9 +197,9 @@ class CVAEHead(DensityHead):
         pass  # everything is trained
 
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
-        """Prior, encoder and decoder, given the features."""
+        """Return prior, encoder and decoder, given the features."""
         raw = require_finite(raw, self.size)
-        # so that no raw number, however large, overflows in the layers behind
+        # clamped, so that no raw parameter overflows in the layers that follow
         features = raw.to(self.from_value.weight.dtype).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
         return self._networks(features)
 
@@ -221,7 +221,7 @@ class CVAEHead(DensityHead):
         )
 
     def encode(self, value: Tensor) -> Tensor:
-        """What the encoder sees of a target: angles as biternions, labels one-hot, reals in standard deviations."""
+        """Return the encoder's input for a target: biternions of angles, one-hot labels, standardised reals."""
         if self.target.kind == "angle":
             return torch.cat([value.cos(), value.sin()], -1)
         if self.target.kind == "class":
@@ -230,11 +230,11 @@ class CVAEHead(DensityHead):
 
 
 def _rest(hidden: int, numbers: int) -> nn.Sequential:
-    """A network behind its linear first layer."""
+    """Return the layers of a network after its first linear layer."""
     return nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, numbers))
 
 
 def _gaussian(number: Tensor) -> Gaussian:
-    number = require_finite(number, number.shape[-1])  # which under autocast is of half precision
+    number = require_finite(number, number.shape[-1])  # half precision under autocast
     mean, log_scale = number.chunk(2, -1)
     return Gaussian(mean, LARGEST_LOG_SCALE * torch.tanh(log_scale / LARGEST_LOG_SCALE))

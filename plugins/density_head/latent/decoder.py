@@ -1,29 +1,31 @@
-"""The decoder of latent-variable density heads: features and a latent vector in, a component's raw numbers out."""
+"""The decoder of latent-variable density heads, from features and a latent vector to a component's raw parameters."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 LARGEST_FEATURE = 1e6
-"""Features are cut off here, so that no raw number, however large, overflows in the layers behind."""
+"""Bound to which features are clamped, so that no raw parameter overflows in the layers that follow."""
 
 
 class LatentDecoder(nn.Module):
     """Two hidden layers of (features, z), plus a path linear in the features and one linear in z.
 
-    It reads `size` raw numbers an item: `hidden` features of the network, then `numbers` that are added to what it
-    says of every z, then `numbers × latent` that turn z. So the framework's linear layer is the first layer of all
-    three and is computed once per item; a layer of z alone is added to the features, once per sample.
+    The decoder reads `size` raw parameters of an item: `hidden` features of the network, then `numbers` that are added
+    to its output for every z, then `numbers × latent` that modify the path linear in z. So the framework's linear layer
+    is the first layer of all three and is computed once per item; a layer of z alone is added to the features, once per
+    sample.
 
-    The two linear paths keep a mixture over several numbers from collapsing. The shared numbers move all components at
-    once, so that what each must know (an angle the image determines) does not single out the one that learnt it
-    first. `spread` makes components differ from the first step, and is turned by the image: two opposite directions,
-    whose mean says nothing, show in the second moment, and this path learns from it at first order.
+    The two linear paths prevent a mixture over several numbers from collapsing. The shared numbers shift all components
+    together, so that what each component must learn (an angle that the image determines) does not favour the component
+    that learnt it first. `spread` makes components differ from the first step. The image modifies it: two opposite
+    directions, whose mean carries no information, differ in the second moment, and this path learns from it at first
+    order.
 
     Args:
         latent: dimensions of z.
         hidden: width of both layers.
-        numbers: what the component reads.
+        numbers: number of raw parameters that the component reads.
     """
 
     def __init__(self, latent: int, hidden: int, numbers: int) -> None:

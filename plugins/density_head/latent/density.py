@@ -1,4 +1,4 @@
-"""The density of a latent-variable head: ∫ p(φ|x,z) p(z|x) dz, with as many samples as its error asks for."""
+"""The density of a latent-variable head, ∫ p(φ|x,z) p(z|x) dz, with as many samples as its tolerance requires."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -24,19 +24,19 @@ from plugins.density_head.latent.monte_carlo import (
 )
 
 CHUNK = 2**22
-"""Most hidden activations held at once without gradient (16 MiB in float32)."""
+"""Largest number of hidden activations held at once without gradient (16 MiB in float32)."""
 MODERATE = {"name": "von_mises", "floor": 1.0}
-"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
+"""Settings of a component that cannot become uniform alone: several together can, and each keeps learning a direction."""
 
 
 class Latent(ABC):
-    """p(φ|x,z) and z for one batch of inputs x; a standard normal vector, the noise, says which z.
+    """p(φ|x,z) and z for one batch of inputs x; a standard normal vector, the noise, determines z.
 
     Attributes:
-        component: raw numbers (*batch, number) → p(φ|x,z).
+        component: raw parameters (*batch, number) → p(φ|x,z).
         center: z of the prior at noise 0, (*batch, latent).
-        width: activations one decoded z holds in memory.
-        size: how many numbers the component reads.
+        width: number of activations that one decoded z holds in memory.
+        size: number of raw parameters that the component reads.
     """
 
     component: Callable[[Tensor], Distribution]
@@ -45,26 +45,32 @@ class Latent(ABC):
     size: int
 
     def example(self) -> Distribution:
-        """The component of raw numbers 0, batch_shape (*batch): what it is a density of, at no decoder's cost."""
+        """Return the component of raw parameters 0, (*batch); it shows the support without the cost of a decoder."""
         return self.component(self.center.new_zeros(*self.center.shape[:-1], self.size))
 
     @abstractmethod
     def numbers(self, noise: Float[Tensor, "sample item latent"]) -> Float[Tensor, "*batch sample number"]:
-        """The component's raw numbers at z of the prior; without gradient chunk by chunk."""
+        """Return the component's raw parameters at z of the prior; without gradient chunk by chunk."""
 
     @abstractmethod
     def log_weights(
         self, value: Tensor, items: Int[Tensor, "row"], noise: Float[Tensor, "*draw row latent"]
     ) -> Float[Tensor, "*draw row"]:
-        """log of weights whose mean is p(φ|x), nats, of values (row, *event) and these items of the flattened batch."""
+        """Return the log of weights whose mean is p(φ|x), nats.
+
+        Args:
+            value: (row, *event).
+            items: index of each row's item in the flattened batch.
+            noise: standard normal points.
+        """
 
     @abstractmethod
     def sample(self, count: int) -> Tensor:
-        """`count` values of each item, (count, *batch, *event), each with a fresh z."""
+        """Return `count` values of each item, (count, *batch, *event), each with a new z."""
 
     @abstractmethod
     def tempered(self, temperature: Tensor) -> "Latent":
-        """The same with tempered components."""
+        """Return a copy with tempered components."""
 
     @property
     def items(self) -> int:
@@ -75,20 +81,20 @@ class Latent(ABC):
         return torch.autocast(self.center.device.type, enabled=False)
 
     def points(self, effort: Effort, kept: int = 0) -> NormalPoints:
-        """Noise of every item."""
+        """Return the noise of every item."""
         dtype, device = self.center.dtype, self.center.device
         dimensions = self.center.shape[-1]
         return NormalPoints(self.items, effort.replicates, dimensions, dtype=dtype, device=device, kept=kept)
 
     def at_once(self, count: int) -> int:
-        """How many of `count` z of every item to decode together; under gradient all of them."""
+        """Return how many of `count` z of every item are decoded together; with gradient all of them."""
         if torch.is_grad_enabled():
             return max(1, count)
         return max(1, CHUNK // (max(1, self.items) * self.width))
 
 
 def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> SampledMixture:
-    """A component at each of S points, with equal weights (eq. 3.21)."""
+    """Return a mixture of a component at each of S points, with equal weights (eq. 3.21)."""
     items = torch.arange(latent.items, device=latent.center.device)
     number = latent.numbers(points(items, 0, effort.first).flatten(0, 1))
     weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
@@ -96,12 +102,12 @@ def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> Sam
 
 
 class LatentDensity(Distribution):
-    """p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
+    """The density p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
 
-    `log_prob` is the log of a mean weight at points z that are drawn once: a function of φ, with respect to the draw in
-    expectation below the truth, rising to it with the samples. With a tolerance it doubles the samples of each value
-    until the estimated error is below. `sample` draws a fresh z for every value. `entropy`, `mode`, `median` and
-    `marginal` are of `mixture`.
+    `log_prob` is the log of a mean weight at points z that are drawn once, so that it is a function of φ. Its
+    expectation over the draw is below the truth and rises to it with the number of samples. With a tolerance it doubles
+    the samples of each value until the estimated error is below the tolerance. `sample` draws a new z for every value.
+    `entropy`, `mode`, `median` and `marginal` are those of `mixture`.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -111,7 +117,7 @@ class LatentDensity(Distribution):
     def __init__(self, latent: Latent, effort: Effort) -> None:
         self.latent = latent
         self.effort = effort
-        # drawn now, so that nothing depends on what is asked first
+        # drawn now, so that no result depends on the order of calls
         self.points = latent.points(effort, kept=effort.first)
         self._fixed = Effort(effort.samples)
         self._mixture_points = latent.points(self._fixed)
@@ -124,12 +130,12 @@ class LatentDensity(Distribution):
         return self._example.support  # pyright: ignore[reportReturnType]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        """Return every class, (class, *batch) or (class, *1) without `expand`."""
         return self._example.enumerate_support(expand)
 
     @cached_property
     def mixture(self) -> SampledMixture:
-        """Equal weights on S components with z from the prior: decoded on first use, then kept."""
+        """The mixture of S components with equal weights and z from the prior: decoded at first use, then kept."""
         with self.latent.full_precision():
             return sampled_mixture(self.latent, self._mixture_points, self._fixed)
 
@@ -201,13 +207,13 @@ def _(density: LatentDensity) -> Tensor:
 
 @tempered.register
 def _(density: LatentDensity, temperature: Tensor) -> Distribution:
-    """Component by component, at the same points; of classes the whole, as of any mixture."""
+    """Return the density with tempered components at the same points; for classes the whole density is tempered."""
     changed = copy.copy(density)
     if temperature.requires_grad:
-        changed.effort = density._fixed  # what a tolerance draws in rounds would all be held
+        changed.effort = density._fixed  # with a tolerance, the draws of all rounds would be held
     if density.has_enumerate_support:
         return tempered_classes(changed, temperature)
-    changed.__dict__.pop("mixture", None)  # that of the untempered components, where it was asked for
+    changed.__dict__.pop("mixture", None)  # the cached mixture is that of the untempered components
     changed.latent = density.latent.tempered(temperature)
     changed._example = tempered(density._example, temperature)
     return changed

@@ -1,4 +1,4 @@
-"""Estimates of log E w(z) over a standard normal z: quasi-random points, standard error, S chosen by a target error."""
+"""Estimates of log E w(z) over a standard normal z by quasi-random points, to a target standard error."""
 
 import math
 from collections.abc import Callable
@@ -17,27 +17,31 @@ from framework.distributions.tempering import tempered_classes
 from framework.errors import ConfigError
 
 REPLICATES = 8
-"""Independent estimates that a standard error is taken from, at most."""
+"""Largest number of independent estimates that a standard error is computed from."""
 TO_TOLERANCE, LEAST = 32, 8
-"""As many where samples are doubled until that error is small, which favours errors that are small by chance: of 8 it
-would be told too low by a third, of 32 by some percent; and the least points of each."""
+"""Number of independent estimates with a tolerance, and smallest number of points of each.
+
+With a tolerance, samples are doubled until the error is small, which favours errors that are small by chance. The error
+would be underestimated by a third with 8 estimates, by some percent with 32.
+"""
 STRETCH = 0.4
-"""How heavy the tails of those points are (`stretched`): of one dimension 3 % lie above 4, of normal ones 0.003 %."""
+"""Heaviness of the tails of these points (`stretched`): in one dimension 3 % lie above 4, of normal ones 0.003 %."""
 MOST = 2**18
-"""Samples after which an item that has not reached its tolerance is given up."""
+"""Number of samples after which an item that has not reached its tolerance is given up."""
 GENERATOR = 1267
-"""Of the lattice; chosen by measured variance (benchmarks/densities/latent.md)."""
+"""Generator of the lattice, chosen by measured variance (benchmarks/densities/latent.md)."""
 LARGEST_KEPT = 2**22
-"""Numbers of normal points that a density holds (16 MiB in float32); more are computed anew for every value."""
+"""Largest number of normal points that a density keeps (16 MiB in float32); more are recomputed for every value."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How many samples an estimate takes.
+    """The number of samples that an estimate takes.
 
     Args:
-        samples: S; with a tolerance, of the first round, rounded up to a power of two and at least 256.
-        tolerance: nats. Samples are doubled until an item's estimated error is below, or MOST are drawn; None: S it is.
+        samples: S; with a tolerance, the samples of the first round, rounded up to a power of two and at least 256.
+        tolerance: nats. Samples are doubled until an item's estimated error is below, or MOST are drawn. None: S
+            samples.
 
     Raises:
         ConfigError: no sample, or a tolerance that is not above zero.
@@ -57,25 +61,25 @@ class Effort:
 
     @property
     def replicates(self) -> int:
-        """R independent parts of the samples: 8, or the largest number below that divides a fixed S."""
+        """Number R of independent parts of the samples: 8, or the largest smaller number that divides a fixed S."""
         if self.tolerance is not None:
             return TO_TOLERANCE
         return next(number for number in range(REPLICATES, 0, -1) if self.samples % number == 0)
 
     @property
     def first(self) -> int:
-        """Samples of each replicate in the first round."""
+        """Number of samples of each replicate in the first round."""
         if self.tolerance is None:
             return self.samples // self.replicates
         return max(LEAST, 1 << (math.ceil(self.samples / TO_TOLERANCE) - 1).bit_length())
 
 
 class SampledMixture(Mixture):
-    """A mixture whose components stand for all of p(φ|x,z): one at each point z, with equal weights.
+    """A mixture whose components are a sample of p(φ|x,z): one at each point z, with equal weights.
 
     Args:
         log_weights: (*batch, S), all equal.
-        components: batch_shape (*batch, S), the samples of one replicate beside each other.
+        components: batch_shape (*batch, S), the samples of one replicate adjacent.
         replicates: R, which divides S.
     """
 
@@ -101,7 +105,7 @@ def _(density: SampledMixture, index: int) -> Distribution:
 
 @tempered.register
 def _(density: SampledMixture, temperature: Tensor) -> Distribution:
-    """Component by component; of classes the whole, as of any mixture, so that no temperature changes the likeliest."""
+    """Return the mixture of tempered components; of classes the whole is tempered, which keeps the likeliest class."""
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
     components = tempered(density.components, temperature)
@@ -113,15 +117,16 @@ def estimated(
     count: int,
     log_shares: Float[Tensor, "replicate *items"] | None = None,
 ) -> Estimate:
-    """The estimate that independent replicates give, each the log of a sum of `count` weights.
+    """Return the estimate from independent replicates, each the log of a sum of `count` weights.
 
-    With shares, whose mean is known to be 1, it is the ratio of both means: where weights follow the shares nothing is
-    left to chance. Below m_r is then the mean weight less that share's part of it (ratio estimator, Cochran 1977, §6).
+    With shares, whose mean is known to be 1, the estimate is the ratio of both means: it has no error if the weights
+    are proportional to the shares. Below, m_r is then the mean weight less the part that the share explains (ratio
+    estimator, Cochran 1977, §6).
 
-    With m_r the mean weight of replicate r over that of all, the squared standard error of the mean weight, relative
-    to it, is s² = Σ (m_r - 1)² / (R (R - 1)), and s is also that of its logarithm (delta method); the logarithm's
-    expectation is low by s²/2. A jackknife over replicates removes the same term, but is infinite where one replicate
-    has all the weight; s² is at most 1, and the correction 1/2.
+    With m_r the mean weight of replicate r over that of all, the squared standard error of the mean weight, relative to
+    it, is s² = Σ (m_r - 1)² / (R (R - 1)), and s is also that of its logarithm (delta method). The expectation of the
+    logarithm is low by s²/2. A jackknife over replicates removes the same term, but is infinite if one replicate has
+    all the weight; s² is at most 1, and the correction 1/2.
     """
     replicates = len(log_sums)
     log_count = math.log(replicates * count) if log_shares is None else torch.logsumexp(log_shares, 0)
@@ -140,7 +145,7 @@ def estimated(
 
 
 def estimated_error(found: Estimate) -> Float[Tensor, "*items"]:
-    """Root mean square error of log_mean, nats: spread and bias together."""
+    """Return the root mean square error of log_mean, nats, from standard error and bias together."""
     return torch.hypot(found.standard_error, found.standard_error.square() / 2)
 
 
@@ -152,16 +157,16 @@ def estimate_log_mean(
     at_once: int,
     device: torch.device,
 ) -> Estimate:
-    """log E w of each of `items`, (items,), in rounds that double the samples of those not yet below the tolerance.
+    """Return log E w of each of `items`, (items,), in rounds that double the samples of items above the tolerance.
 
-    Only a sum for each replicate and the chunk at hand are held. Differentiable where log_weights is; then everything
-    drawn is held, and nothing is chunked.
+    Only a sum for each replicate and the current chunk are held. The result is differentiable if log_weights is; then
+    all draws are held, and nothing is chunked.
 
     Args:
         log_weights: (items (n,) int64, start, count) → (replicate, count, n), nats: of these items, at the points
             `start` to `start + count` of each replicate. -inf is a weight of zero. Or (2, replicate, count, n), of
             weights and of shares as `estimated` reads them.
-        at_once: weights asked for together, at most (but one for each replicate).
+        at_once: largest number of weights requested together (at least one for each replicate).
     """
     if torch.is_grad_enabled():
         at_once = max(at_once, items * effort.replicates * MOST)
@@ -175,7 +180,7 @@ def estimate_log_mean(
         )
         if effort.tolerance is None:
             return found
-        # a weight that is not a number stays one, whatever is added
+        # a NaN weight stays NaN, whatever is added
         wanting = ~(estimated_error(found) <= effort.tolerance)
         more = wanting & ~found.log_mean.isnan()
         if effort.replicates * done * 2 > MOST:
@@ -200,7 +205,7 @@ def _log_sums(
     replicates: int,
     at_once: int,
 ) -> Float[Tensor, "*pair replicate rows"]:
-    """Log of the sum of `count` weights of each replicate, chunk by chunk."""
+    """Return the log of the sum of `count` weights of each replicate, computed chunk by chunk."""
     step = max(1, min(count, at_once // replicates))
     parts = []
     for some in rows.split(max(1, at_once // (replicates * step))):
@@ -216,8 +221,12 @@ def _log_sums(
 def rows_of(
     value: Tensor, batch_shape: torch.Size, event_shape: torch.Size
 ) -> tuple[Tensor, Tensor, torch.Size]:
-    """Values (*sample, *batch, *event) one below the other: (rows, *event), the item of the flattened batch that each
-    row asks about, (rows,) int64, and the shape (*sample, *batch) of the answer."""
+    """Return values (*sample, *batch, *event) as rows, with the item of each row and the shape of the result.
+
+    Returns:
+        Values (rows, *event); the item of the flattened batch that each row belongs to, (rows,) int64; and the shape
+        (*sample, *batch) of the result.
+    """
     lead = value.shape[: value.dim() - len(event_shape)]
     shape = torch.Size(torch.broadcast_shapes(lead, batch_shape))
     items = torch.arange(batch_shape.numel(), device=value.device).reshape(batch_shape).expand(shape)
@@ -225,19 +234,19 @@ def rows_of(
 
 
 class NormalPoints:
-    """Standard normal points z, a sequence for each item and replicate that can be continued at will.
+    """Standard normal points z: a sequence for each item and replicate that can be extended without limit.
 
     All are one extensible lattice (`lattice`), each shifted by a random vector modulo 1 (Cranley & Patterson 1976), so
-    that a replicate's mean is unbiased and replicates are independent, and mapped by the normal quantile. Drawn from
-    torch's global generator in float64, so that float32 and float64 see the same points.
+    that a replicate's mean is unbiased and replicates are independent, and mapped by the normal quantile. They are
+    drawn from torch's global generator in float64, so that float32 and float64 get the same points.
 
     Args:
-        items: of a flattened batch.
+        items: number of items of a flattened batch.
         replicates: R.
-        dimensions: of z.
+        dimensions: dimensions of z.
         dtype, device: of the points.
-        kept: so many first points of each replicate are held from first use, where many values are asked about at the
-            same; not if they are too many.
+        kept: number of first points of each replicate that are kept from first use, for many values at the same points;
+            0 if they exceed LARGEST_KEPT.
     """
 
     def __init__(
@@ -257,7 +266,7 @@ class NormalPoints:
     def __call__(
         self, items: Int[Tensor, "rows"], start: int, count: int
     ) -> Float[Tensor, "replicate count rows dimension"]:
-        """Points `start` to `start + count` of some items' sequences."""
+        """Return points `start` to `start + count` of the sequences of some items."""
         if start + count <= self.kept:
             return self._first[:, start : start + count, items]
         return self._points(self.shift[:, :, items], start, count)
@@ -274,11 +283,11 @@ class NormalPoints:
 def stretched(
     points: Float[Tensor, "*shape dimension"],
 ) -> tuple[Float[Tensor, "*shape dimension"], Float[Tensor, "*shape"]]:
-    """Points of heavier tails, z = y exp(h y²/2) of standard normal y (Tukey's h), and the log of their shares.
+    """Return points of heavier tails, z = y exp(h y²/2) of standard normal y (Tukey's h), and the log of their shares.
 
-    A share is the standard normal density at z over that of the points. Weights times shares have the mean that weights
-    have under normal points, but no weight is large only where hardly a point comes (defensive sampling, Hesterberg
-    1995).
+    A share is the standard normal density at z over the density of the points. Weights times shares have the mean that
+    weights have under normal points, but no weight is large only in a region with hardly any point (defensive sampling,
+    Hesterberg 1995).
     """
     h = STRETCH / points.shape[-1] ** 0.5
     square = points.square()
@@ -289,15 +298,15 @@ def stretched(
 def lattice(
     start: int, count: int, dimensions: int, device: torch.device | None = None
 ) -> Float[Tensor, "count dimension"]:
-    """Points `start` to `start + count` of an extensible Korobov sequence in [0, 1), float64 and exact.
+    """Return points `start` to `start + count` of an extensible Korobov sequence in [0, 1), float64 and exact.
 
-    Point i is r(i) (1, a, a², …) mod 1 with r the radical inverse: i's binary digits mirrored at the point. The first
-    2^m points, for any m, are a whole lattice (Hickernell, Hong, L'Ecuyer & Lemieux 2000, §2).
+    Point i is r(i) (1, a, a², …) mod 1 with r the radical inverse: the binary digits of i mirrored at the binary point.
+    The first 2^m points, for any m, are a whole lattice (Hickernell, Hong, L'Ecuyer & Lemieux 2000, §2).
     """
     number = torch.arange(start, start + count, device=device)
     inverse = torch.zeros(count, dtype=torch.float64, device=device)
     for bit in range((start + count - 1).bit_length()):
         inverse += ((number >> bit) & 1) * 2.0 ** -(bit + 1)
-    # below 2^20, so that products with up to 32 digits are exact
+    # below 2^20, so that products with numbers of up to 32 bits are exact
     vector = [pow(GENERATOR, power, 2**20) for power in range(dimensions)]
     return torch.remainder(inverse[:, None] * torch.tensor(vector, dtype=torch.float64, device=device), 1.0)

@@ -23,12 +23,12 @@ SMALL = {"latent": 2, "hidden": 16, "training_samples": 5, "samples": 50}
 
 
 def component(head: CVAEHead | SCVAEHead, number: np.ndarray, value: np.ndarray) -> float:
-    """One component's log-density; its own rows check it."""
+    """Return one component's log-density; its own rows check it."""
     return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
 
 
 def through(layers: nn.Sequential, numbers: np.ndarray) -> np.ndarray:
-    """What a network of linear layers and rectifiers makes of a vector."""
+    """Return the output of a network of linear layers and rectifiers for a vector."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
             numbers = layer.weight.detach().numpy() @ numbers + layer.bias.detach().numpy()
@@ -38,7 +38,7 @@ def through(layers: nn.Sequential, numbers: np.ndarray) -> np.ndarray:
 
 
 def decoded(decoder: LatentDecoder, raw: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """The component's raw numbers at one z (plugins.density_head.latent.decoder), layer by layer."""
+    """Return the component's raw parameters at one z (plugins.density_head.latent.decoder), layer by layer."""
     features, shared, turned = np.split(raw, np.cumsum(decoder.parts)[:2])
     spread = decoder.spread.detach().numpy() + turned.reshape(decoder.spread.shape)
     layer = features + decoder.from_latent.weight.detach().numpy() @ z
@@ -46,7 +46,7 @@ def decoded(decoder: LatentDecoder, raw: np.ndarray, z: np.ndarray) -> np.ndarra
 
 
 def gaussian(layers: nn.Sequential, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of z."""
+    """Return mean and standard deviation of z."""
     mean, log_scale = np.split(through(layers, numbers), 2)
     return mean, np.exp(LARGEST_LOG_SCALE * np.tanh(log_scale / LARGEST_LOG_SCALE))
 
@@ -54,8 +54,10 @@ def gaussian(layers: nn.Sequential, numbers: np.ndarray) -> tuple[np.ndarray, np
 def log_weights(
     head: CVAEHead | SCVAEHead, raw: np.ndarray, value: np.ndarray, noise: np.ndarray
 ) -> list[float]:
-    """log of the importance weights of one item (eq. 3.19) at standard normal noise (sample, latent); of a simplified
-    CVAE the noise is z, and the weights are the terms of eq. 3.21."""
+    """Return the log of the importance weights of one item (eq. 3.19) at standard normal noise (sample, latent).
+
+    For a simplified CVAE the noise is z, and the weights are the terms of eq. 3.21.
+    """
     if isinstance(head, SCVAEHead):
         return [component(head, decoded(head.decoder, raw, one), value) for one in noise]
     for_prior, for_posterior, for_decoder = np.split(raw, [head.hidden, 2 * head.hidden])
@@ -71,10 +73,10 @@ def log_weights(
 
 
 def stiff(head: DensityHead) -> Iterator[Case]:
-    """Ordinary raw numbers, and hard ones.
+    """Yield cases with ordinary raw parameters, and hard ones.
 
-    Of a CVAE large: narrow components, a narrow prior, an encoder that misses it. Of a simplified one narrow components
-    and targets far from all of them.
+    For a CVAE hard ones are large: narrow components, a narrow prior, and an encoder far from it. For a simplified CVAE
+    they are narrow components and targets far from all of them.
     """
     assert isinstance(head, CVAEHead | SCVAEHead)
     generator = torch.Generator().manual_seed(7)

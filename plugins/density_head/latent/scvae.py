@@ -1,4 +1,4 @@
-"""The simplified conditional variational autoencoder: its decoder on one batch, and the head."""
+"""The simplified conditional variational autoencoder: its decoder for one batch, and the head."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -23,15 +23,15 @@ from plugins.density_head.latent.monte_carlo import Effort
 
 @dataclass(frozen=True)
 class Networks(Latent):
-    """The decoder on one batch of inputs x; z is the noise itself.
+    """The decoder for one batch of inputs x; z is the noise itself.
 
     Attributes:
-        raw: what it reads of each input, (*batch, size).
-        decode: (raw, z), broadcast against each other → the component's raw numbers (*batch, number).
-        component: raw numbers → p(φ|x,z).
-        center: zeros, (*batch, latent), of the number type of z.
-        width: activations one decoded z holds in memory.
-        size: how many numbers the component reads.
+        raw: raw parameters of each input, (*batch, size).
+        decode: (raw, z), broadcast against each other → the component's raw parameters (*batch, number).
+        component: raw parameters → p(φ|x,z).
+        center: zeros, (*batch, latent), of the dtype of z.
+        width: number of activations that one decoded z holds in memory.
+        size: number of raw parameters that the component reads.
     """
 
     raw: Tensor
@@ -70,10 +70,10 @@ class SCVAEHead(DensityHead):
         latent: dimensions of z.
         hidden: width of the decoder.
         training_samples: S of the training loss.
-        samples: S in evaluation; may be set at any time. The density keeps S components per item, so memory
-            grows as batch × S × (numbers of a component).
+        samples: S in evaluation; may be set at any time. The density keeps S components per item, so that memory grows
+            as batch × S × (raw parameters of a component).
         tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
-            estimated error is below. None: S it is, and the density is a mixture of S components.
+            estimated error is below the tolerance. None: S samples, and the density is a mixture of S components.
         component: the head whose densities are mixed.
     """
 
@@ -127,7 +127,7 @@ class SCVAEHead(DensityHead):
     def decode(
         self, raw: Float[Tensor, "*batch size"], z: Float[Tensor, "*batch sample latent"]
     ) -> Float[Tensor, "*batch sample number"]:
-        """The component's raw numbers at every z."""
+        """Return the component's raw parameters at every z."""
         return self.decoder(raw.unsqueeze(-2), z)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:

@@ -14,15 +14,15 @@ from framework.heads.parameters import require_finite, require_trained
 from framework.target import Target
 
 MODERATE = {"name": "von_mises", "floor": 1.0}
-"""A component that cannot become uniform alone: many still can together, and none stops learning its direction."""
+"""Settings of a component that cannot become uniform alone: several together can, and each keeps learning a direction."""
 
 
 class MixtureHead(DensityHead):
     """Finite mixture of any other head's densities, weights by softmax (thesis eq. 3.10-3.11).
 
-    Reads K logits, then K times what the component reads, then that once more, which is added to all K: what every
-    component must know is learnt by all at once, and none falls behind (README). A component that is fitted after
-    training (it keeps a buffer) is refused, because which data belongs to it is not known.
+    The head reads K logits, then the raw parameters of K components, then one more set of raw parameters that is added
+    to all K: all components learn together what each of them must know, and none falls behind (README). A component
+    that is fitted after training (it has a buffer) is refused, because it is not known which data belongs to it.
 
     Args:
         components: K. With 1 the density is the component, to the last bit.
@@ -50,7 +50,7 @@ class MixtureHead(DensityHead):
         self.component = require_trained(component)
         self.size = components * (component.size + 1)
         if components > 1:
-            # the numbers all components have in common, and what makes them differ from the first step
+            # the parameters that all components share, and offsets that make them differ from the first step
             self.size += component.size
             self.spread = nn.Parameter(torch.randn(components, component.size))
 

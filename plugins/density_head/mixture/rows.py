@@ -1,4 +1,4 @@
-"""Rows of the contract: finite mixtures, with log-densities summed in NumPy from the head's own numbers."""
+"""Rows of the contract: finite mixtures, with log-densities summed in NumPy from the head's parameters."""
 
 from collections.abc import Iterator
 
@@ -19,12 +19,12 @@ NESTED = {"components": 2, "component": {"name": "mixture", "components": 3}}
 
 
 def component(head: MixtureHead, number: np.ndarray, value: np.ndarray) -> float:
-    """One component's log-density; its own rows check it."""
+    """Return one component's log-density; its own rows check it."""
     return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
 
 
 def by_hand(head: MixtureHead, raw: np.ndarray, value: np.ndarray) -> float:
-    """log Σ_k w_k p_k (eq. 3.10), the largest term taken out."""
+    """Return log Σ_k w_k p_k (eq. 3.10), with the largest term factored out."""
     count, each = head.components, head.component.size
     numbers = raw[count : count + count * each].reshape(count, each)
     if count > 1:
@@ -34,7 +34,7 @@ def by_hand(head: MixtureHead, raw: np.ndarray, value: np.ndarray) -> float:
 
 
 def stiff(head: DensityHead) -> Iterator[Case]:
-    """Ordinary raw numbers, weights that vanish, components far narrower than their distance, far outliers."""
+    """Yield cases with ordinary raw parameters, vanishing weights, and components far narrower than their distance."""
     assert isinstance(head, MixtureHead)
     generator = torch.Generator().manual_seed(7)
     ordinary = torch.randn(6, head.size, generator=generator)
