@@ -12,12 +12,16 @@ import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "WORLD_SIZE")
+"""Variables of a job of several processes; those of SLURM have a prefix."""
+SHOWN = ("FORCE_COLOR", "NO_COLOR", "COLUMNS", "LINES")
+"""Variables that change what is printed."""
 for name in [
-    name
-    for name in os.environ
-    if name.startswith("SLURM_") or name in ("RANK", "LOCAL_RANK", "NODE_RANK", "WORLD_SIZE")
-]:  # the job that the tests run in is not the one that a test starts
-    del os.environ[name]
+    *os.environ
+]:  # neither the job nor the terminal that the tests run in is that of what they start
+    if name.startswith("SLURM_") or name in (*RANKS, *SHOWN):
+        del os.environ[name]
+os.environ["TERM"] = "xterm"
 
 if os.environ.get("CHECK_TYPES", "0") != "0":
     from jaxtyping import install_import_hook
