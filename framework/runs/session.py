@@ -44,11 +44,11 @@ from framework.configuration.paths import flat, require_said, without_paths
 from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings, device_of
-from framework.data import Batch, Data
+from framework.data import Batch, Data, Mapped
 from framework.datasets.fields import fetched
 from framework.density_head import Fitted
 from framework.distributions.noise import seed_step
-from framework.errors import CheckpointError, ConfigError
+from framework.errors import CheckpointError, ConfigError, UserError
 from framework.evaluation.splits import BLOCK, numbers, on_device, require_own
 from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
@@ -448,19 +448,32 @@ def around(
         data.prepare()
         require_fit(data, description)
     elif "data" in chosen or "data" in config.settings.stored:
-        data.read = partial(_reading, data.read, description)  # type: ignore[method-assign]
+        begun = None if goes_on(config) else config
+        data.read = partial(_reading, data.read, data, description, begun)  # type: ignore[method-assign]
     method = description.method or method_of(config, parts)
     introduce_model(description, method, data if prepare else None, console)
     return Session(config, parts, method, description.target, data, predictor, device, console)
 
 
 def _reading(
-    read: Callable[[Sequence[Path]], Dataset[Batch]], description: Description, files: Sequence[Path]
+    read: Callable[[Sequence[Path]], Dataset[Batch]],
+    data: Data,
+    description: Description,
+    config: Config | None,
+    files: Sequence[Path],
 ) -> Dataset[Batch]:
-    """Read a user's own files by a data set that the command chose.
+    """Read a user's own files by a data set that the command chose or changed.
+
+    Args:
+        read: of the data set.
+        data: the data set.
+        description: of the model.
+        config: of the command; None for a run that goes on, whose settings are not looked at again.
+        files: the user's.
 
     Raises:
         CheckpointError: the first sample is of another shape than the model reads.
+        ConfigError: the first files are read the same as the model reads them by itself.
     """
     samples = read(files)
     found, wanted = tuple(fetched(samples, range(1))["input"].shape[1:]), description.input_shape
@@ -470,7 +483,32 @@ def _reading(
             f"{description.path} reads inputs of shape {wanted}, but with data={description.config['data']['name']} as "
             f"this command sets it {files[0]} is one of shape {found}. Leave data out: the model knows its own."
         )
+    given = None if config is None else config.given("data")
+    if config is not None and given is not None and not isinstance(data, Mapped):
+        skips = any(
+            "unreadable=" in item for item in config.overrides
+        )  # which the mode reads, not the data set
+        some = list(files[:FEW])
+        if not skips and _same_samples(_by_itself(description, some), read(some)):
+            refuse_idle(config.folder, sets_nothing(given, f"the model reads {files[0]} the same without it"))
     return samples
+
+
+def _by_itself(description: Description, files: Sequence[Path]) -> Dataset[Batch] | None:
+    """Return the samples of files as a model reads them without anything that the command says of its data."""
+    stored = read(Path(description.path))["framework"]["config"]["data"]
+    try:
+        config, _ = without_paths({"data": stored}, {})
+        return reader(replace(description, config={**description.config, **config}, dropped={})).read(files)
+    except UserError:  # without a path that the command says, for one
+        return None
+
+
+def _same_samples(one: Dataset[Batch] | None, other: Dataset[Batch]) -> bool:
+    if one is None or len(one) != len(other):  # type: ignore[arg-type]
+        return False
+    first, second = (fetched(each, range(min(BLOCK, len(each)))) for each in (one, other))  # type: ignore[arg-type]
+    return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
 
 
 def inherited(config: Config, description: Description) -> Config:
