@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 
 class PIT(Metric, Pictured):
-    """Probability integral transform (PIT) F(y) of each number of the target; it is uniform if forecasts are
-    calibrated.
+    """Probability integral transform (PIT) F(y) of each number of the target.
+
+    It is uniform if forecasts are calibrated.
 
     - `pit_ks`: largest distance of the distribution of F(y) from uniform (Kolmogorov-Smirnov), in [0, 1].
     - `pit_cvm`: mean squared distance of the distribution of F(y) from uniform (Cramér-von Mises).
