@@ -410,6 +410,22 @@ def varied_to_64(data: Waves, batch: Batch) -> Batch:
     return {name: values[:64] for name, values in Waves.augment(data, batch).items()}
 
 
+def noise_of_the_cpu(data: Waves, batch: Batch) -> Batch:
+    return {**batch, "input": batch["input"] + 0.01 * torch.randn(batch["input"].shape)}
+
+
+def left_in_place(data: Waves, batch: Batch) -> Batch:
+    """A part of the samples is varied, chosen on the CPU."""
+    chosen = torch.zeros(len(batch["input"]), 1)
+    chosen[batch["index"] % 2 == 0] = 1.0
+    return Waves.augment(data, batch)
+
+
+def by_numpy(data: Waves, batch: Batch) -> Batch:
+    np.sign(np.asarray(batch["input"]))
+    return Waves.augment(data, batch)
+
+
 BITS, FETCH, OWNED, DIFFER = (
     "same data, same bits",
     "one by one or at once",
@@ -448,5 +464,8 @@ ALL_FAULTS = (
     Fault("standardised pixels", "images are 0 to 1", {"table": standard_pixels}, base=Dots),
     Fault("files known by their names", "own files", {"numbers": known_by_name}, row=OWN),
     Fault("every file once", "own files", {"read": every_file_once}, row=OWN),
+    Fault("varied by noise of the CPU", "on the device of its inputs", {"augment": noise_of_the_cpu}),
+    Fault("samples chosen on the CPU", "on the device of its inputs", {"augment": left_in_place}),
+    Fault("varied by NumPy", "on the device of its inputs", {"augment": by_numpy}),
     Fault("64 of a batch are varied", "augment", {"augment": varied_to_64}),
 )

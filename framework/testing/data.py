@@ -40,6 +40,7 @@ from framework.testing.data_samples import (
     trimmed,
 )
 from framework.testing.data_targets import belong
+from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import SEED, Finding, Worst, examined
 from framework.testing.rows import DataRow
 
@@ -68,6 +69,7 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "fingerprint": (0.0, _fingerprint),
             "synthetic is said": (0.0, _synthetic),
             "pictures": (0.0, _pictures),
+            "on the device of its inputs": (0.0, _on_one_device),
             "augment": (0.0, _augment),
             "workers": (0.0, _workers),
             "official layout read back": (0.0, read_back),
@@ -381,6 +383,19 @@ def _pictures(bench: Workbench, worst: Worst) -> None:
                 len(shape) != 3 or shape[2] != 3 or 0 in shape, f"{where}: {shape}, wanted (height, width, 3)"
             )
             worst.same_bits(f"{where}: the input afterwards", inputs, before)
+
+
+def _on_one_device(bench: Workbench, worst: Worst) -> None:
+    """Batches are varied where the model trains; what the data set holds stays on the CPU."""
+    data, train = bench.data, parts(bench.data)["train"]
+    batch = fetched(train, list(range(min(8, len(train)))))
+
+    def questions(mode: OneDevice) -> Questions:
+        mode.keep(dict(vars(data)))
+        mode.receive(batch)
+        yield "augment", lambda: data.augment(dict(batch))
+
+    on_one_device(questions, worst)
 
 
 def _augment(bench: Workbench, worst: Worst) -> None:

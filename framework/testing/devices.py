@@ -86,6 +86,11 @@ class OneDevice(TorchFunctionMode):
                 self.receive([states, [getattr(part, name) for name in states]])
                 part._device = DEVICE  # type: ignore[assignment]
 
+    def keep(self, value: Any) -> None:
+        """Mark every tensor in a value as of the CPU, as attributes of an object that nothing moves."""
+        for tensor in tensors_in(value):
+            _on_device[tensor] = False
+
     def __torch_function__(
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
