@@ -1,1 +1,1 @@
-"""CEST brain imaging: Z-spectra of volumes, measured and generated."""
+"""Data set of CEST brain imaging: measured and generated Z-spectra of volumes."""

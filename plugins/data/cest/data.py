@@ -1,4 +1,4 @@
-"""Z-spectra of a brain and the Lorentzian lines fitted to them; the contract is framework.data's."""
+"""Data set of Z-spectra of a brain and fitted Lorentzian lines; framework.data describes the contract."""
 
 import hashlib
 import io
@@ -34,20 +34,22 @@ from plugins.data.cest.volumes import SUFFIXES, Volume, read_volume
 
 NotNegative = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 GENERATED, FITTED = "1", "3"
-"""Versions of the generator, and of the fit whose results are kept."""
+"""Version of the generator, and of the fit whose results are kept in the cache."""
 FILE = "brain.npz"
-"""Of a folder."""
+"""Name of the volume in a folder."""
 CYCLE = (0, 0, 1, 0, 0, 2)
-"""Bands of rows in turn: training, validation and test."""
+"""Splits of the bands of rows in turn: 0 training, 1 validation, 2 test."""
 _log = logging.getLogger(__name__)
 
 
 class Slice(NamedTuple):
-    """Attributes:
-    spectra: (voxel, offset) float32, at the model's offsets.
-    lines: (voxel, p) float64, all that was fitted; the first are the target.
-    place: (voxel, 3).
-    region: (voxel,).
+    """Spectra and fitted lines of voxels.
+
+    Attributes:
+        spectra: (voxel, offset) float32, at the model's offsets.
+        lines: (voxel, p) float64, all fitted parameters; the first of them are the target.
+        place: (voxel, 3), index of the voxel in the volume.
+        region: (voxel,), number of the region.
     """
 
     spectra: Tensor
@@ -57,24 +59,25 @@ class Slice(NamedTuple):
 
 
 class CEST(Data, Mapped):
-    """Z-spectra of a volume's voxels, and as target the Lorentzian lines that least squares fits to each (thesis §4.1).
+    """Z-spectra of a volume's voxels; the target is the Lorentzian lines fitted by least squares (thesis §4.1).
 
     Splits are bands of `band` neighbouring rows (the first axis), in turn training, training, validation, training,
-    training, test; a band's first row is left out where the band before belongs to another split, so that no voxel has
-    a neighbour in another split. Fits are kept in the cache. Batches also hold "place", (batch, 3), the voxel, and
-    "lines", (batch, p), all that was fitted.
+    training, test. The first row of a band is left out where the band before belongs to another split, so that no voxel
+    has a neighbour in another split. Fits are kept in the cache. Batches also hold "place", (batch, 3), the index of
+    the voxel, and "lines", (batch, p), all fitted parameters.
 
     Args:
-        root: a file, see volumes.py, or a folder with brain.npz; None: a slice is generated.
-        preset: ten numbers, amplitude and width of five pools, or fifteen, with their centres.
-        offsets: at which the model reads spectra, ppm, ascending; None: `framework.spectra.offsets.OFFSETS`. Others are
-            resampled.
-        band: rows.
-        noise: greatest standard deviation of what is added to a training spectrum, drawn anew for each.
-        shift: greatest shift of a training spectrum's lines, ppm; a fitted centre of water moves with it.
-        side: of the generated slice, voxels.
-        data_seed: of the generated slice.
-        unreadable: what becomes of a bad file in a folder that is predicted for: it is listed and left out, or refused.
+        root: a file, see volumes.py, or a folder with brain.npz; None to generate a slice.
+        preset: "ten" numbers, amplitude and width of five pools, or "fifteen", with their centres.
+        offsets: offsets at which the model reads spectra, ppm, ascending; None for `framework.spectra.offsets.OFFSETS`.
+            Spectra at other offsets are resampled.
+        band: number of rows of a band.
+        noise: greatest standard deviation of the noise that is added to training spectra; it is drawn for each
+            spectrum.
+        shift: greatest shift of a training spectrum's lines, ppm; a fitted centre of water is shifted too.
+        side: side of the generated slice, voxels.
+        data_seed: seed of the generated slice.
+        unreadable: treatment of a bad file in a folder for prediction: list it and leave it out, or refuse the folder.
     """
 
     bibtex = """@article{glang2019deepcest,
@@ -110,10 +113,12 @@ class CEST(Data, Mapped):
 
     @cached_property
     def offsets(self) -> tuple[float, ...]:
+        """Offsets at which the model reads spectra, ppm."""
         return offsets_of(self.given)
 
     @property
     def wanted(self) -> Parameters:
+        """Parameters that are fitted to each spectrum."""
         return Parameters.of(self.preset)
 
     def prepare(self) -> None:
@@ -155,7 +160,7 @@ class CEST(Data, Mapped):
         return generated(folder("cest") / name, mark, partial(write_slice, **asked)) / FILE, True
 
     def _fits(self, spectra: Tensor) -> Float[Tensor, "voxel p"]:
-        """The fits, from the cache if they are there."""
+        """Return the fits, from the cache if they are kept there."""
         key = hashlib.sha256(
             spectra.numpy().tobytes() + repr((FITTED, self.wanted, self.offsets)).encode()
         ).hexdigest()[:24]
@@ -207,13 +212,18 @@ class CEST(Data, Mapped):
         return Fields(input=spectra, index=torch.arange(len(spectra)))
 
     def write_maps(self, file: Path, point: Tensor, deviation: Tensor, folder: Path) -> Sequence[Path]:
+        """Write the maps of the predictions for a volume, and return the files."""
         from plugins.data.cest.maps import write_maps
 
         return write_maps(file, self.wanted.target, point, deviation, folder, synthetic=self.synthetic)
 
     def augment(self, batch: Batch) -> Batch:
-        """Noise of a random strength, and lines at a random shift of B0 with what they left unexplained; cubes of even
-        shares of either's greatest, so that most spectra stay nearly as they are and some are far off."""
+        """Return a batch with random noise and a random B0 shift of the lines; what the fit left unexplained is not
+        shifted.
+
+        Strength of noise and shift are cubes of uniform numbers times the greatest value, so that most spectra stay
+        nearly unchanged and some change strongly.
+        """
         spectra, target, lines = batch["input"], batch["target"], batch["lines"]
         if self.shift:
             moved = self.shift * (2 * torch.rand(len(spectra), device=spectra.device) - 1) ** 3
@@ -243,7 +253,7 @@ class CEST(Data, Mapped):
 
 
 def _remarks(volume: Volume, offsets: Sequence[float]) -> tuple[str, ...]:
-    """What of a volume is not read as it is."""
+    """Return sentences on what of a volume is left out or resampled."""
     said = []
     outside = math.prod(volume.shape) - len(volume.spectra) - volume.dropped
     if outside:

@@ -1,4 +1,7 @@
-"""A brain-like slice of Z-spectra in the layout that is read: tissues, a tumour-like region, B0 shift and noise."""
+"""Generator of a brain-like slice of Z-spectra, with tissues, a tumour-like region, B0 shift and noise.
+
+It writes the layout that `read_volume` reads.
+"""
 
 from pathlib import Path
 
@@ -18,22 +21,25 @@ TISSUES = np.array(
         [0.80, 0.050, 0.09, 0.07, 0.10, 1.10, 1.0, 4.8, 50.0, 4.5],  # tumour: more amide, less NOE and MT
     ]
 )
-"""Typical of what is fitted to a human brain at 7 T; those of the tumour after Zaiss et al. (2015)."""
+"""Parameters typical of fits to a human brain at 7 T; those of the tumour follow Zaiss et al. (2015)."""
 VARIATION = 0.08
-"""Standard deviation of a parameter within a tissue, as a share of it; smooth over the slice."""
+"""Relative standard deviation of a parameter within a tissue; the variation is smooth over the slice."""
 
 
 def write_slice(folder: Path, *, side: int, noise: float, shift: float, data_seed: int) -> None:
-    """`brain.npz`: spectra (side, side, offset), offsets, mask, region (1: tumour), and the true parameters.
+    """Write `brain.npz`: spectra (side, side, offset), offsets, mask, region (1: tumour), and the true parameters.
 
     Args:
+        folder: folder of the file.
+        side: side of the slice, voxels.
         noise: standard deviation of each number of a spectrum.
         shift: standard deviation of the smooth B0 shift, ppm.
+        data_seed: seed of all draws.
     """
     generator = np.random.default_rng((data_seed, 42))
 
     def field(smooth: float) -> np.ndarray:
-        """Smooth, of mean 0 and standard deviation 1."""
+        """Return a smooth random field of mean 0 and standard deviation 1."""
         found = gaussian_filter(generator.normal(size=(side, side)), smooth * side, mode="reflect")
         return (found - found.mean()) / found.std()
 

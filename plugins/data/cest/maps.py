@@ -1,4 +1,4 @@
-"""Maps of what is predicted for a volume's voxels, with their standard deviations: files and a picture."""
+"""Maps of the predictions for a volume's voxels, with their standard deviations: files and a figure."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,19 +12,25 @@ from plugins.data.cest.maps_picture import SHOWN, Maps, pictured
 from plugins.data.cest.volumes import Volume, read_volume
 
 ASYMMETRIC = 3.5
-"""Offset of the amide protons, ppm, at which the asymmetry is told."""
+"""Offset of the amide protons, ppm, at which the asymmetry is reported."""
 ASYMMETRY = "mtr_asymmetry_3.5_ppm"
 
 
 def write_maps(
     file: Path, names: Sequence[str], point: Tensor, deviation: Tensor, folder: Path, *, synthetic: bool
 ) -> Sequence[Path]:
-    """`<file>_maps.npz` (a map of each name, of each with `_deviation`, and of the asymmetry; NaN where there is no
-    voxel), of a NIfTI file `_maps.nii.gz` with the maps' names beside it, the picture, and a list of bad voxels.
+    """Write the predicted maps of a volume, and return the files.
+
+    The files are `<file>_maps.npz` (a map of each name, one of each name with `_deviation`, and one of the asymmetry;
+    NaN where there is no voxel); for a NIfTI file also `_maps.nii.gz`, with the maps' names beside it; the figure; and
+    a list of bad voxels if there are any.
 
     Args:
-        names: of the numbers predicted.
-        point, deviation: (voxel, number), of the file's voxels in their order.
+        file: the volume.
+        names: names of the predicted numbers.
+        point: point predictions (voxel, number), for the file's voxels in their order.
+        deviation: standard deviations, of the same shape.
+        folder: folder of the written files.
         synthetic: whether the model learnt from generated spectra.
     """
     volume = read_volume(file)
@@ -52,7 +58,9 @@ def maps_of(
     point: Float[np.ndarray, "voxel number"],
     deviation: Float[np.ndarray, "voxel number"],
 ) -> dict[str, np.ndarray]:
-    """Each (x, y, z), NaN where there is no voxel; amplitudes as shares of the unsaturated signal."""
+    """Return the maps by name, each (x, y, z), NaN where there is no voxel; amplitudes are shares of the unsaturated
+    signal.
+    """
     columns = {ASYMMETRY: asymmetry(volume)}
     for number, name in enumerate(names):
         columns[name], columns[f"{name}_deviation"] = point[:, number], deviation[:, number]
@@ -64,7 +72,7 @@ def maps_of(
 
 
 def asymmetry(volume: Volume) -> Float[np.ndarray, "voxel"]:
-    """Z(-Δω) - Z(Δω), of the spectra as measured: B0 is not corrected (Zhou et al. 2003, eq. 1)."""
+    """Return Z(-Δω) - Z(Δω) of the measured spectra; B0 is not corrected (Zhou et al. 2003, eq. 1)."""
     left, right = (
         np.array([np.interp(sign * ASYMMETRIC, volume.offsets, spectrum) for spectrum in volume.spectra])
         for sign in (-1, 1)
@@ -73,7 +81,7 @@ def asymmetry(volume: Volume) -> Float[np.ndarray, "voxel"]:
 
 
 def slice_of(maps: Mapping[str, np.ndarray], volume: Volume) -> Maps:
-    """Of the slice with most voxels, cut to them: what is shown, with its deviation."""
+    """Return the maps to show of the slice with most voxels, cropped to them, each with its deviation."""
     where = np.bincount(volume.place[:, 2]).argmax()
     rows, columns = volume.place[volume.place[:, 2] == where, :2].T
     frame = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1, where]

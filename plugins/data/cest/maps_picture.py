@@ -1,4 +1,4 @@
-"""Contrast maps of a slice in a picture, standard deviations below them."""
+"""Figure of the contrast maps of a slice, with standard deviations below them."""
 
 from collections.abc import Mapping
 
@@ -15,18 +15,19 @@ SHOWN = {
     "amine_amplitude": "amine, 2 ppm",
     "water_amplitude": "water",
 }
-"""Which numbers are mapped, with their headings; the asymmetry of the spectra beside them."""
+"""Name of each mapped number and its heading; the asymmetry of the spectra is shown beside them."""
 Maps = Mapping[str, tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"] | None]]
-"""Of each name its map and that of its standard deviation, NaN outside the brain."""
+"""Map of each name and map of its standard deviation, NaN outside the brain."""
 SIZE = 2.1
-"""Of a map, inches."""
+"""Side of a map, inches."""
 
 
 def pictured(methods: Mapping[str, Maps], title: str) -> Figure:
-    """Two rows a method, what is predicted and its standard deviation, in percent of the unsaturated signal.
+    """Return a figure with two rows for each method, prediction and standard deviation, in % of the unsaturated signal.
 
-    Contrasts have the field's rainbow, asymmetry a scale about 0, standard deviations one of one colour. A column's
-    methods share their scales, which end at the 1 % and 99 % quantiles of the first.
+    Contrasts use the rainbow colours that are usual in the field, the asymmetry a scale centred on 0, and standard
+    deviations a sequential scale. The methods of a column share their scales, which end at the 1 % and 99 % quantiles
+    of the first method.
     """
     columns = list(next(iter(methods.values())))
     figure = titled_figure((SIZE * len(columns) + 0.8, (SIZE + 0.35) * 2 * len(methods) + 0.4), title, False)

@@ -16,18 +16,19 @@ from framework.storage.text import decoded, require_numbers_in, words_of
 
 PACKED = b"\x1f\x8b"
 MASKS = (".mask.nii.gz", ".mask.nii")
-"""How the names of masks end."""
+"""Endings of the names of mask files."""
 SECOND = (540).to_bytes(4, "little"), (540).to_bytes(4, "big")
-"""How NIfTI-2 begins: the bytes of its header."""
+"""First bytes of a NIfTI-2 file: the size of its header."""
 
 
 def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
-    """Images of `file` and their `affine`; `offsets` of `<name>.offsets.txt` and `mask` of `<name>.mask.nii.gz` or
-    `<name>.mask.nii` beside it, this if it is there.
+    """Read the images of `file` and their `affine`, the `offsets` beside it, and the `mask` if there is one.
+
+    Offsets are in `<name>.offsets.txt`; the mask is in `<name>.mask.nii.gz` or `<name>.mask.nii`.
 
     Raises:
-        DataError: no offsets are beside it.
-        Exception: what nibabel raises on damage.
+        DataError: there is no file of offsets beside it.
+        Exception: nibabel's own errors on a damaged file.
     """
     name = re.sub(r"\.nii(\.gz)?$", "", file.name, flags=re.IGNORECASE)
     beside = file.with_name(f"{name}.offsets.txt")
@@ -59,7 +60,7 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
 
 
 def write_nifti(file: Path, maps: np.ndarray, affine: np.ndarray) -> None:
-    """Maps (x, y, z, map), float32, that lie where the spectra lay."""
+    """Write maps (x, y, z, map), float32, at the place of the spectra."""
     nibabel.Nifti1Image(maps.astype(np.float32), affine).to_filename(file)
 
 

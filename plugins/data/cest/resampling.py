@@ -1,4 +1,4 @@
-"""Z-spectra that were measured at other offsets than the model reads."""
+"""Resampling of Z-spectra that were measured at other offsets than the model reads."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from framework.errors import DataError
 
 SAME = 1e-3
-"""Offsets that differ by no more, ppm, are the same."""
+"""Greatest difference, ppm, of offsets that count as the same."""
 
 
 def resampled(
@@ -18,15 +18,19 @@ def resampled(
     wanted: Sequence[float],
     where: str,
 ) -> Float[np.ndarray, "voxel wanted"]:
-    """Spectra as the model reads them: as they are where the offsets are the same, else by cubic pieces that overshoot
-    nowhere (Fritsch & Carlson 1980).
+    """Return spectra at the model's offsets.
+
+    Spectra are unchanged where the offsets are the same; otherwise they are interpolated by piecewise cubics that do
+    not overshoot (Fritsch & Carlson 1980).
 
     Args:
-        given: ascending.
-        where: the file, for the message.
+        spectra: the measured spectra.
+        given: their offsets, ascending, ppm.
+        wanted: the model's offsets, ascending, ppm.
+        where: name of the file, for the message.
 
     Raises:
-        DataError: the given offsets do not reach as far as the wanted ones, or are too few to follow the lines.
+        DataError: the given offsets do not reach as far as the wanted ones, or are too few to resolve the lines.
     """
     if len(given) == len(wanted) and np.abs(given - wanted).max() <= SAME:
         return spectra

@@ -1,4 +1,4 @@
-"""Rows of the contract: a small slice, generated and in MATLAB's and NumPy's files."""
+"""Rows of the contract: a small slice, generated, and in MATLAB's and NumPy's files."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,7 +32,7 @@ def as_matlab(folder: Path) -> Mapping[str, str]:
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """A piece of one slice in NumPy's file, one of another in MATLAB's."""
+    """Write a part of one slice in a NumPy file, and a part of another in a MATLAB file."""
     first, second = (slice_of(folder, seed)["spectra"][8:16, 8:16] for seed in (1, 2))
     (folder / "brain.npz").unlink()
     np.savez(folder / "mine_1.npz", spectra=first, offsets=OFFSETS)

@@ -1,4 +1,4 @@
-"""Reads Z-spectra volumes: MATLAB 5 (.mat), NumPy (.npz), and NIfTI (.nii, .nii.gz) beside a list of offsets."""
+"""Reading of Z-spectra volumes: MATLAB 5 (.mat), NumPy (.npz), and NIfTI (.nii, .nii.gz) beside a list of offsets."""
 
 import math
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ SUFFIXES = (".mat", ".npz", ".nii", ".gz")
 SPECTRA = ("spectra", "rawData")
 KNOWN = ("offsets", "M0", "mask", "region", "affine")
 UNSATURATED = 100.0
-"""From this offset on, ppm, nothing is saturated: such images are M0, by which the others are divided."""
+"""Offset, ppm, from which nothing is saturated: images there are M0, by which the others are divided."""
 PLAUSIBLE = 2.0
-"""Z is about 1 at most; from here on a volume was not divided by M0."""
+"""Upper limit of a plausible Z, which is about 1 at most; above it, a volume was not divided by M0."""
 WANTED = (
     "Wanted: `spectra` (or `rawData`), the voxels' axes first and the offsets last, and `offsets` in ppm; where there "
     "are, `M0` (or images at 100 ppm or more) and `mask`, of the voxels' axes."
@@ -28,16 +28,18 @@ WANTED = (
 
 
 class Volume(NamedTuple):
-    """Attributes:
-    offsets: (offset,), ppm, ascending.
-    spectra: (voxel, offset), Z of the voxels within the mask.
-    place: (voxel, 3), where each lies.
-    region: (voxel,), a number of `regions`.
-    shape: of the whole volume.
-    regions: names.
-    left_out: (dropped, 3), voxels of the mask with a number that is not finite.
-    affine: of a NIfTI file, voxels to millimetres; None of others.
-    unread: names of what else the file holds.
+    """Z-spectra of the voxels of a volume.
+
+    Attributes:
+        offsets: (offset,), ppm, ascending.
+        spectra: (voxel, offset), Z of the voxels within the mask.
+        place: (voxel, 3), index of each voxel in the volume.
+        region: (voxel,), index into `regions`.
+        shape: shape of the whole volume.
+        regions: names of the regions.
+        left_out: (dropped, 3), voxels of the mask with a number that is not finite.
+        affine: for a NIfTI file, the transform from voxels to millimetres; otherwise None.
+        unread: names of other arrays in the file.
     """
 
     offsets: Float[np.ndarray, "offset"]
@@ -52,14 +54,15 @@ class Volume(NamedTuple):
 
     @property
     def dropped(self) -> int:
+        """Number of voxels of the mask that are left out."""
         return len(self.left_out)
 
 
 def read_volume(file: Path) -> Volume:
-    """One file's spectra, divided by M0 where that is there.
+    """Read the spectra of one file, divided by M0 if the file holds it.
 
     Raises:
-        DataError: it is missing, damaged, of another layout, or holds no voxel; says what was wanted.
+        DataError: the file is missing, damaged, of another layout, or holds no voxel; the message says what was wanted.
     """
     with guarded(file, "a volume of Z-spectra", WANTED):
         found = _found(file)
@@ -138,7 +141,7 @@ def _volume(found: Mapping[str, Any], size: int) -> Volume:
 
 
 def _normalised(spectra: np.ndarray, offsets: np.ndarray, given: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Divided by M0; where that is 0 a voxel becomes NaN."""
+    """Return spectra divided by M0, and their offsets; a voxel becomes NaN where M0 is 0."""
     far = np.abs(offsets) >= UNSATURATED
     if far.all():
         raise DataError(f"every offset is {UNSATURATED:g} ppm or more. They are to be in ppm, not in Hz.")
@@ -154,7 +157,7 @@ def _normalised(spectra: np.ndarray, offsets: np.ndarray, given: Any) -> tuple[n
 
 
 def _mask(given: Any, spectra: np.ndarray) -> Bool[np.ndarray, "x y z"]:
-    """Which voxels are meant; where nobody says, those with any number other than 0."""
+    """Return the mask of voxels to read; without a given mask, voxels with any number other than 0."""
     if given is None:
         return np.asarray(np.nan_to_num(spectra, nan=1.0).any(-1))
     return np.asarray(np.nan_to_num(real(given, "mask").reshape(spectra.shape[:-1])) > 0)
