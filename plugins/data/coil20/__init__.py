@@ -1,0 +1,1 @@
+"""Data set COIL-20: 20 objects seen from all sides on a turntable."""

@@ -1,4 +1,4 @@
-"""Reads COIL-20, real objects on a turntable; the contract is framework.data's."""
+"""Data set COIL-20, real objects on a turntable; framework.data describes the contract."""
 
 import hashlib
 import math
@@ -27,12 +27,13 @@ GROUPS = ("unique", "look-alikes")
 class COIL20(Data):
     """Columbia Object Image Library: 20 objects seen every 5° of a turntable (Nene, Nayar & Murase 1996).
 
-    Views every `every` degrees are for training, those in the middle between two of them for validation, all others
-    for the test: what is learnt is to interpolate. A training batch is drawn from the objects' appearance manifolds,
-    periodic cubic splines through the training views (Murase & Nayar 1995), at random angles, if `interpolate` says so.
+    Views every `every` degrees are for training, the views in the middle between two of them for validation, and all
+    others for the test; the model must therefore interpolate between views. With `interpolate`, a training batch is
+    drawn at random angles from the objects' appearance manifolds, periodic cubic splines through the training views
+    (Murase & Nayar 1995).
 
-    Results are also reported apart for the objects that look alike from two opposite sides: those whose training
-    views half a turn apart are nearer to one another than neighbouring ones, on the mean.
+    Results are also reported separately for the objects that look alike from two opposite sides: objects whose training
+    views half a turn apart are on average closer to one another than neighbouring views.
     """
 
     bibtex = """@techreport{nene1996coil20,
@@ -113,7 +114,7 @@ class COIL20(Data):
         return {**batch, "input": images.augmented(batch["input"], never, self.jitter)}
 
     def _interpolated(self, batch: Batch) -> Batch:
-        """Turn each object of a batch by up to half a step between two training views."""
+        """Return the batch with each object turned at random by up to half a step between two training views."""
         target = batch["target"]
         shift = (torch.rand(len(target), 1, device=target.device) - 0.5) * math.radians(self.every)
         turned = target + shift

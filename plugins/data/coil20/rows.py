@@ -1,4 +1,4 @@
-"""Rows of the contract: a turntable that one blob goes round, as the distributed MATLAB file."""
+"""Rows of the contract: a blob that moves around a turntable, as the distributed MATLAB file."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +11,7 @@ from framework.testing.sample_files import images
 
 
 def turntable(symmetric: bool = False) -> np.ndarray:
-    """20 objects × 72 views (20, 72, 32, 32): a blob going round, twice a turn where it is symmetric."""
+    """Return 20 objects × 72 views (20, 72, 32, 32): a blob that goes round once a turn, or twice if symmetric."""
     angle = np.radians(5) * np.arange(72) * (2 if symmetric else 1)
     row, column = np.mgrid[:32, :32]
     views = []

@@ -1,4 +1,4 @@
-"""Reads COIL-20 as it is distributed: one MATLAB file, or the folder of processed images."""
+"""Reading of COIL-20 as it is distributed: one MATLAB file, or the folder of processed images."""
 
 from pathlib import Path
 
@@ -20,10 +20,10 @@ WANTED = (
 
 
 def read_views(root: str | None, side: int) -> UInt8[Tensor, "object view 1 side side"]:
-    """Read every view of every object, view k at 5k degrees.
+    """Read every view of every object; view k is at 5k degrees.
 
     Raises:
-        DataError: no root, neither layout in it, a file missing, unreadable or of another shape.
+        DataError: there is no root, it has neither layout, or a file is missing, unreadable or of another shape.
     """
     if root is None:
         raise DataError(
