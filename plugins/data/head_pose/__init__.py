@@ -1,1 +1,1 @@
-"""Head pose from images: IDIAP, TownCentre and CAVIAR as published, and generators that write their layouts."""
+"""Data sets of head pose: IDIAP, TownCentre and CAVIAR as published, and generators that write their layouts."""

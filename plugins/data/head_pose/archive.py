@@ -1,4 +1,4 @@
-"""Finds the images of a data set: in the unpacked archive, or drawn into the cache in the archive's layout."""
+"""Folder of a data set's images: the unpacked archive, or one drawn into the cache in the archive's layout."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from framework.storage import cache, generated
 from plugins.data.head_pose import synthetic_heads
 
 TRAIN_AND_TEST = ("train", "test")
-"""The folders of the archives that are published in two splits."""
+"""Folders of the archives that are published in two splits."""
 Label = TypeVar("Label")
 
 
 class Archive(NamedTuple):
-    """A data set as it was published, and what draws heads in its layout.
+    """Published data set, and a function that draws heads in its layout.
 
     Attributes:
-        name: of its folder in the cache.
-        folder: what the archive unpacks to.
-        parts: what lies in that folder; names of folders end in a slash.
-        version: of `draw`; a change in what it draws or writes takes a new number, and with it a new folder.
-        draw: writes so many images, drawn from a seed, into an empty folder.
+        name: name of its folder in the cache.
+        folder: name of the folder that the archive unpacks to.
+        parts: entries of that folder; names of folders end in a slash.
+        version: version of `draw`; a change in what it draws or writes takes a new number, and thus a new folder.
+        draw: function that writes the given number of images, drawn from a seed, into an empty folder.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Archive(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """A user's folder `root` or, where that is None, a folder of so many images drawn from a seed."""
+    """User's folder `root` or, if it is None, a folder with the given number of images drawn from a seed."""
 
     archive: Archive
     root: str | None
@@ -46,7 +46,7 @@ class Source:
     seed: int
 
     def folder(self) -> Path:
-        """Check the user's folder, or draw the images unless they are there; the folder to read.
+        """Return the folder to read: the user's, which is checked, or one whose images are drawn unless they are there.
 
         Raises:
             DataError: the user's folder is missing or lacks a part, or the cache cannot be written or holds something
@@ -70,7 +70,7 @@ class Source:
         return generated.generated(place, mark, lambda root: self.archive.draw(root, self.images, self.seed))
 
     def generated_in(self) -> Path | None:
-        """Name the cache folder that holds what was drawn; None for a user's folder."""
+        """Return the cache folder of drawn images; None for a user's folder."""
         return cache.folder(self.archive.name) if self.root is None else None
 
     def fingerprint(self, synthetic: bool) -> dict[str, str]:
@@ -94,7 +94,7 @@ class Source:
 
 
 def wrong_layout(root: Path, folder: str, missing: str) -> DataError:
-    """Make the complaint about a root that does not hold what the archive unpacks to `folder`."""
+    """Return the error for a root that does not hold what the archive unpacks to `folder`."""
     inner = root / folder
     hint = f"Did you mean {inner}?" if inner.is_dir() else "Unpack the whole archive there."
     return DataError(f"data.root = {root} is not laid out as {folder}: no {missing}. {hint}")
@@ -107,12 +107,14 @@ def draw_train_and_test(
     what: str,
     draw: Callable[[int], tuple[str, NDArray[np.uint8], Label]],
 ) -> dict[str, list[Label]]:
-    """Write so many JPEG images into train/ and test/, and give the labels of both in the images' order.
+    """Write JPEG images into train/ and test/, and return the labels of both in the images' order.
 
     Args:
+        root: folder to write into.
+        images: number of images.
         train_share: share of the images, the first ones, that are for training.
-        what: the images are called in the progress bar.
-        draw: gives name, pixels and label of an image by its number.
+        what: name of the images in the progress bar.
+        draw: function that returns name, pixels and label of an image by its number.
     """
     train = round(train_share * images)
     labels: dict[int, Label] = {}

@@ -1,4 +1,4 @@
-"""The CAVIAR crops with partly hidden heads, and drawn ones in their layout: train/ and test/, `or_label.mat`."""
+"""Data set of CAVIAR crops with partly hidden heads, published or drawn: train/ and test/, `or_label.mat`."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ AS_PUBLISHED = Reading(image_size=SIDE)
 class Caviar(Heads):
     """Partly hidden heads of people in a shopping centre, and their gaze; generated where no root is given.
 
-    Training mirrors no image: the thesis authors' data hold no mirror images.
+    Training mirrors no image, because the thesis authors' data hold no mirror images.
     """
 
     bibtex = """@misc{fisher2005caviar,

@@ -1,7 +1,7 @@
-"""Reads and writes the label file of the CAVIAR crops, `or_label.mat`: MATLAB 5.
+"""Reading and writing of the label file of the CAVIAR crops, `or_label.mat`: MATLAB 5.
 
-Its struct arrays `or_label_train` and `or_label_test` have one element an image, whose fields are by their order gaze
-(degrees), x, y, size and name without suffix; what the fields are called does not matter.
+Its struct arrays `or_label_train` and `or_label_test` have one element for each image, whose fields are by their order
+gaze (degrees), x, y, size and name without suffix; the names of the fields do not matter.
 """
 
 import io
@@ -22,17 +22,17 @@ HEADER = b"MATLAB 5.0 MAT-file, synthetic labels".ljust(116)  # SciPy's holds th
 
 
 class Label(NamedTuple):
-    """An image's name without suffix, and its gaze in degrees."""
+    """Name of an image without suffix, and its gaze in degrees."""
 
     name: str
     gaze: float
 
 
 def read_labels(file: Path) -> dict[str, list[Label]]:
-    """Read the labels of "train" and "test", in the file's order.
+    """Return the labels of "train" and "test", in the file's order.
 
     Raises:
-        DataError: the file cannot be read, lacks a struct array, or one of its elements is no label.
+        DataError: the file cannot be read, lacks a struct array, or one of its elements is not a label.
     """
     names = [f"or_label_{split}" for split in TRAIN_AND_TEST]
     content = read_variables(file, names)

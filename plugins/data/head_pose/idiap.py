@@ -1,4 +1,4 @@
-"""The IDIAP head-pose crops, and drawn heads in their layout: pictures in train/ and test/, `or_label_full.mat`."""
+"""Data set of IDIAP head-pose crops, published or drawn: images in train/ and test/, `or_label_full.mat`."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ AS_PUBLISHED = Reading(image_size=SIDE)
 class Idiap(Heads):
     """Heads of a few people in a meeting room, and their pan, tilt and roll; generated where no root is given.
 
-    Training mirrors no image: the published ones hold their mirror images already.
+    Training mirrors no image, because the published ones hold their mirror images already.
     """
 
     bibtex = """@inproceedings{ba2005evaluation,
@@ -78,13 +78,13 @@ class Idiap(Heads):
 
 
 def pose(random: np.random.Generator) -> Pose:
-    """Draw where a person at a table looks, mostly forwards and down."""
+    """Return a random pose of a person at a table, mostly forwards and down."""
     pan, tilt, roll = random.normal((0, -8, 0), (35, 14, 10)).clip((-90, -60, -45), (90, 45, 45))
     return Pose(float(pan), float(tilt), float(roll))
 
 
 def people(seed: int) -> list[Person]:
-    """Draw who sits there; the same people are in both splits, as in frames of the same recordings."""
+    """Return random people; the same people are in both splits, as in frames of the same recordings."""
     return [synthetic_heads.person(np.random.default_rng([seed, 1, number])) for number in range(PEOPLE)]
 
 

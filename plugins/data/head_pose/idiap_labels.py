@@ -1,7 +1,7 @@
-"""Reads and writes the label file of the IDIAP crops, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
+"""Reading and writing of the label file of the IDIAP crops, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
 
 In it the groups `or_label_train` and `or_label_test` are struct arrays: each of their fields pan, tilt, roll and name
-holds one reference an image, to a number or to UTF-16 text.
+holds one reference for each image, to a number or to UTF-16 text.
 """
 
 import math
@@ -19,24 +19,25 @@ from plugins.data.head_pose.archive import TRAIN_AND_TEST
 LABELS = "or_label_full.mat"
 ANGLES = ("pan", "tilt", "roll")
 ENOUGH = 20
-"""With more labels than this, none beyond ±2π is taken for radians."""
+"""Number of labels above which angles that all lie within ±2π are taken for radians."""
 MOST_LABELS, MOST_VALUES = 2**20, 2**12
-"""Labels of a split, and letters of a name."""
+"""Largest number of labels of a split, and of letters of a name."""
 HEADER = b"MATLAB 7.3 MAT-file, synthetic labels".ljust(116) + bytes(8) + b"\x00\x02IM"
 
 
 class Label(NamedTuple):
-    """An image's name and its angles pan, tilt and roll, in the file's unit."""
+    """Name of an image, and its angles pan, tilt and roll in the file's unit."""
 
     name: str
     angles: tuple[float, float, float]
 
 
 def read_labels(file: Path, angles_in: Literal["radians", "degrees"]) -> dict[str, list[Label]]:
-    """Read the labels of "train" and "test", in the file's order, angles in radians.
+    """Return the labels of "train" and "test", in the file's order, with angles in radians.
 
     Raises:
-        DataError: it is no such file, a field is missing or of another length, or the angles are not `angles_in`.
+        DataError: the file is of another kind, a field is missing or of another length, or the angles are not
+            `angles_in`.
     """
     wanted = (
         "the MATLAB 7.3 (HDF5) file of structs or_label_train and or_label_test with the fields pan, tilt, roll "
@@ -69,7 +70,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
-    """Read what a field's references lead to; a struct of one element holds its value itself."""
+    """Return what a field's references lead to; a struct of one element holds its value itself."""
     if field.dtype != h5py.ref_dtype:
         return [_values(content, field, MOST_VALUES)]
     return [
@@ -79,7 +80,7 @@ def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
 
 
 def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
-    """All of a small dataset, which must lie in the file itself: HDF5's library would read other files too."""
+    """Return all values of a small dataset, which must lie in the file itself, as HDF5 would read other files too."""
     chunk = math.prod(dataset.chunks or ())
     plain = dataset.dtype.kind in "iuf" or dataset.dtype == h5py.ref_dtype
     if not plain or max(dataset.size, chunk) > most:

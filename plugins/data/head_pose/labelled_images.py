@@ -1,4 +1,4 @@
-"""What the data sets of heads share: whole images with angles, read in three splits."""
+"""Base class of the data sets of heads: whole images with angles, read in three splits."""
 
 import hashlib
 import math
@@ -24,11 +24,11 @@ from plugins.data.head_pose.archive import Source
 
 SPLITS = Splits._fields
 SPLIT_SEED = 13
-"""The seed of the thesis authors' code, for NumPy's legacy generator."""
+"""Seed of the thesis authors' code, for NumPy's legacy generator."""
 
 
 class Labelled(NamedTuple):
-    """One image; angles in radians, any number of turns, in the order of the target's names."""
+    """One image; its angles are in radians, any number of turns, in the order of the target's names."""
 
     file: Path
     angles: tuple[float, ...]
@@ -36,13 +36,13 @@ class Labelled(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How images are read: whole, squared by repeating their border, and scaled.
+    """Settings for reading images: whole, made square by repeating their border, and scaled.
 
     Attributes:
         image_size: side of the square, pixels.
         test_blur: standard deviation of a Gaussian that blurs the test images, pixels of the square.
         jitter: how far training images are shifted, scaled and made brighter or darker, as a share.
-        skip_unreadable: leave images out that cannot be read, and count them.
+        skip_unreadable: whether to leave out, and count, images that cannot be read.
     """
 
     image_size: Annotated[int, Field(ge=8, le=1024)] = 50
@@ -51,21 +51,22 @@ class Reading:
     skip_unreadable: bool = False
 
     def crop(self, file: Path, split: str) -> Crop:
+        """Return the whole image as a crop; images of the test split are blurred."""
         return Crop(file, None, 0.0, self.image_size, blur=self.test_blur if split == "test" else 0.0)
 
     def own(self, files: Sequence[Path]) -> Fields | Crops:
-        """Read a user's own files without labels, turned as their EXIF entries say."""
+        """Return a user's own files without labels, rotated as their EXIF entries say."""
         return images.unlabelled(
             [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
         )
 
 
 class Loaded(NamedTuple):
-    """What can be trained on and tested with.
+    """Data of all splits.
 
     Attributes:
         tables: the fields "input" (uint8, colour), "target" (radians in [-π, π)), "group" (0) and "index" by split.
-        skipped: how many images were left out because they could not be read.
+        skipped: number of images that were left out because they could not be read.
         fingerprint: the splits' sizes, the test blur, and a hash over names and labels.
     """
 
@@ -75,12 +76,12 @@ class Loaded(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the labels of a data set say.
+    """Labels of a data set.
 
     Attributes:
         samples: images by split; without "validation" the published test set is halved.
-        faults: labels that could not be read; they count as unreadable images.
-        left_out: what else is missing from the splits, for the complaint about an empty one.
+        faults: errors of labels that could not be read; they count as unreadable images.
+        left_out: text on what else is missing from the splits, for the message about an empty one.
     """
 
     samples: dict[str, list[Labelled]]
@@ -89,20 +90,20 @@ class Found(NamedTuple):
 
 
 class Heads(Data):
-    """Pictures of heads and where they look. A data set of the family adds its constructor, what to cite, and `found`.
+    """Base class of data sets of head images and gaze; a data set adds its constructor, its citation, and `found`.
 
-    The constructor sets `source`, `reading`, `target`, and `signs` where mirror images are shown in training.
+    The constructor sets `source`, `reading`, `target`, and, if mirror images are shown in training, `signs`.
     """
 
     suffixes = images.SUFFIXES
     source: Source
     reading: Reading
     signs: tuple[float, ...] = ()
-    """What a mirror image multiplies the angles by; empty: no image is mirrored."""
+    """Factors of the angles in a mirror image; if empty, no image is mirrored."""
 
     @abstractmethod
     def found(self, root: Path) -> Found:
-        """What the labels in a folder say.
+        """Return the labels in a folder.
 
         Raises:
             DataError: the labels cannot be read.
@@ -139,7 +140,7 @@ class Heads(Data):
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
-    """Halve what was published as one test set into validation and test, as the thesis authors' code does."""
+    """Return validation and test halves of what was published as one test set, as in the thesis authors' code."""
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]
     return shuffled[: len(samples) // 2], shuffled[len(samples) // 2 :]
@@ -154,12 +155,15 @@ def load(
     generated_in: Path | None,
     left_out: str = "",
 ) -> Loaded:
-    """Read the images of all splits.
+    """Return the images of all splits.
 
     Args:
-        names: of the angles.
-        faults, left_out: as in Found.
-        generated_in: the cache folder of generated images; None: they are the user's.
+        samples: labelled images by split.
+        names: names of the angles.
+        reading: settings for reading images.
+        faults: errors of labels that could not be read.
+        generated_in: the cache folder of generated images; None for a user's images.
+        left_out: text on what else is missing from the splits.
 
     Raises:
         DataError: an angle is not finite, images cannot be read and are not to be skipped, or a split is empty.

@@ -1,4 +1,4 @@
-"""Folders as the three data sets are published, written by hand for the tests."""
+"""Folders in the layouts of the three published data sets, written for the tests."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,19 +15,21 @@ from framework.data import Data
 from framework.datasets.fields import Fields
 
 PEOPLE = 40
-"""In the folder of TownCentre heads, each with two images."""
+"""Number of people in the folder of TownCentre heads, with two images each."""
 CAVIAR_FIELDS = ("gaze", "x", "y", "size", "name")
 Row = tuple[str, float, float, float]
 """Name, pan, tilt and roll of an IDIAP image."""
 
 
 def prepared(name: str, root: Path | None, **config: Any) -> Any:
+    """Return the prepared data set of this name, with a folder as its root."""
     data = schema.build("data", schema.resolve("data", {"name": name, "root": root and str(root), **config}))
     data.prepare()
     return data
 
 
 def table(data: Data, split: str) -> Mapping[str, Tensor]:
+    """Return the fields of a split."""
     dataset = getattr(data.splits(), split)
     assert isinstance(dataset, Fields)
     return dataset.fields
@@ -37,6 +39,7 @@ def table(data: Data, split: str) -> Mapping[str, Tensor]:
 
 
 def write_idiap(place: Path) -> Path:
+    """Write a folder of IDIAP images with their labels, and return it."""
     _write_images(place, 75, "head_{}.png")
     publish_idiap(place)
     return place
@@ -51,13 +54,14 @@ def publish_idiap(
 
 
 def idiap_row(number: int) -> Row:
+    """Return the label of the image of a number, with angles in radians."""
     return f"head_{number}.png", 0.1 * number - 1.5, 0.02 * number, -0.05 * number
 
 
 def save_idiap(file: Path, *, column: bool = True, **structs: Sequence[Row]) -> None:
-    """A file as MATLAB 7.3 writes struct arrays: cells in #refs#, and fields of references to them.
+    """Write a file as MATLAB 7.3 writes struct arrays: cells in #refs#, and fields of references to them.
 
-    Text is UTF-16 code units down a column; a row of structs gives columns of references, a column a row.
+    Text is UTF-16 code units down a column. A row of structs gives columns of references, a column of structs a row.
     """
     with h5py.File(file, "w", userblock_size=512) as content:
         cells = content.create_group("#refs#")
@@ -82,6 +86,7 @@ def save_idiap(file: Path, *, column: bool = True, **structs: Sequence[Row]) -> 
 
 
 def write_caviar(place: Path) -> Path:
+    """Write a folder of CAVIAR images with their labels, and return it."""
     _write_images(place, 50, "head_{}_x.jpg")
     publish_caviar(place)
     return place
@@ -93,16 +98,17 @@ def publish_caviar(root: Path, train: Iterable[int] = range(20), test: Iterable[
 
 
 def caviar_row(number: int) -> list[Any]:
-    """Gaze of 10° × number - 180°, whole numbers as MATLAB's uint8 would be, and a name with a number in it."""
+    """Return a label whose gaze is 10° × number - 180°, with a uint8 number as MATLAB writes whole ones, and a name."""
     return [10.0 * number - 180, np.uint8(25), 25.5, 50.0, f"head_{number}_x"]
 
 
 def save_caviar(root: Path, train: np.ndarray, test: np.ndarray) -> None:
+    """Write two struct arrays as the label file of the CAVIAR crops."""
     scipy.io.savemat(root / "or_label.mat", {"or_label_train": train, "or_label_test": test, "other": 3})
 
 
 def struct_array(rows: Sequence[Sequence[Any]], names: Sequence[str] = CAVIAR_FIELDS) -> np.ndarray:
-    """A MATLAB struct array, one element a row."""
+    """Return a MATLAB struct array with one element for each row."""
     array = np.empty((1, len(rows)), dtype=[(name, object) for name in names])
     for index, row in enumerate(rows):
         array[0, index] = tuple(row)
@@ -121,7 +127,7 @@ def _write_images(place: Path, side: int, name: str) -> None:
 
 
 def write_towncentre(place: Path) -> Path:
-    """Forty people with two images each, pan 10° × person and 5° more; the names as published have more numbers."""
+    """Write forty people with two images each, pan 10° × person and 5° more; published names have more numbers."""
     for person in range(PEOPLE):
         folder = place / f"person{person}"
         folder.mkdir(parents=True)
@@ -135,4 +141,5 @@ def write_towncentre(place: Path) -> Path:
 
 
 def pixels(number: int, side: int = 50) -> np.ndarray:
+    """Return an image of noise, which depends on the number."""
     return np.random.default_rng(number).integers(0, 256, (side, side, 3), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Rows of the contract: a few generated heads of each set, in its official layout."""
+"""Rows of the contract: a few generated heads of each data set, in its official layout."""
 
 from framework.testing.rows import DAMAGES, DataRow
 from framework.testing.sample_files import images
@@ -31,7 +31,7 @@ ROWS = {
             {"images": 200, "image_size": 12},
             synthetic=True,
             files=images,
-            # an image and its label tell of each other: one alone is named by the label, or not missed
+            # a missing image is named by its label, but a missing label goes unnoticed
             fragile={
                 "0001/*.jpg": ("empty", "cut", "garbage", "folder"),
                 "0001/*.txt": ("empty", "cut", "garbage", "folder"),

@@ -1,8 +1,8 @@
 """Synthetic photographs of heads: ellipsoids cast by parallel rays, over clutter, through a poor camera.
 
-The camera looks along -z, x is right in the picture, y up. A head's own frame has x towards its left, y towards its
-crown, z out of its face; at pan, tilt and roll 0 both frames agree and the face looks into the camera. Lengths are in
-half heights of a head.
+The camera looks along -z; x is right in the image and y is up. A head's own frame has x towards its left, y towards its
+crown, and z out of its face; at pan, tilt and roll 0 both frames agree and the face looks into the camera. Lengths are
+in half heights of a head.
 
 `no_type_check` keeps the type checks that tests switch on from wrapping the kernel before it is compiled.
 """
@@ -23,10 +23,10 @@ from framework.storage.kernels import compiler, kept_in
 compiled = compiler(kept_in("synthetic_heads", [Path(__file__)]))
 
 VERSION = 1
-"""The version of what is drawn; a change takes a new number, which the marks of generated data hold."""
+"""Version of what is drawn; a change takes a new number, which the marks of generated data hold."""
 Array = NDArray[np.float64]
 SAMPLES = 2
-"""So many rays are cast along each side of a pixel."""
+"""Number of rays along each side of a pixel."""
 CLOTH, SKIN, HAIR = 0, 1, 2
 EYE, EYE_HEIGHT, MOUTH_HEIGHT = 0.31, 0.12, -0.52
 SKINS = ((0.93, 0.76, 0.66), (0.85, 0.65, 0.52), (0.70, 0.50, 0.38), (0.52, 0.35, 0.26), (0.40, 0.27, 0.20))
@@ -34,8 +34,11 @@ HAIRS = ((0.08, 0.07, 0.06), (0.20, 0.13, 0.09), (0.36, 0.24, 0.14), (0.62, 0.47
 
 
 class Pose(NamedTuple):
-    """Degrees. Pan > 0 turns the nose towards the picture's right, tilt > 0 lifts it, roll > 0 leans the crown to the
-    picture's left. A mirror image negates pan and roll."""
+    """Pan, tilt and roll in degrees.
+
+    Pan > 0 turns the nose towards the image's right, tilt > 0 lifts it, roll > 0 leans the crown to the image's left. A
+    mirror image negates pan and roll.
+    """
 
     pan: float
     tilt: float = 0.0
@@ -44,14 +47,14 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Person:
-    """What stays the same from picture to picture; colours (3,) in 0…1.
+    """Appearance of a person, which stays the same from image to image; colours (3,) in 0…1.
 
     Attributes:
         axes: half width, height and depth of the skull.
-        face_tilt, face_reach: how far below the forehead the hair's opening points, radians, and the cosine of its
-            angular radius; a reach of -1 leaves no hair.
-        long_hair, bun, hat: what else is on the head.
-        glasses, beard: the darkness of either, 0…1.
+        face_tilt: how far below the forehead the opening of the hair points, radians.
+        face_reach: cosine of the angular radius of that opening; -1 leaves no hair.
+        long_hair, bun, hat: whether these are on the head.
+        glasses, beard: darkness of either, 0…1.
         ears: size; 0 where hair hides them.
     """
 
@@ -71,16 +74,16 @@ class Person:
 
 
 class Conditions(NamedTuple):
-    """How pictures are taken; ranges are drawn from uniformly.
+    """Conditions of photographs; values are drawn uniformly from ranges.
 
     Attributes:
-        pixels: range of the camera's own pixels along a side; the picture is scaled to the side asked for.
+        pixels: range of the camera's own pixels along a side; the image is scaled to the requested side.
         height: range of the head's height, as a share of the side.
-        offset: largest shift of the head's middle from the picture's, as a share of the side.
+        offset: largest shift of the head's middle from the image's, as a share of the side.
         blur: largest standard deviation of the camera's blur, camera pixels.
         noise: largest standard deviation of its noise, of values in 0…1.
-        clutter: how many shapes stand in the background at most.
-        occluded: share of pictures in which something hides part of the head.
+        clutter: largest number of shapes in the background.
+        occluded: share of images in which something hides part of the head.
     """
 
     pixels: tuple[int, int]
@@ -93,7 +96,7 @@ class Conditions(NamedTuple):
 
 
 def person(random: Generator) -> Person:
-    """A random person: head shape, skin, hair and what is worn, drawn from the generator."""
+    """Return a random person: head shape, skin, hair and what is worn, drawn from the generator."""
     tone = int(random.integers(5))
     long_hair, bald, hat = random.random() < 0.3, random.random() < 0.1, random.random() < 0.15
     covered = long_hair and not bald
@@ -117,7 +120,7 @@ def person(random: Generator) -> Person:
 
 
 def rotation(pose: Pose) -> Array:
-    """(3, 3): from the head's frame to the camera's, R_y(pan) R_x(-tilt) R_z(roll)."""
+    """Return the rotation (3, 3) from the head's frame to the camera's, R_y(pan) R_x(-tilt) R_z(roll)."""
     pan, tilt, roll = (math.radians(angle) for angle in pose)
     about_y = [[math.cos(pan), 0, math.sin(pan)], [0, 1, 0], [-math.sin(pan), 0, math.cos(pan)]]
     about_x = [[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]]
@@ -128,7 +131,7 @@ def rotation(pose: Pose) -> Array:
 def photograph(
     random: Generator, who: Person, pose: Pose, side: int, conditions: Conditions
 ) -> NDArray[np.uint8]:
-    """Photograph a person's head, (side, side, 3)."""
+    """Return a photograph of a person's head, (side, side, 3)."""
     pixels = int(random.integers(conditions.pixels[0], conditions.pixels[1] + 1))
     scale = 0.5 * pixels * random.uniform(*conditions.height)  # camera pixels per half height
     middle = 0.5 * pixels + pixels * random.uniform(-1, 1, 2) * conditions.offset
@@ -157,19 +160,23 @@ def rendered(
     light: Array,
     strength: float,
 ) -> Array:
-    """Render head, neck and shoulders alone, (pixels, pixels, 4): colour times cover, and cover, 0…1.
+    """Return head, neck and shoulders alone, (pixels, pixels, 4): colour times cover, and cover, 0…1.
 
     Args:
+        who: the person.
+        pose: pose of the head.
+        body: pose of the shoulders.
+        pixels: side of the image, pixels.
         scale: pixels per half height.
-        middle: of the head (column, row), pixels from the picture's corner.
-        light: towards the lamp, any length.
+        middle: centre of the head (column, row), pixels from the image's corner.
+        light: direction towards the lamp, any length.
         strength: the lamp's share of the light, 0…1.
     """
     head, torso = rotation(pose), rotation(body)
     parts = _ellipsoids(who, head, torso)
     centers = np.array([center for center, _, _, _ in parts])
     frames = np.array([frame for _, frame, _, _ in parts])
-    # of |F (p - c)| = 1 along an axis of the camera: the length of that row of the inverse of F
+    # the extent of |F (p - c)| = 1 along an axis of the camera is the length of that row of the inverse of F
     reaches = np.linalg.norm(np.linalg.inv(frames), axis=2)
     colors = np.array([color for _, _, color, _ in parts])
     kinds = np.array([kind for _, _, _, kind in parts])
@@ -182,7 +189,7 @@ def rendered(
 
 
 def _ellipsoids(who: Person, head: Array, torso: Array) -> list[tuple[Array, Array, Array, int]]:
-    """List the centre, the matrix to the unit ball, the colour and the kind of every part."""
+    """Return the centre, the matrix to the unit ball, the colour and the kind of every part."""
     parts: list[tuple[Array, Array, Array, int]] = []
 
     def add(
@@ -285,7 +292,9 @@ def _cast(
 @compiled
 @no_type_check
 def _paint_face(point, look, color):
-    """Change the skin's colour where a feature lies; `point` in the head's frame, features seen from its front."""
+    """Change the skin's colour at facial features; `point` is in the head's frame, and features are seen from its
+    front.
+    """
     x, y = abs(point[0]), point[1]
     if point[2] < 0.15:
         return
@@ -319,12 +328,12 @@ def _paint_face(point, look, color):
 
 
 def _muted(random: Generator) -> Array:
-    """Draw a colour (3,) of any brightness and little saturation, as most things have."""
+    """Return a colour (3,) of any brightness and little saturation, as most things have."""
     return np.clip(random.uniform(0.1, 0.9) + random.normal(0, 0.05, 3), 0, 1)
 
 
 def background(random: Generator, pixels: int, clutter: int) -> Array:
-    """Draw smooth noise between two colours with up to `clutter` shapes before it, (pixels, pixels, 3)."""
+    """Return smooth noise between two colours with up to `clutter` shapes in front of it, (pixels, pixels, 3)."""
     first = _muted(random)
     second = np.clip(first + random.normal(0, 0.2) + random.normal(0, 0.04, 3), 0, 1)
     cells = int(random.integers(2, 7))
@@ -339,7 +348,7 @@ def background(random: Generator, pixels: int, clutter: int) -> Array:
 
 
 def _hidden(random: Generator, picture: Array, middle: Array, scale: float) -> Array:
-    """Put something before part of the head, which is at `middle` and has `scale` pixels per half height."""
+    """Return the image with a shape over part of the head, which is at `middle`, `scale` pixels per half height."""
     pixels = len(picture)
     turn, reach = random.uniform(0, 2 * math.pi), random.uniform(0.8, 1.3)
     place = middle + reach * scale * np.array([0.8 * math.cos(turn), math.sin(turn)])
@@ -348,7 +357,7 @@ def _hidden(random: Generator, picture: Array, middle: Array, scale: float) -> A
 
 
 def _shape(random: Generator, pixels: int, place: Array, size: Array) -> NDArray[np.bool_]:
-    """Mask a turned ellipse or rectangle of half lengths `size` about `place` (column, row)."""
+    """Return the mask of a rotated ellipse or rectangle of half lengths `size` about `place` (column, row)."""
     rows, columns = np.mgrid[:pixels, :pixels] + 0.5
     turn = random.uniform(0, math.pi)
     right, down = columns - place[0], rows - place[1]

@@ -1,4 +1,4 @@
-"""The TownCentre heads, and drawn ones in their layout: a folder a person, an image and a text file a head."""
+"""Data set of TownCentre heads, published or drawn: a folder for each person, an image and a text file per head."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ from plugins.data.head_pose.towncentre_labels import FOLDER, by_person, find_hea
 
 SIDE = 50  # pixels
 EACH = 8
-"""So many images show the same person."""
+"""Number of images that show the same person."""
 CONDITIONS = Conditions(
     pixels=(20, 46), height=(0.5, 0.66), offset=0.05, blur=0.9, noise=0.05, clutter=6, occluded=0.12
 )
@@ -29,7 +29,7 @@ class TownCentre(Heads):
     """Heads of pedestrians seen by a surveillance camera, and their pan; generated where no root is given.
 
     Attributes:
-        invalid: how many heads their label marks as not valid, which are left out; set by `prepare`.
+        invalid: number of heads that their labels mark as not valid, which are left out; set by `prepare`.
     """
 
     bibtex = """@inproceedings{benfold2009guiding,
@@ -59,7 +59,7 @@ class TownCentre(Heads):
     ) -> None:
         self.source = Source(ARCHIVE, root, images, generator_seed)
         self.reading = reading
-        # The mirror image of a head at pan p shows one at -p, 360° - p in the words of Beyer et al.
+        # The mirror image of a head at pan p shows a head at -p; Beyer et al. write 360° - p.
         self.signs = (-1.0,) if mirror else ()
 
     def found(self, root: Path) -> Found:
@@ -68,7 +68,7 @@ class TownCentre(Heads):
 
 
 def pose(heading: float, random: np.random.Generator) -> Pose:
-    """Draw where a person looks who walks towards `heading`, degrees."""
+    """Return a random pose of a person who walks towards `heading`, degrees."""
     pan = heading + random.normal(0, 35)
     return Pose(float(pan), float(random.normal(0, 6)), float(random.normal(0, 4)))
 
@@ -87,7 +87,7 @@ def _draw(root: Path, images: int, seed: int) -> None:
         if not valid:
             picture = picture[:5]  # a head that was cut off
         folder, stem = root / f"{person:04d}", f"synthetic_{person}_{number:06d}"
-        # the official names go on behind the stem as well
+        # the official names also have a part after the stem
         Image.fromarray(picture).save(folder / f"{stem}_{number % EACH}.jpg", quality=95)
         text = label_text((looks.pan + 180) % 360 - 180, valid)
         (folder / f"{stem}.txt").write_text(text, encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Reads the folders of the TownCentre heads: one a person, and in it for each image a text file with its label.
+"""Reading of the folders of the TownCentre heads: one folder for each person, and a text file for each image.
 
-`<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0; the image is the other file whose name
-starts with `<stem>`, and the second of the parts of its name that `_` separates is the person's number.
+The text file `<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0. Its image is the other file
+whose name starts with `<stem>`; the second of the parts of its name that `_` separates is the person's number.
 """
 
 import math
@@ -22,7 +22,7 @@ TRAIN_SHARE, VALIDATION_SHARE = 0.8, 0.1
 
 
 class Head(NamedTuple):
-    """An image of person number `person`; pan in radians, any number of turns."""
+    """Image of person number `person`; pan is in radians, any number of turns."""
 
     image: Path
     person: int
@@ -30,7 +30,7 @@ class Head(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The valid heads in a root, how many are marked as not valid, and the labels that cannot be used."""
+    """Valid heads in a root, number of heads that are marked as not valid, and errors of labels that cannot be used."""
 
     heads: list[Head]
     invalid: int
@@ -38,10 +38,10 @@ class Found(NamedTuple):
 
 
 def find_heads(root: Path) -> Found:
-    """Find all heads in a root, in the order of their names.
+    """Return all heads in a root, in the order of their names.
 
     Raises:
-        DataError: it holds no folder with label files.
+        DataError: the root holds no folder with label files.
     """
     found = Found([], 0, [])
     invalid, labels = 0, 0
@@ -66,10 +66,10 @@ def find_heads(root: Path) -> Found:
 
 
 def read_label(file: Path) -> tuple[float, bool]:
-    """Read pan in degrees, and whether the image may be used.
+    """Return pan in degrees, and whether the image may be used.
 
     Raises:
-        DataError: the file cannot be read, or its lines are others.
+        DataError: the file cannot be read, or its lines are not those of a label.
     """
     with guarded(file, "a label"):
         text = decoded(read_bytes(file))
@@ -87,7 +87,7 @@ def read_label(file: Path) -> tuple[float, bool]:
 
 
 def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
-    """Find the image of a label: of those that start with its stem, the one that does not go on with a digit."""
+    """Return the image of a label: among those that start with its stem, the one that has no digit after it."""
     stem = text.removesuffix(".txt")
     names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:
@@ -109,7 +109,7 @@ def _person(image: Path) -> int:
 
 
 def by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
-    """Split the people, 80, 10 and 10 % of them, as the thesis authors' code does."""
+    """Return the samples by split, 80, 10 and 10 % of the people, as in the thesis authors' code."""
     people = np.unique([head.person for head in heads])
     drawn = np.random.RandomState(SPLIT_SEED).rand(len(people))
     share = dict(zip(people.tolist(), drawn.tolist(), strict=True))
@@ -126,5 +126,5 @@ def _split(share: float) -> str:
 
 
 def label_text(pan: float, valid: bool) -> str:
-    """Write the content of a label file; `pan` in degrees."""
+    """Return the content of a label file; `pan` is in degrees."""
     return f"pan = {pan:+.2f}\nvalid = {int(valid)}\n"
