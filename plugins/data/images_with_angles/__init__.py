@@ -1,1 +1,1 @@
-"""A folder of images and a table of angles as a data set."""
+"""Data set of a folder of images with a table of angles."""

@@ -1,4 +1,4 @@
-"""Reads a user's own images and angles; the contract is framework.data's."""
+"""Data set of a user's own images and angles; framework.data describes the contract."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -22,10 +22,10 @@ from plugins.data.images_with_angles.table import SPLITS, Table, read_table
 
 
 class ImagesWithAngles(Data):
-    """Your own folder of images with a CSV table of their angles in degrees.
+    """Your own folder of images with a CSV table of their angles.
 
-    `mirror` names the angles that change sign in a mirror image; where it names any, half of the images are
-    mirrored in training.
+    Angles are degrees unless `angles_in` says radians. `mirror` names the angles that change sign in a mirror image; if
+    it names any, half of the training images are mirrored.
     """
 
     bibtex = """@misc{images_with_angles,
@@ -92,7 +92,7 @@ class ImagesWithAngles(Data):
                 )
 
     def _labels(self) -> tuple[Path, Table]:
-        """The folder, and what its table says."""
+        """Return the folder, and the table that was read from it."""
         if self.root is None:
             raise DataError("data.root is not set; wanted the folder that holds your images and their table.")
         root = Path(self.root).expanduser()

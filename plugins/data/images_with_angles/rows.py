@@ -1,4 +1,4 @@
-"""Rows of the contract: a folder of noise, as one has it, and grey and divided by the table."""
+"""Rows of the contract: images of noise, in colour and mirrored, and grey with splits from the table."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,7 +9,7 @@ from framework.testing.sample_files import images, noise_image
 
 
 def write(folder: Path, split: bool = False) -> Mapping[str, str]:
-    """Forty images and a table of their angles, degrees."""
+    """Write forty images and a table of their angles, degrees."""
     lines = ["file,pan,tilt" + ",split" * split]
     for number in range(40):
         file = noise_image(folder / f"{number:03d}.png", number)

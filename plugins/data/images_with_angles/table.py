@@ -1,4 +1,4 @@
-"""Reads the table beside the images: a line for each file, with its angles and perhaps its split."""
+"""Reading of the table beside the images: a line for each file, with its angles and optionally its split."""
 
 import hashlib
 import math
@@ -29,7 +29,7 @@ FILE, SPLIT = "file", "split"
 
 
 class Row(NamedTuple):
-    """One image; angles in radians, in the order of the table's columns."""
+    """One image; its angles are in radians, in the order of the table's columns."""
 
     file: str
     split: Split
@@ -37,10 +37,12 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Attributes:
-    columns: names of the angles.
-    rows: of the images.
-    remarks: sentences on what else the table holds.
+    """Rows and columns of a table of angles.
+
+    Attributes:
+        columns: names of the angles.
+        rows: one row for each image.
+        remarks: sentences on columns that were left out.
     """
 
     columns: tuple[str, ...]
@@ -54,12 +56,13 @@ def read_table(
     angles_in: Literal["degrees", "radians"] | None,
     writing: Writing | None = None,
 ) -> Table:
-    """Read and check a CSV file; no `columns`: all whose cells are mostly numbers, but for row numbers.
+    """Read and check a CSV file.
 
-    Without `angles_in` the angles are degrees, and a column that looks like radians is refused.
+    Without `columns`, every column is an angle whose cells are mostly numbers, except row numbers. Without `angles_in`
+    the angles are degrees, and a column that looks like radians is refused.
 
     Raises:
-        DataError: the file is missing, or a header, cell or file name is wrong; names the line.
+        DataError: the file is missing, or a header, cell or file name is wrong; the message names the line.
     """
     table = _read(file, writing or Writing())
     chosen = _angle_columns(table, columns)
@@ -85,7 +88,9 @@ def read_table(
 
 
 def split_of(name: str) -> Split:
-    """Choose train (70 %), validation or test (15 % each) by a hash of the name: new images never move old ones."""
+    """Return train (70 %), validation or test (15 % each) by a hash of the name, so that new images never move old
+    ones.
+    """
     share = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
     for split in SPLITS:
         share -= SHARES[split]
@@ -95,10 +100,10 @@ def split_of(name: str) -> Split:
 
 
 def _read(file: Path, writing: Writing) -> Columns:
-    """The table's cells, with a column of files.
+    """Return the table's cells, which include a column of files.
 
     Raises:
-        DataError: as `read_columns`; or there is no such column.
+        DataError: `read_columns` raises it, or there is no such column.
     """
     missing = (
         f"wanted a table with a column `{FILE}` and a column for each angle. Write it, or name another with "
