@@ -1,1 +1,1 @@
-"""Point clouds with classes: ModelNet40, DALES and a user's own folders."""
+"""Data sets of point clouds with classes: ModelNet40, DALES and a user's own folders."""

@@ -1,4 +1,4 @@
-"""Clouds of many sizes in one NumPy archive: `points`, `offset`, `label`, `object_id`, `classes`."""
+"""Reading of clouds of many sizes from one NumPy archive: `points`, `offset`, `label`, `object_id`, `classes`."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +18,7 @@ WANTED = (
 
 
 class Archive(NamedTuple):
-    """Objects one after another, as the archive has them."""
+    """Arrays of the archive, which holds its objects one after another."""
 
     points: Float[np.ndarray, "points 3"]
     offset: Int[np.ndarray, "objects_and_one"]
@@ -28,11 +28,11 @@ class Archive(NamedTuple):
 
 
 def read_archive(root: str | None) -> Archive:
-    """The whole archive, checked.
+    """Read and check the whole archive.
 
     Raises:
-        DataError: no root, no such file, no archive, an array missing or of another shape, offsets that do not rise, a
-            label without a class, a coordinate that is not finite; names the object.
+        DataError: there is no root, no such file, or no archive; an array is missing or of another shape; offsets do
+            not rise; a label has no class; or a coordinate is not finite. The message names the object.
     """
     if root is None:
         raise DataError(

@@ -1,4 +1,4 @@
-"""Data sets by the name that a test's module gives, in a cache of the test's own."""
+"""Fixtures that build the data set which a test's module names, in a cache of the test's own."""
 
 import pytest
 

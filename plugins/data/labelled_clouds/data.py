@@ -1,4 +1,4 @@
-"""ModelNet40, a user's own folders, and DALES; the contract is framework.data's."""
+"""Data sets ModelNet40, a user's own folders, and DALES; framework.data describes the contract."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,12 +34,12 @@ Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class Surfaces:
-    """How surfaces become points, drawn uniformly by area.
+    """Settings for drawing points from surfaces, uniformly by area.
 
     Attributes:
-        points: of each surface (thesis §6.5.1: 2048).
-        normals: add the faces' normals as columns.
-        data_seed: of the points and of the validation split, whatever the seed of the run.
+        points: number of points of each surface (thesis §6.5.1: 2048).
+        normals: whether to add the faces' normals as columns.
+        data_seed: seed of the points and of the validation split; it does not depend on the seed of the run.
     """
 
     points: Annotated[int, Field(ge=1, le=1_000_000)] = 2048
@@ -50,17 +50,17 @@ class Surfaces:
 class ModelNet40(LabelledClouds):
     """CAD models of everyday things as points of their surfaces, z up; generated where no root is given.
 
-    A mesh's points depend on `data_seed` and its file's name alone. They are drawn once and kept in the cache.
+    The points of a mesh depend only on `data_seed` and its file's name. They are drawn once and kept in the cache.
 
     Args:
-        root: the unpacked ModelNet40; None: a generated set in its layout, its 40 classes.
+        root: the unpacked ModelNet40; None for a generated set in its layout, with its 40 classes.
         surfaces: how meshes become points.
-        classes: some of them; None: all.
-        validation_share: of the official training split, of every class alike; with 0 all of it trains, as in the
-            thesis, and what validation says is said of training clouds.
-        rotations: a training cloud comes so many times, turned about the up axis in equal steps (thesis §6.5.1).
-        unreadable: what becomes of files that cannot be read.
-        models: what is generated.
+        classes: names of the classes to use; None for all.
+        validation_share: share of the official training split for validation, equal in every class. With 0 the whole
+            split is used for training, as in the thesis, and validation results are then over training clouds.
+        rotations: number of copies of each training cloud, rotated about the up axis in equal steps (thesis §6.5.1).
+        unreadable: treatment of files that cannot be read: refuse or skip.
+        models: settings of the generated models.
     """
 
     bibtex = """@inproceedings{wu2015modelnet,
@@ -125,19 +125,20 @@ class ModelNet40(LabelledClouds):
 
 
 class PointCloudFolder(LabelledClouds):
-    """Your own files, without writing code: meshes and clouds in folders named by class; the class is predicted.
+    """Your own meshes and clouds, without writing code, in folders named by class; the class is predicted.
 
-    Surfaces are sampled uniformly by area, clouds are taken as they are, each with its own number of points.
+    Surfaces are sampled uniformly by area. Clouds are used as they are, each with its own number of points.
 
     Args:
         root: the folder.
-        points: drawn from a mesh (None: 2048); of a cloud of more points so many are kept (None: all).
-        columns: attributes wanted beside x, y, z. "normal_x", "normal_y", "normal_z" of a mesh are its faces'.
-        validation, test: shares of the files, of every class alike, where folders do not say it. With validation = 0
-            the training split serves as validation too: early stopping and calibration then see what training saw.
-        centred: subtract each cloud's mean in float64, before it is rounded to float32 (coordinates of a map).
-        unreadable: what becomes of files that cannot be read.
-        data_seed: of points and splits, whatever the seed of the run.
+        points: number of points drawn from a mesh (None: 2048), and largest number kept of a cloud (None: all).
+        columns: attributes to read beside x, y, z. "normal_x", "normal_y", "normal_z" of a mesh are its faces' normals.
+        validation: share of the files for validation, equal in every class, where folders do not say it. With 0 the
+            training split serves as validation too: early stopping and calibration then use training data.
+        test: share of the files for the test, likewise.
+        centred: whether to subtract each cloud's mean in float64, before it is rounded to float32 (map coordinates).
+        unreadable: treatment of files that cannot be read: refuse or skip.
+        data_seed: seed of points and splits; it does not depend on the seed of the run.
     """
 
     bibtex = """@misc{point_cloud_folder,
@@ -203,13 +204,13 @@ class PointCloudFolder(LabelledClouds):
         )
 
     def _drawn(self, kept: folders.Listed) -> np.ndarray:
-        """The split of every sample: what the folders say, and the rest drawn from the seed."""
+        """Return the split of every sample: as the folders say, and otherwise drawn from the seed."""
         splits = np.where(kept.splits == "", "train", kept.splits)
         random = stream(self.reading.seed, "splits")
         validation, test = self.shares
         if "" in kept.splits:
             hold_out(splits, kept.labels, test, random, "test")
-            validation /= 1 - test  # of what is left
+            validation /= 1 - test  # the share of what is left
         if "validation" not in kept.splits and validation:
             hold_out(splits, kept.labels, validation, random)
         return splits
@@ -218,15 +219,15 @@ class PointCloudFolder(LabelledClouds):
 class Dales(LabelledClouds):
     """Buildings, cars, fences, poles and trees from airborne laser scans, 100 to 28,000 points each, metres.
 
-    Objects are dealt into five folds, every class alike; one fold is the test split. A batch is padded to its largest
-    cloud. Batches also hold "object", int64, the archive's number of the object.
+    Objects are dealt into five folds with equal shares of every class; one fold is the test split. A batch is padded to
+    its largest cloud. Batches also hold "object", int64, the object's number in the archive.
 
     Args:
         root: the archive.
-        fold: which fold is tested.
-        points: of larger objects so many points are kept; None: all.
-        validation_share: of the other folds, of every class alike.
-        data_seed: of folds, validation and points, whatever the seed of the run.
+        fold: index of the fold that is the test split.
+        points: largest number of points that is kept of an object; None for all.
+        validation_share: share of the other folds for validation, equal in every class.
+        data_seed: seed of folds, validation and points; it does not depend on the seed of the run.
     """
 
     bibtex = """@inproceedings{varney2020dales,

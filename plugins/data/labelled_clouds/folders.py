@@ -1,4 +1,4 @@
-"""Folders of meshes and clouds: by class, by split and class, or by class and split, as ModelNet40 is."""
+"""Layouts of folders of meshes and clouds: by class, by split and class, or by class and split, as in ModelNet40."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ WANTED = (
 
 
 class Listed(NamedTuple):
-    """Classes in alphabetical order; every file with its label and its split ("": to be drawn); files of no use."""
+    """Classes in alphabetical order; all files with labels and splits ("" if to be drawn); number of ignored files."""
 
     classes: tuple[str, ...]
     files: list[Path]
@@ -29,17 +29,18 @@ class Listed(NamedTuple):
     ignored: int
 
     def only(self, numbers: Iterable[int]) -> "Listed":
-        """The same of fewer files."""
+        """Return the listing with only the files of the given numbers."""
         kept = list(numbers)
         files = [self.files[number] for number in kept]
         return self._replace(files=files, labels=self.labels[kept], splits=self.splits[kept])
 
 
 def official(root: Path, wanted: Sequence[str] | None) -> Listed:
-    """What a root in ModelNet40's layout holds, its training split first; `wanted` None: all classes.
+    """List the files of a root in ModelNet40's layout, its training split first; all classes if `wanted` is None.
 
     Raises:
-        DataError: no such folder, another layout, an unknown class, fewer than two classes, a class without files.
+        DataError: there is no such folder, another layout, an unknown class, fewer than two classes, or a class without
+            files.
     """
     folders = _folders(root, OFFICIAL)
     strange = [path.name for path in folders if not ((path / "train").is_dir() and (path / "test").is_dir())]
@@ -61,10 +62,10 @@ def official(root: Path, wanted: Sequence[str] | None) -> Listed:
 
 
 def listed(root: Path) -> Listed:
-    """What a user's root holds.
+    """List the files of a user's root.
 
     Raises:
-        DataError: no such folder, none of the layouts, fewer than two classes, a class without files.
+        DataError: there is no such folder, none of the layouts, fewer than two classes, or a class without files.
     """
     folders = _folders(root, WANTED)
     names = {path.name for path in folders}
@@ -108,11 +109,11 @@ def _collected(
     kind: str,
     wanted: str,
 ) -> Listed:
-    """The files of folders, given with their class and split; those of other suffixes are ignored, hidden ones too."""
+    """Return the files of folders with their class and split; hidden files and files of other suffixes are ignored."""
     files, labels, splits, ignored = [], [], [], 0
     for name, split, folder in places:
         shown_files = (path for path in folder.iterdir() if not path.name.startswith("."))
-        # also a folder of such a name: reading it says that it is no file
+        # keep a folder with such a suffix too: reading it then says that it is not a file
         held = sorted(path for path in shown_files if path.is_file() or path.suffix.lower() in suffixes)
         own = [path for path in held if path.suffix.lower() in suffixes]
         ignored += len(held) - len(own)

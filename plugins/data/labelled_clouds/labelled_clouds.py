@@ -1,4 +1,4 @@
-"""What the data sets of labelled clouds share: from the clouds that were found to splits, fingerprint and picture."""
+"""Base class of the data sets of labelled clouds: splits, fingerprint and image from the clouds that were found."""
 
 import hashlib
 from abc import abstractmethod
@@ -29,20 +29,22 @@ Unreadable = Literal["error", "skip"]
 
 
 class Found(NamedTuple):
-    """The clouds of a data set before they are cut into splits.
+    """Clouds of a data set before they are split.
 
     Attributes:
-        where: what was read, for messages.
-        about: what identifies them beside sizes, names, labels and splits, for the fingerprint.
-        classes: names, in the order of the labels.
+        where: source of the clouds, for messages.
+        about: entries of the fingerprint beside sizes, names, labels and splits.
+        classes: names of the classes, in the order of the labels.
         packed: the clouds.
-        labels, names, splits: of each cloud its class, its name, and the name of its split.
+        labels: class of each cloud.
+        names: name of each cloud.
+        splits: name of the split of each cloud.
         fields: further fields of each cloud.
-        skipped: how many could not be read.
-        synthetic: whether they were generated.
-        validated_on: the split whose clouds are those of validation.
-        rotations: how often a training cloud comes, turned about the up axis.
-        remarks: what of the user's files is not read.
+        skipped: number of files that could not be read.
+        synthetic: whether the clouds were generated.
+        validated_on: the split whose clouds are used for validation.
+        rotations: number of copies of a training cloud, rotated about the up axis.
+        remarks: sentences on what of the user's files is not read.
     """
 
     where: str
@@ -61,19 +63,19 @@ class Found(NamedTuple):
 
 
 class LabelledClouds(Data):
-    """Clouds with classes. A data set of the family adds its constructor, what to cite, and `found`."""
+    """Base class of data sets of clouds with classes; a data set adds its constructor, its citation, and `found`."""
 
     suffixes = tuple(READERS)
     varies = False
     reading: Reading
-    """How files become clouds."""
+    """Settings for turning files into clouds."""
 
     @abstractmethod
     def found(self) -> Found:
-        """All clouds, from files.
+        """Return all clouds, read from files.
 
         Raises:
-            DataError: as `prepare`.
+            DataError: the clouds cannot be read, for the reasons of `prepare`.
         """
 
     def prepare(self) -> None:
@@ -116,10 +118,10 @@ def loaded(
     unreadable: Unreadable,
     remedy: str = "Restore them, or set data.unreadable=skip to leave them out.",
 ) -> tuple[Listed, Packed]:
-    """The files that could be read, and their clouds, from the cache folder `place` where they are there.
+    """Return the files that could be read, and their clouds, from the cache folder `place` if they are there.
 
     Raises:
-        DataError: some cannot be read, and are not to be skipped.
+        DataError: some files cannot be read, and are not to be skipped.
     """
     found = load(listed.files, root, how, place)
     if found.faults and unreadable == "error":
@@ -128,7 +130,7 @@ def loaded(
 
 
 def unread(listed: Listed, how: Reading) -> tuple[str, ...]:
-    """What is not read of some files: those of other kinds, and the columns of the first that can be read."""
+    """Return remarks on what is not read: files of other kinds, and unread columns of the first file."""
     said = []
     if listed.ignored:
         said.append(f"left out: {listed.ignored} files of other kinds")
@@ -151,13 +153,13 @@ def hold_out(
     random: np.random.Generator,
     name: str = "validation",
 ) -> None:
-    """Rename the split of a share of the training clouds, of every class alike."""
+    """Rename the split of a share of the training clouds, equal in every class."""
     learned = np.flatnonzero(splits == "train")
     splits[learned[spared(labels[learned], share, random)]] = name
 
 
 def apart(found: Found) -> dict[str, Clouds]:
-    """The clouds of each split, with "target", "group" (one for all) and the further fields of each.
+    """Return the clouds of each split, with "target", "group" (one for all) and the further fields of each cloud.
 
     Raises:
         DataError: a split is empty.
@@ -176,7 +178,7 @@ def require_samples(sizes: Mapping[str, int], where: str) -> None:
     """Refuse an empty split.
 
     Raises:
-        DataError: names it, and says how many samples the others have.
+        DataError: a split is empty; the message names it and says how many samples the others have.
     """
     for split, size in sizes.items():
         if size == 0:
@@ -188,6 +190,6 @@ def require_samples(sizes: Mapping[str, int], where: str) -> None:
 
 
 def digest(names: Sequence[str], labels: Sequence[int], splits: Sequence[str]) -> str:
-    """A hash over names, labels and splits."""
+    """Return a hash of names, labels and splits."""
     lines = (f"{split} {label} {name}\n" for name, label, split in zip(names, labels, splits, strict=True))
     return hashlib.sha256(as_bytes("".join(lines))).hexdigest()

@@ -1,7 +1,7 @@
-"""Reads files as point clouds, and keeps many of them in memory.
+"""Reading of files as point clouds, many of which are kept in memory.
 
-Files are read and their surfaces sampled once; the result is kept below the cache folder, under a hash of everything it
-depends on, so that a second run starts at once.
+Files are read and their surfaces sampled once. The result is kept in the cache folder, under a hash of everything that
+it depends on, so that a second run starts at once.
 """
 
 import hashlib
@@ -32,21 +32,23 @@ from framework.storage.progress import tracked
 from framework.storage.reading import guarded, read_bytes
 
 VERSION = 1
-"""Of what `cloud` makes of a file; a change takes a new number, and with it a new place in the cache."""
+"""Version of the conversion by `cloud`; a changed conversion takes a new number, and thus a new place in the cache."""
 SURFACE_POINTS = 2048
-"""Drawn from a mesh where no number is asked for (thesis §6.5.1)."""
+"""Number of points drawn from a mesh where no number is given (thesis §6.5.1)."""
 COARSE = 1e-3
 """Rounding to float32, as a share of a cloud's extent, that is refused."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a file becomes a cloud.
+    """Settings for turning a file into a cloud.
 
     Attributes:
-        points: drawn from the surface of a mesh, None: 2048; of a cloud of more points so many are kept, None: all.
-        columns: wanted beside x, y, z. A mesh's normals are those of its faces; its other attributes are interpolated.
-        seed: of the draws; each depends on it and on the file's name alone.
+        points: number of points drawn from the surface of a mesh (None: 2048), and largest number kept of a cloud
+            (None: all).
+        columns: attributes beside x, y, z. A mesh's normals are those of its faces; its other attributes are
+            interpolated.
+        seed: seed of the draws; each draw depends only on it and on the file's name.
         centred: subtract each cloud's mean before it is rounded to float32.
         surface: refuse files without faces.
     """
@@ -59,26 +61,29 @@ class Reading:
 
     @property
     def all_columns(self) -> tuple[str, ...]:
+        """Names of all columns of a cloud."""
         return (*XYZ, *self.columns)
 
 
 class Packed(NamedTuple):
-    """Clouds of any sizes one after another; cloud i is points[offset[i] : offset[i + 1]]."""
+    """Clouds of any sizes, one after another; cloud i is points[offset[i] : offset[i + 1]]."""
 
     points: Float32[Tensor, "points columns"]
     offset: Int64[Tensor, "clouds_and_one"]
 
     @classmethod
     def of(cls, clouds: Sequence[Float32[np.ndarray, "_points columns"]], columns: int) -> "Packed":
+        """Return the clouds packed one after another."""
         table = np.concatenate([np.empty((0, columns), np.float32), *clouds])
         return cls(torch.from_numpy(table), torch.from_numpy(np.cumsum([0, *map(len, clouds)])))
 
     def largest(self) -> int:
+        """Return the number of points of the largest cloud; 0 without clouds."""
         return int(self.offset.diff().max()) if len(self.offset) > 1 else 0
 
 
 class Loaded(NamedTuple):
-    """The clouds of the files that could be read, which files these are, and what is wrong with the others."""
+    """Clouds of the files that could be read, numbers of these files, and errors of the others."""
 
     packed: Packed
     good: tuple[int, ...]
@@ -86,7 +91,7 @@ class Loaded(NamedTuple):
 
 
 class Clouds(Dataset[dict[str, Tensor]]):
-    """Some of the packed clouds ("input", (points, columns)) beside fields that are in memory.
+    """Data set of some of the packed clouds ("input", (points, columns)) with fields that are in memory.
 
     A fetched batch is padded to its largest cloud with rows of NaN (`framework.geometry.clouds`).
     """
@@ -110,10 +115,11 @@ class Clouds(Dataset[dict[str, Tensor]]):
 
 
 def cloud(file: Path, how: Reading) -> Float32[np.ndarray, "points columns"]:
-    """The cloud of a file: points of a mesh's surface, or the file's own.
+    """Return the cloud of a file: points of a mesh's surface, or the file's own points.
 
     Raises:
-        DataError: as `framework.geometry.meshes`; a column is missing; the coordinates are too far from 0 for float32.
+        DataError: `framework.geometry.meshes` raises it; or a column is missing; or the coordinates are too far from 0
+            for float32.
     """
     mesh = meshes.read(file)
     random = meshes.stream(how.seed, file.name)
@@ -122,7 +128,7 @@ def cloud(file: Path, how: Reading) -> Float32[np.ndarray, "points columns"]:
         points = drawn.points
         of_faces = meshes.normals(mesh)[drawn.face]
         own = [name for name in how.columns if name not in NORMALS]
-        # weights as a column vector each: what is linear on a face stays so
+        # interpolate with the weights of the drawn points: attributes that are linear on a face stay linear
         corners = mesh.attribute(own)[mesh.faces[drawn.face]]
         of_vertices = np.einsum("pc,pcn->pn", drawn.weights, corners)
         attributes = [
@@ -137,14 +143,14 @@ def cloud(file: Path, how: Reading) -> Float32[np.ndarray, "points columns"]:
 
 
 def subsampled(table: NDArray, points: int | None, random: np.random.Generator) -> NDArray:
-    """At most `points` rows, drawn without replacement, in their order; None: all."""
+    """Return at most `points` rows, drawn without replacement, in their order; all rows if `points` is None."""
     if points is None or len(table) <= points:
         return table
     return table[np.sort(random.choice(len(table), points, replace=False))]
 
 
 def rounded(table: NDArray, source: str, *, centred: bool) -> Float32[np.ndarray, "points columns"]:
-    """A cloud as float32, its mean subtracted before where `centred` says so.
+    """Return a cloud as float32, after subtracting its mean if `centred` is true.
 
     Raises:
         DataError: the coordinates exceed float32, or are so far from 0 that rounding would blur the shape.
@@ -162,10 +168,13 @@ def rounded(table: NDArray, source: str, *, centred: bool) -> Float32[np.ndarray
 
 
 def load(files: Sequence[Path], root: Path, how: Reading, place: str) -> Loaded:
-    """The clouds of all files, from the cache folder `place` where they were read before; a progress bar where not.
+    """Return the clouds of all files, from the cache folder `place` if they were read before, else with a progress bar.
 
     Args:
-        root: what the files' names in the cache's key are relative to.
+        files: the files.
+        root: folder to which the files' names in the cache's key are relative.
+        how: settings for turning files into clouds.
+        place: name of the cache folder.
     """
     kept = cache.folder(place) / f"{_key(files, root, how)}.npz"
     try:
@@ -173,7 +182,7 @@ def load(files: Sequence[Path], root: Path, how: Reading, place: str) -> Loaded:
             found = archive(read_bytes(kept))
             packed = Packed(torch.from_numpy(found["points"]), torch.from_numpy(found["offset"]))
             faults = {int(number): text for number, text in json.loads(str(found["faults"])).items()}
-    except DataError:  # not there, or damaged: read anew
+    except DataError:  # the cached file is missing or damaged: read the files again
         packed, faults = _read_all(files, how)
         try:
             with replacing(kept) as part, part.open("wb") as stream:
@@ -197,7 +206,7 @@ def _key(files: Sequence[Path], root: Path, how: Reading) -> str:
 
 
 def _read_all(files: Sequence[Path], how: Reading) -> tuple[Packed, dict[int, str]]:
-    """The clouds of the files that can be read, and by number what is wrong with the others."""
+    """Return the clouds of the files that can be read, and the error messages of the others by number."""
     clouds, faults = [], {}
     for number, file in enumerate(tracked(files, "reading clouds", len(files), "files")):
         try:
@@ -208,10 +217,10 @@ def _read_all(files: Sequence[Path], how: Reading) -> tuple[Packed, dict[int, st
 
 
 def unlabelled(files: Sequence[Path], how: Reading) -> Clouds:
-    """A user's own files, "input" and "index", in their order.
+    """Return a data set of a user's own files, "input" and "index", in their order.
 
     Raises:
-        DataError: there are none, or some cannot be read; names the first ten.
+        DataError: there are no files, or some cannot be read; the message names the first ten.
     """
     if not files:
         raise DataError(f"No file was given; wanted at least one of {', '.join(meshes.READERS)}.")

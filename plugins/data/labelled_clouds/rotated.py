@@ -1,4 +1,4 @@
-"""Clouds again and again, turned about the up axis."""
+"""Repetition of clouds, rotated about the up axis."""
 
 import math
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from plugins.data.labelled_clouds.reading import Clouds
 
 
 class Rotated(Dataset[dict[str, Tensor]]):
-    """The same clouds `rotations` times: first all as they are, then all turned by a step of 2π / rotations, and so on.
+    """Data set with each cloud `rotations` times: first all as they are, then all rotated by 2π / rotations, and so on.
 
-    Normals, the fourth to sixth columns where there are so many, turn with their points.
+    Normals, which are the fourth to sixth columns if there are that many, rotate with their points.
     """
 
     def __init__(self, clouds: Clouds, rotations: int) -> None:
@@ -41,6 +41,6 @@ class Rotated(Dataset[dict[str, Tensor]]):
 def _turned(
     clouds: Float[Tensor, "batch points columns"], matrix: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch points columns"]:
-    """Every group of three columns as a vector, turned."""
+    """Return the clouds with every group of three columns rotated as a vector."""
     vectors = clouds.unflatten(-1, (-1, 3))
     return torch.einsum("bij,bpvj->bpvi", matrix, vectors).flatten(-2)

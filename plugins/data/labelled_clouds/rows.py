@@ -9,14 +9,14 @@ from framework.testing.rows import DAMAGES, DataRow
 from framework.testing.sample_files import meshes, surface, write_off
 
 UNMISSED = ("empty", "cut", "garbage", "folder")
-"""Which files there are is for the folder to say: one fewer is a smaller set."""
+"""Kinds of damage that the data set detects; it cannot detect a missing file, which makes a smaller set."""
 MODELS = {"train_models": 3, "test_models": 1, "points": 20, "classes": ["bowl", "cone", "stool"]}
 CLASSES = ("building", "car", "tree")
 MADE = {"data_seed": 1, "generator_seed": 1}
 
 
 def folder_of_classes(folder: Path) -> Mapping[str, str]:
-    """Meshes and clouds, of many sizes, of two classes."""
+    """Write meshes and clouds of many sizes, in two classes."""
     for number in range(16):
         vertices, faces = surface(number, side=3 + number % 3)
         place = folder / ("hills" if number % 2 else "plains")
@@ -28,7 +28,7 @@ def folder_of_classes(folder: Path) -> Mapping[str, str]:
 
 
 def objects(counts: tuple[int, ...] = (11, 10, 12)) -> dict[str, np.ndarray]:
-    """An archive's arrays: so many objects of each class, of 2 to 20 points."""
+    """Return an archive's arrays: the given number of objects of each class, of 2 to 20 points each."""
     random = np.random.default_rng(0)
     label = random.permutation(np.repeat(np.arange(len(counts)), counts))
     sizes = random.integers(2, 21, len(label))

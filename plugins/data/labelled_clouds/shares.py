@@ -1,4 +1,4 @@
-"""Draws which samples are held out, and which fold each belongs to, of every class alike."""
+"""Random choice of held-out samples and of folds, with equal shares of every class."""
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -7,9 +7,10 @@ from jaxtyping import Bool, Int
 def spared(
     labels: Int[np.ndarray, "samples"], share: float, random: np.random.Generator
 ) -> Bool[np.ndarray, "samples"]:
-    """Which samples to hold out: `share` of all, of every class alike, but never the last of a class.
+    """Return which samples to hold out: `share` of all, equal in every class, but never the last sample of a class.
 
-    Classes give their whole parts, and those with the largest rests one more each, until the number is reached.
+    Each class gives the whole part of its share; classes with the largest remainders give one more each, until the
+    total is reached.
     """
     held = np.zeros(len(labels), bool)
     counts = np.bincount(labels) if len(labels) else np.zeros(1, np.int64)
@@ -27,7 +28,9 @@ def spared(
 def folds(
     labels: Int[np.ndarray, "samples"], count: int, random: np.random.Generator
 ) -> Int[np.ndarray, "samples"]:
-    """The fold of each sample: every class is dealt out in turn, so that folds differ by at most one of each."""
+    """Return the fold of each sample; every class is dealt out in turn, so that folds differ by at most one sample of
+    each.
+    """
     order = np.concatenate(
         [random.permutation(np.flatnonzero(labels == label)) for label in np.unique(labels)]
     )

@@ -1,4 +1,4 @@
-"""Parts of buildings as random solids, metres, front towards -y."""
+"""Random solids of parts of buildings, metres, front towards -y."""
 
 import math
 
@@ -24,7 +24,7 @@ Random = np.random.Generator
 
 
 def curtain(random: Random) -> Solid:
-    """One or two hangings, pleated, straight or gathered, with or without a rail and a valance."""
+    """Return one or two curtains, pleated, straight or gathered, with or without a rail and a valance."""
     width, height = random.uniform(0.9, 2.4), random.uniform(1.2, 2.5)
     count, deep = int(random.integers(1, 3)), random.uniform(0.02, 0.09)
     wide = width / count * random.uniform(0.5, 1.0)
@@ -57,6 +57,7 @@ def curtain(random: Random) -> Solid:
 
 
 def door(random: Random) -> Solid:
+    """Return a door, with or without panels, panes and a frame."""
     width, height, thick = random.uniform(0.7, 1.1), random.uniform(1.9, 2.4), random.uniform(0.035, 0.07)
     wings = 2 if random.random() < 0.25 else 1
     rows, columns = int(random.integers(0, 5)), int(random.integers(1, 3))
@@ -97,7 +98,7 @@ def door(random: Random) -> Solid:
 
 
 def mantel(random: Random) -> Solid:
-    """A chimney piece: two jambs, a frieze and a shelf, perhaps the hearth, a back and what is above."""
+    """Return a mantelpiece: two jambs, a frieze and a shelf, optionally with hearth, back and overmantel."""
     width, height = random.uniform(1.1, 2.0), random.uniform(0.9, 1.4)
     jamb, deep = random.uniform(0.1, 0.3), random.uniform(0.1, 0.35)
     frieze = random.uniform(0.12, 0.3) * height
@@ -128,7 +129,9 @@ def mantel(random: Random) -> Solid:
 
 
 def stairs(random: Random) -> Solid:
-    """A flight, solid or of treads on strings, straight, with a landing, or winding; perhaps with rails."""
+    """Return a flight of stairs, solid or with treads on strings, straight, with a landing, or winding; optionally with
+    rails.
+    """
     count, rise = int(random.integers(4, 15)), random.uniform(0.14, 0.2)
     run, width = random.uniform(0.22, 0.34), random.uniform(0.6, 1.5)
     kind, open_ = random.random(), random.random() < 0.4
@@ -176,7 +179,7 @@ def stairs(random: Random) -> Solid:
 
 
 def tent(random: Random) -> Solid:
-    """Ridge tents, domes, cones on poles, and roofs on posts."""
+    """Return a ridge tent, a dome, a cone on poles, or a roof on posts."""
     kind, width, long = random.random(), random.uniform(1.2, 3.0), random.uniform(1.2, 3.2)
     height = random.uniform(0.45, 0.9) * width
     parts: list[Solid] = []
@@ -228,7 +231,7 @@ def tent(random: Random) -> Solid:
 
 
 def range_hood(random: Random) -> Solid:
-    """A canopy, sloped, boxed, vaulted or of glass, most with a flue above."""
+    """Return a range hood: sloped, boxed, vaulted or of glass, usually with a flue above."""
     width, depth = random.uniform(0.55, 1.1), random.uniform(0.4, 0.65)
     rim, tall = random.uniform(0.03, 0.12), random.uniform(0.15, 0.4)
     flue = random.uniform(0.2, 0.38)

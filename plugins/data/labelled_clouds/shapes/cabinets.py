@@ -1,4 +1,4 @@
-"""Cabinets and boxes as random solids, metres, front towards -y: what tells them apart is on the front and inside."""
+"""Random solids of cabinets and boxes, metres, front towards -y; the kinds differ in their fronts and insides."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ Random = np.random.Generator
 def fronts(
     random: Random, width: Number, height: Number, at: Point, rows: int, columns: int, doors: bool = False
 ) -> list[Solid]:
-    """Drawers or doors with their handles; `at` is the middle of their lower edge on the cabinet's front."""
+    """Return drawers or doors with their handles; `at` is the middle of their lower edge on the cabinet's front."""
     x, y, z = at
     wide, tall = width / columns, height / rows
     thick, gap = random.uniform(0.012, 0.03), random.uniform(0.86, 0.97)
@@ -51,7 +51,7 @@ def fronts(
 
 
 def case(width: Number, depth: Number, height: Number, board: Number, z: Number, back: bool) -> list[Solid]:
-    """An open cabinet's boards, above `z`."""
+    """Return the boards of an open cabinet, above `z`."""
     parts = [box(board, depth, height, (side * (width - board) / 2, 0, z)) for side in (-1, 1)]
     parts += [box(width, depth, board, (0, 0, level)) for level in (z, z + height - board)]
     if back:
@@ -60,7 +60,7 @@ def case(width: Number, depth: Number, height: Number, board: Number, z: Number,
 
 
 def feet(random: Random, width: Number, depth: Number, foot: Number, thick: Number = 0.06) -> list[Solid]:
-    """What a cabinet stands on: nothing, legs, or a plinth."""
+    """Return the base of a cabinet: nothing, legs, or a plinth."""
     if not foot:
         return []
     if random.random() < 0.3:
@@ -69,6 +69,7 @@ def feet(random: Random, width: Number, depth: Number, foot: Number, thick: Numb
 
 
 def bookshelf(random: Random) -> Solid:
+    """Return a bookshelf with shelves and books."""
     width, depth = random.uniform(0.4, 1.8), random.uniform(0.2, 0.45)
     height, board = random.uniform(0.8, 2.2), random.uniform(0.015, 0.045)
     count = int(random.integers(2, 7))
@@ -94,6 +95,7 @@ def bookshelf(random: Random) -> Solid:
 
 
 def dresser(random: Random) -> Solid:
+    """Return a dresser with drawers."""
     width, depth, height = random.uniform(0.45, 1.7), random.uniform(0.35, 0.6), random.uniform(0.6, 1.35)
     foot = random.choice([0.0, 0.06, 0.12, 0.25])
     parts = [box(width, depth, height - foot, (0, 0, foot)), *feet(random, width, depth, foot)]
@@ -113,6 +115,7 @@ def dresser(random: Random) -> Solid:
 
 
 def night_stand(random: Random) -> Solid:
+    """Return a night stand."""
     width, depth, height = random.uniform(0.35, 0.7), random.uniform(0.3, 0.55), random.uniform(0.4, 0.8)
     foot = random.choice([0.0, 0.1, 0.25]) * random.uniform(0.8, 1.2)
     board, low = random.uniform(0.015, 0.035), foot
@@ -128,6 +131,7 @@ def night_stand(random: Random) -> Solid:
 
 
 def tv_stand(random: Random) -> Solid:
+    """Return a stand for a television set."""
     width, depth, height = random.uniform(0.8, 2.1), random.uniform(0.35, 0.6), random.uniform(0.35, 0.8)
     board, foot = random.uniform(0.015, 0.045), random.choice([0.0, 0.06, 0.15])
     tall, bays = height - foot, int(random.integers(1, 5))
@@ -152,6 +156,7 @@ def tv_stand(random: Random) -> Solid:
 
 
 def wardrobe(random: Random) -> Solid:
+    """Return a wardrobe with doors, sometimes with drawers below them."""
     width, depth, height = random.uniform(0.6, 2.0), random.uniform(0.4, 0.7), random.uniform(1.2, 2.2)
     foot = random.choice([0.0, 0.08, 0.15])
     tall, closed = height - foot, width
@@ -179,7 +184,7 @@ def wardrobe(random: Random) -> Solid:
 
 
 def glass_box(random: Random) -> Solid:
-    """A show case: panes between bars, on a base, legs or nothing, perhaps with shelves or an open top."""
+    """Return a show case: panes between bars, on a base, legs or nothing, optionally with shelves or an open top."""
     width, depth, height = random.uniform(0.4, 1.6), random.uniform(0.3, 0.9), random.uniform(0.3, 1.6)
     bar, pane = random.uniform(0.015, 0.05), random.uniform(0.006, 0.015)
     low, stand = 0.0, random.random()
@@ -209,6 +214,7 @@ def glass_box(random: Random) -> Solid:
 
 
 def radio(random: Random) -> Solid:
+    """Return a radio."""
     width, depth, height = random.uniform(0.2, 0.6), random.uniform(0.07, 0.2), random.uniform(0.12, 0.32)
     narrow = random.choice([1.0, 1.0, 0.85])
     parts = [tapered(width, depth, narrow * width, narrow * depth, height)]
@@ -247,7 +253,7 @@ def radio(random: Random) -> Solid:
 
 
 def xbox(random: Random) -> Solid:
-    """A game console, lying or upright, with a slot, ribs, knobs, perhaps its controller."""
+    """Return a game console, lying or upright, with a slot, ribs, knobs, and optionally its controller."""
     width, depth, height = random.uniform(0.26, 0.42), random.uniform(0.2, 0.34), random.uniform(0.05, 0.12)
     narrow = random.uniform(0.85, 1.0)
     lower = random.uniform(0.3, 0.7) * height

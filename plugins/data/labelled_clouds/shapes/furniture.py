@@ -1,4 +1,4 @@
-"""Furniture as random solids, metres, front towards -y: families that share a shape and differ in parts."""
+"""Random solids of furniture, metres, front towards -y; some kinds share a shape and differ in parts."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ Random = np.random.Generator
 
 
 def legs(random: Random, width: float, depth: float, height: float, thick: float) -> Solid:
-    """Four, straight or splayed, square or round, below a top of this size."""
+    """Return four legs, straight or splayed, square or round, below a top of this size."""
     inset = random.uniform(0.5, 1.6) * thick
     x, y = width / 2 - inset, depth / 2 - inset
     splay = random.choice([0.0, 0.0, 0.08, 0.14]) * height
@@ -29,7 +29,7 @@ def legs(random: Random, width: float, depth: float, height: float, thick: float
 
 
 def rails(random: Random, width: float, depth: float, height: float, thick: float) -> list[Solid]:
-    """Bars between the legs, sometimes."""
+    """Return bars between the legs; sometimes an empty list."""
     if random.random() > 0.35:
         return []
     z, half = height * random.uniform(0.2, 0.45), thick * 0.35
@@ -38,7 +38,7 @@ def rails(random: Random, width: float, depth: float, height: float, thick: floa
 
 
 def top(random: Random, width: float, depth: float, height: float, thick: float, bar: float) -> list[Solid]:
-    """A table's top on four legs, perhaps with an apron."""
+    """Return a table's top on four legs, optionally with an apron."""
     parts = [
         box(width, depth, thick, (0, 0, height)),
         legs(random, width, depth, height, bar),
@@ -51,6 +51,7 @@ def top(random: Random, width: float, depth: float, height: float, thick: float,
 
 
 def table(random: Random) -> Solid:
+    """Return a table, round or rectangular."""
     height = random.uniform(0.35, 0.95)
     width, depth = random.uniform(0.6, 2.2), random.uniform(0.5, 1.2)
     thick, bar = random.uniform(0.015, 0.08), random.uniform(0.03, 0.12)
@@ -72,6 +73,7 @@ def table(random: Random) -> Solid:
 
 
 def desk(random: Random) -> Solid:
+    """Return a desk, with one chest or two, or with one flat drawer."""
     height, width, depth = random.uniform(0.65, 0.85), random.uniform(0.9, 2.0), random.uniform(0.45, 0.95)
     thick, bar = random.uniform(0.015, 0.06), random.uniform(0.03, 0.08)
     chest = random.uniform(0.28, 0.55)
@@ -107,6 +109,7 @@ def desk(random: Random) -> Solid:
 
 
 def bench(random: Random) -> Solid:
+    """Return a bench, sometimes with a back and arms."""
     height, width, depth = random.uniform(0.35, 0.55), random.uniform(0.8, 2.0), random.uniform(0.28, 0.55)
     thick, bar = random.uniform(0.03, 0.07), random.uniform(0.04, 0.09)
     if random.random() < 0.5:
@@ -136,6 +139,7 @@ def bench(random: Random) -> Solid:
 
 
 def stool(random: Random) -> Solid:
+    """Return a stool, sometimes with a low back."""
     height, size = random.uniform(0.4, 0.8), random.uniform(0.15, 0.24)
     thick, bar = random.uniform(0.02, 0.12), random.uniform(0.02, 0.06)
     if random.random() < 0.6:
@@ -163,7 +167,7 @@ def stool(random: Random) -> Solid:
 
 
 def back(random: Random, width: float, height: float, tall: float, y: float, bar: float) -> list[Solid]:
-    """A chair's: a board, slats upright or lying."""
+    """Return the back of a chair: a board, or upright or horizontal slats."""
     lean = random.uniform(0, 12)
     style = random.integers(3)
     if style == 0:
@@ -182,6 +186,7 @@ def back(random: Random, width: float, height: float, tall: float, y: float, bar
 
 
 def chair(random: Random) -> Solid:
+    """Return a chair."""
     if random.random() < 0.2:
         return couch(random, random.uniform(0.45, 0.75))
     height, width, depth = random.uniform(0.35, 0.7), random.uniform(0.36, 0.6), random.uniform(0.36, 0.55)
@@ -206,7 +211,7 @@ def chair(random: Random) -> Solid:
 
 
 def couch(random: Random, width: float) -> Solid:
-    """A padded seat with arms and a back, `width` between the arms."""
+    """Return a padded seat with arms and a back, with `width` between the arms."""
     height, depth = random.uniform(0.32, 0.46), random.uniform(0.55, 0.85)
     arm, tall = random.uniform(0.08, 0.2), random.uniform(0.3, 0.5)
     foot = random.choice([0.0, 0.05, 0.1, 0.15])
@@ -233,6 +238,7 @@ def couch(random: Random, width: float) -> Solid:
 
 
 def sofa(random: Random) -> Solid:
+    """Return a sofa, sometimes with a corner."""
     seat = couch(random, random.uniform(0.95, 2.2))
     if random.random() < 0.15:  # a corner sofa
         wing = box(0.7, random.uniform(0.5, 0.9), 0.4, (seat.vertices[:, 0].max() - 0.45, -0.7, 0.02))
@@ -241,6 +247,7 @@ def sofa(random: Random) -> Solid:
 
 
 def bed(random: Random) -> Solid:
+    """Return a bed, sometimes a bunk bed or a canopy bed."""
     width, length = random.choice([0.9, 1.2, 1.6, 1.8]) * random.uniform(0.95, 1.05), random.uniform(1.9, 2.2)
     height, thick = random.uniform(0.12, 0.45), random.uniform(0.1, 0.3)
     parts = [

@@ -1,7 +1,7 @@
-"""A generated set of CAD models in ModelNet's layout: `<class>/{train,test}/<class>_<number>.off` and `synthetic.json`.
+"""Generator of a set of CAD models in ModelNet's layout: `<class>/{train,test}/<class>_<number>.off`, `synthetic.json`.
 
-A root is a function of seed, sizes and classes, to the byte: each object has its own random stream, so that the first
-of more objects are those of fewer. It is written beside its place and renamed when whole.
+A root is a function of seed, sizes and classes, to the byte. Each object has its own random stream, so that a larger
+set begins with the objects of a smaller one. A root is written beside its place and renamed when it is complete.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from plugins.data.labelled_clouds.shapes import buildings, cabinets, furniture, 
 from plugins.data.labelled_clouds.shapes.solids import Solid, without_needless
 
 VERSION = 2
-"""Of the generator; a change in what it makes takes a new number, and with it a new folder."""
+"""Version of the generator; a change in its output takes a new number, and thus a new folder."""
 CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
     "airplane": things.airplane,
     "bathtub": vessels.bathtub,
@@ -62,18 +62,21 @@ CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
     "wardrobe": cabinets.wardrobe,
     "xbox": cabinets.xbox,
 }
-"""Those of ModelNet40, in its order."""
+"""Classes of ModelNet40, in its order, and the functions that make their objects."""
 SPLITS = ("train", "test")
 JITTER_DEG, QUARTERS = 12.0, 0.25
-"""Every object is turned about the up axis by up to so much, and this share of them by a quarter, half or three
-quarters of a turn more: the official models are not aligned either."""
+"""Largest rotation of each object about the up axis, degrees, and share of objects that are rotated by quarter turns
+too.
+
+The official models are not aligned either.
+"""
 STRETCH = 0.2
 """Standard deviation of the logarithm of each axis's own stretch."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Models:
-    """How many models of each class are generated for each split, and from which seed."""
+    """Number of generated models of each class for each split, and the seed."""
 
     train_models: Annotated[int, Field(ge=2, le=10_000)] = 60
     test_models: Annotated[int, Field(ge=1, le=10_000)] = 50
@@ -81,7 +84,7 @@ class Models:
 
 
 def generated(models: Models) -> Path:
-    """The root of a generated set; made now unless it is there.
+    """Return the root of a generated set; it is made now if it is not there.
 
     Raises:
         DataError: the cache cannot be written, or holds something else in its place.
@@ -99,7 +102,7 @@ def generated(models: Models) -> Path:
 
 
 def model(category: str, split: str, number: int, seed: int) -> Solid:
-    """The model of this number, from 0, within its split."""
+    """Return the model of this number, from 0, within its split."""
     stream = [seed, list(CLASSES).index(category), SPLITS.index(split), number]
     random = np.random.default_rng(stream)
     solid = CLASSES[category](random)
@@ -111,7 +114,7 @@ def model(category: str, split: str, number: int, seed: int) -> Solid:
 
 
 def as_off(solid: Solid) -> str:
-    """The text of an OFF file, to 10 µm: what the last bits of a cosine are differs from one machine to another."""
+    """Return the text of an OFF file, rounded to 10 µm, because the last bits of a cosine differ between machines."""
     rounded = np.round(solid.vertices, 5) + 0.0  # no -0
     vertices = [f"{x:g} {y:g} {z:g}" for x, y, z in rounded.tolist()]
     faces = [f"3 {a} {b} {c}" for a, b, c in solid.faces.tolist()]

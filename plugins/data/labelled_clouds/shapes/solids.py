@@ -1,4 +1,4 @@
-"""Closed solids as vertices and triangles, z up: what the generated objects are made of."""
+"""Closed solids as vertices and triangles, z up, from which the generated objects are made."""
 
 import math
 from collections.abc import Sequence
@@ -12,19 +12,21 @@ Point = Sequence[Number]
 
 
 class Solid(NamedTuple):
-    """A surface, or several, as triangles."""
+    """One surface or several, as triangles."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
 
     def moved(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Solid":
+        """Return the solid shifted along each axis."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
     def scaled(self, x: Number, y: Number, z: Number) -> "Solid":
+        """Return the solid scaled along each axis."""
         return Solid(self.vertices * [x, y, z], self.faces)
 
     def turned(self, axis: str, angle_deg: Number) -> "Solid":
-        """Rotated about a coordinate axis, counter-clockwise seen from its positive end."""
+        """Return the solid rotated about a coordinate axis, counter-clockwise seen from its positive end."""
         c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
         vertices = self.vertices.copy()
@@ -34,7 +36,7 @@ class Solid(NamedTuple):
 
 
 def joined(solids: Sequence[Solid]) -> Solid:
-    """All of them as one."""
+    """Return all solids as one."""
     first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     return Solid(
         np.concatenate([solid.vertices for solid in solids]),
@@ -43,21 +45,21 @@ def joined(solids: Sequence[Solid]) -> Solid:
 
 
 def mirrored(solid: Solid, axis: int) -> Solid:
-    """The solid and its mirror image; `axis` 0: left and right of the plane x = 0."""
+    """Return the solid and its mirror image; with `axis` 0, left and right of the plane x = 0."""
     sign = np.ones(3)
     sign[axis] = -1
     return joined([solid, Solid(solid.vertices * sign, solid.faces[:, ::-1])])
 
 
 def box(width: Number, depth: Number, height: Number, at: Point = (0, 0, 0)) -> Solid:
-    """Width along x, depth along y; `at` is the middle of its bottom."""
+    """Return a box with width along x and depth along y; `at` is the middle of its bottom."""
     return tapered(width, depth, width, depth, height, at)
 
 
 def tapered(
     width: Number, depth: Number, top_width: Number, top_depth: Number, height: Number, at: Point = (0, 0, 0)
 ) -> Solid:
-    """A box whose top has another size than its bottom."""
+    """Return a box whose top has another size than its bottom."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
     bottom = np.column_stack([corners * [width, depth], np.zeros(4)])
     top = np.column_stack([corners * [top_width, top_depth], np.full(4, height)])
@@ -66,14 +68,18 @@ def tapered(
 
 
 def slab(outline: Sequence[Point], thickness: Number) -> Solid:
-    """A flat plate in the plane z = 0 with a convex outline (x, y), counter-clockwise, centred in its thickness."""
+    """Return a flat plate in the plane z = 0, centred in its thickness; its outline (x, y) is convex,
+    counter-clockwise.
+    """
     flat = np.array([(x, y, 0.0) for x, y in outline])
     half = np.array([0, 0, thickness / 2])
     return Solid(*_rings([flat - half, flat + half], len(flat)))
 
 
 def revolved(profile: Sequence[Point], sides: int = 24) -> Solid:
-    """A profile (radius, height), from its lower end to its upper, turned about the z axis; the ends are closed."""
+    """Return the surface of a profile (radius, height), from bottom to top, rotated about the z axis; its ends are
+    closed.
+    """
     angle = 2 * math.pi * np.arange(sides) / sides
     rings = [
         np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(sides, float(z))]) for r, z in profile
@@ -84,29 +90,30 @@ def revolved(profile: Sequence[Point], sides: int = 24) -> Solid:
 def cylinder(
     radius: Number, height: Number, at: Point = (0, 0, 0), top: Number | None = None, sides: int = 16
 ) -> Solid:
-    """Upright, `at` the middle of its bottom; a cone's frustum where `top`, its upper radius, is another."""
+    """Return an upright cylinder, or a frustum with the upper radius `top`; `at` is the middle of its bottom."""
     return revolved([(radius, 0), (radius if top is None else top, height)], sides).moved(*at)
 
 
 def rod(start: Point, end: Point, radius: Number, sides: int = 8) -> Solid:
-    """A round bar between two points."""
+    """Return a round bar between two points."""
     return swept([start, end], [radius, radius], sides)
 
 
 def ball(radius: Number, at: Point = (0, 0, 0), sides: int = 16) -> Solid:
+    """Return a sphere with its centre at `at`."""
     bend = np.linspace(-math.pi / 2, math.pi / 2, sides // 2 + 1)
     return revolved([(radius * math.cos(b), radius * math.sin(b)) for b in bend], sides).moved(*at)
 
 
 def ring(radius: Number, thickness: Number, at: Point = (0, 0, 0), sides: int = 24) -> Solid:
-    """A horizontal torus; `thickness` is the radius of its tube."""
+    """Return a horizontal torus; `thickness` is the radius of its tube."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     path = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(sides + 1)])
     return swept(path, [thickness] * (sides + 1), 8).moved(*at)
 
 
 def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: int = 8) -> Solid:
-    """A round tube along a path in a plane or a straight line, with a radius at each of its points."""
+    """Return a round tube along a plane path or a straight line, with a radius at each of its points."""
     points = np.asarray(path, float)
     step = np.gradient(points, axis=0)
     closed = len(points) > 2 and np.allclose(points[0], points[-1])
@@ -126,7 +133,7 @@ def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: in
 
 
 def extruded(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
-    """An outline that the origin sees whole, counter-clockwise, from z = 0 to `height`."""
+    """Return an outline extruded from z = 0 to `height`; it is counter-clockwise and star-shaped about the origin."""
     middle = np.zeros_like(outline)
     levels = [(middle, 0), (outline, 0), (outline, height), (middle, height)]
     rings = [np.column_stack([flat, np.full(len(flat), float(z))]) for flat, z in levels]
@@ -134,7 +141,9 @@ def extruded(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
 
 
 def carried(outline: Sequence[Point], width: Number) -> Solid:
-    """A side view (y, z), counter-clockwise, carried along x, in the middle; its corners' mean sees it whole."""
+    """Return a side view (y, z) extruded along x, centred; it is counter-clockwise and star-shaped about its corners'
+    mean.
+    """
     flat = np.asarray(outline, float)
     middle = flat.mean(0)
     solid = extruded(flat - middle, width)
@@ -150,7 +159,7 @@ def tray(
     at: Point = (0, 0, 0),
     foot: Number = 1.0,
 ) -> Solid:
-    """An open box with walls so thick, its floor too; `foot` is the bottom's size as a share of the rim's."""
+    """Return an open box whose walls and floor have thickness; `foot` is the bottom's size as a share of the rim's."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
     outer = np.array([width, depth])
     inner = outer - 2 * wall
@@ -163,7 +172,7 @@ def tray(
 def ribbon(
     low: Float[np.ndarray, "points 2"], high: Float[np.ndarray, "points 2"], thickness: Number, height: Number
 ) -> Solid:
-    """A standing sheet between two lines (x, y) of as many points, at z = 0 and at `height`, x rising."""
+    """Return a standing sheet between two lines (x, y) of equally many points, at z = 0 and `height`; x is rising."""
     rings = [
         np.array(
             [
@@ -179,14 +188,14 @@ def ribbon(
 
 
 def without_needless(solid: Solid) -> Solid:
-    """The solid without triangles of which two corners are in one place: what is left of a ring of radius 0."""
+    """Return the solid without triangles that have two corners in one place, which a ring of radius 0 leaves."""
     corners = solid.vertices[solid.faces]
     apart = np.abs(corners - np.roll(corners, 1, axis=1)).max(-1)  # of each corner from the one before
     return Solid(solid.vertices, solid.faces[(apart > 1e-9).all(1)])  # the cosine of a right angle is 6e-17
 
 
 def _rings(rings: Sequence[np.ndarray], sides: int, caps: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Rings of equally many points joined by strips; the first and last closed by fans, right for convex ones."""
+    """Return rings of equally many points joined by strips; fans close the first and last, which must be convex."""
     vertices = np.concatenate(rings)
     here = np.arange(sides)
     after = (here + 1) % sides

@@ -1,4 +1,4 @@
-"""Vehicles, instruments, devices, lamps and people as random solids, metres, front towards -y."""
+"""Random solids of vehicles, instruments, devices, lamps and people, metres, front towards -y."""
 
 import math
 
@@ -26,6 +26,7 @@ Random = np.random.Generator
 
 
 def airplane(random: Random) -> Solid:
+    """Return an aeroplane."""
     length, radius = random.uniform(2.0, 3.6), random.uniform(0.1, 0.28)
     nose = random.uniform(0.08, 0.25)
     profile = [(0.02, 0.0), (0.75 * radius, nose * 0.5 * length), (radius, nose * length)]
@@ -72,7 +73,7 @@ def airplane(random: Random) -> Solid:
 
 
 def car(random: Random) -> Solid:
-    """Saloons, estates, vans, pick-ups and open cars; the bonnet points towards -y."""
+    """Return a saloon, estate, van, pick-up or open car; the bonnet points towards -y."""
     length, width = random.uniform(3.2, 5.2), random.uniform(1.5, 2.0)
     wheel, floor = random.uniform(0.28, 0.42), random.uniform(0.18, 0.35)
     waist = floor + random.uniform(0.45, 0.7)
@@ -117,7 +118,7 @@ def car(random: Random) -> Solid:
 
 
 def guitar(random: Random) -> Solid:
-    """Acoustic and electric ones, upright, their strings towards -y; some lie or lean."""
+    """Return an acoustic or electric guitar, upright, its strings towards -y; some lie or lean."""
     electric = random.random() < 0.45
     angle = np.linspace(0, 2 * math.pi, 48, endpoint=False)
     long, waist = random.uniform(0.2, 0.27), random.uniform(0.5, 0.85)
@@ -162,7 +163,7 @@ def guitar(random: Random) -> Solid:
 
 
 def key_rows(random: Random, width: Number, depth: Number, at: tuple[Number, Number, Number]) -> list[Solid]:
-    """A field of keys, its middle at `at`, with a long one in the front row."""
+    """Return a field of keys, its middle at `at`, with a long key in the front row."""
     x, y, z = at
     rows, columns = int(random.integers(4, 7)), int(random.integers(9, 16))
     wide, deep = width / columns, depth / rows
@@ -178,6 +179,7 @@ def key_rows(random: Random, width: Number, depth: Number, at: tuple[Number, Num
 
 
 def keyboard(random: Random) -> Solid:
+    """Return a computer keyboard."""
     width, depth = random.uniform(0.28, 0.52), random.uniform(0.11, 0.2)
     thick, rise = random.uniform(0.008, 0.025), random.uniform(0, 0.02)
     y = depth / 2
@@ -197,6 +199,7 @@ def keyboard(random: Random) -> Solid:
 
 
 def laptop(random: Random) -> Solid:
+    """Return an open laptop."""
     width = random.uniform(0.28, 0.42)
     depth, thick = width * random.uniform(0.6, 0.78), random.uniform(0.012, 0.04)
     parts = [box(width, depth, thick)]
@@ -214,6 +217,7 @@ def laptop(random: Random) -> Solid:
 
 
 def monitor(random: Random) -> Solid:
+    """Return a monitor on a stand."""
     width = random.uniform(0.4, 1.2)
     height, thick = width * random.uniform(0.5, 0.85), random.uniform(0.025, 0.09)
     lift = random.uniform(0.04, 0.3)
@@ -243,7 +247,7 @@ def monitor(random: Random) -> Solid:
 
 
 def piano(random: Random) -> Solid:
-    """Uprights and grands, the keys towards -y, some with a stool."""
+    """Return an upright or grand piano, the keys towards -y, sometimes with a stool."""
     width = random.uniform(1.3, 1.6)
     ledge, deep = random.uniform(0.6, 0.75), random.uniform(0.25, 0.4)
     parts: list[Solid] = []
@@ -294,7 +298,7 @@ def piano(random: Random) -> Solid:
 
 
 def lamp(random: Random) -> Solid:
-    """Standing, bent, on a table, and hanging ones."""
+    """Return a standing, bent, table or hanging lamp."""
     height, shade = random.uniform(0.4, 1.7), random.uniform(0.12, 0.32)
     foot, style = random.uniform(0.08, 0.22), random.random()
     tall, narrow = random.uniform(0.15, 0.38), random.uniform(0.3, 1)
@@ -332,7 +336,7 @@ def lamp(random: Random) -> Solid:
 
 
 def person(random: Random) -> Solid:
-    """Standing, walking, with arms down, raised or spread, or seated; in trousers, a skirt, a hat."""
+    """Return a standing, walking or seated person, arms down, raised or spread; in trousers, a skirt, or a hat."""
     hip, stout = random.uniform(0.8, 1.0), random.uniform(0.8, 1.4)
     chest, shoulder = hip + random.uniform(0.48, 0.6), random.uniform(0.17, 0.24) * stout**0.5
     seated = random.random() < 0.12

@@ -1,4 +1,4 @@
-"""Vessels, plants and what holds water as random solids, metres, z up."""
+"""Random solids of vessels, plants and things that hold water, metres, z up."""
 
 import math
 from collections.abc import Sequence
@@ -28,13 +28,13 @@ Random = np.random.Generator
 
 
 def walled(outer: Sequence[Point], wall: Number, floor: Number, sides: int = 28) -> Solid:
-    """A vessel: an outer profile (radius, height) from the foot to the rim, and the same inside, above a floor."""
+    """Return a vessel with an outer profile (radius, height) from the foot to the rim, and the same profile inside."""
     inside = [(max(r - wall, 0.0), z) for r, z in reversed(outer) if z > floor]
     return revolved([*outer, *inside, (0.0, floor)], sides)
 
 
 def curve(random: Random, controls: Sequence[Point], steps: int = 14) -> list[tuple[float, float]]:
-    """A smooth profile through a few points (radius, height): cosine steps between them."""
+    """Return a smooth profile through a few points (radius, height), with cosine steps between them."""
     radii, heights = np.array(controls).T
     at = np.linspace(0, len(controls) - 1, steps)
     left = np.minimum(at.astype(int), len(controls) - 2)
@@ -45,7 +45,7 @@ def curve(random: Random, controls: Sequence[Point], steps: int = 14) -> list[tu
 
 
 def ear(reach: Number, low: Number, high: Number, out: Number, thick: Number) -> Solid:
-    """A handle on the side x > 0 of a vessel of radius `reach`, between two heights."""
+    """Return a handle on the side x > 0 of a vessel of radius `reach`, between two heights."""
     bend = np.linspace(math.radians(-80), math.radians(80), 9)
     middle, tall = (low + high) / 2, (high - low) / 2
     path = [(0.95 * reach + out * math.cos(b), 0.0, middle + tall * math.sin(b)) for b in bend]
@@ -55,7 +55,7 @@ def ear(reach: Number, low: Number, high: Number, out: Number, thick: Number) ->
 def leaves(
     random: Random, count: int, start: Point, spread: Number, tall: Number, long: Number
 ) -> list[Solid]:
-    """Stems from one point, up and outwards, each with a leaf."""
+    """Return stems from one point, up and outwards, each with a leaf."""
     x, y, z = start
     parts = []
     for _ in range(count):
@@ -69,7 +69,7 @@ def leaves(
 
 
 def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number) -> list[Solid]:
-    """Long blades that rise and bend over, as of a palm or grass."""
+    """Return long blades that rise and bend over, as of a palm or grass."""
     x, y, z = start
     parts = []
     for _ in range(count):
@@ -86,7 +86,7 @@ def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number
 
 
 def pot(random: Random) -> tuple[list[Solid], float, float]:
-    """A pot's parts, the height of its earth, and its radius."""
+    """Return a pot's parts, the height of its earth, and its radius."""
     radius, height = random.uniform(0.1, 0.25), random.uniform(0.15, 0.4)
     if random.random() < 0.2:  # square
         earth = height * random.uniform(0.75, 0.92)
@@ -107,6 +107,7 @@ def pot(random: Random) -> tuple[list[Solid], float, float]:
 
 
 def flower_pot(random: Random) -> Solid:
+    """Return a flower pot, often with a plant in it."""
     parts, earth, radius = pot(random)
     grown = random.random()
     tall = random.uniform(0.08, 0.4)
@@ -119,6 +120,7 @@ def flower_pot(random: Random) -> Solid:
 
 
 def plant(random: Random) -> Solid:
+    """Return a plant in a pot."""
     parts, earth, radius = pot(random) if random.random() < 0.85 else ([cylinder(0.08, 0.03)], 0.02, 0.15)
     kind = random.integers(4)
     tall, spread = random.uniform(0.25, 0.9), random.uniform(0.8, 2.2) * radius
@@ -147,6 +149,7 @@ def plant(random: Random) -> Solid:
 
 
 def bottle(random: Random) -> Solid:
+    """Return a bottle."""
     radius, height = random.uniform(0.08, 0.22), random.uniform(0.45, 0.85)
     neck = radius * random.uniform(0.22, 0.65)
     shoulder, start = random.uniform(0.4, 0.72) * height, random.uniform(0.72, 0.88) * height
@@ -162,6 +165,7 @@ def bottle(random: Random) -> Solid:
 
 
 def vase(random: Random) -> Solid:
+    """Return a vase, sometimes with handles or flowers."""
     height = random.uniform(0.3, 0.85)
     belly, neck = random.uniform(0.08, 0.28), random.uniform(0.04, 0.2)
     foot, rim = random.uniform(0.05, 0.17), neck * random.uniform(0.8, 1.9)
@@ -179,6 +183,7 @@ def vase(random: Random) -> Solid:
 
 
 def bowl(random: Random) -> Solid:
+    """Return a bowl, sometimes with a stem or fruit."""
     radius, height = random.uniform(0.18, 0.36), random.uniform(0.08, 0.3)
     foot = radius * random.uniform(0.25, 0.75)
     outer = [(foot, 0.0), (radius * random.uniform(0.7, 1.02), 0.5 * height), (radius, height)]
@@ -194,7 +199,7 @@ def bowl(random: Random) -> Solid:
 
 
 def cup(random: Random) -> Solid:
-    """Mugs, cups without a handle, and goblets."""
+    """Return a mug, a cup without a handle, or a goblet."""
     radius, height = random.uniform(0.08, 0.16), random.uniform(0.12, 0.34)
     foot, low = radius * random.uniform(0.5, 1), 0.0
     kind = random.random()
@@ -215,7 +220,7 @@ def cup(random: Random) -> Solid:
 
 
 def tap(random: Random, at: Point, size: Number) -> list[Solid]:
-    """A water tap behind a basin, its mouth towards -y, perhaps with two knobs."""
+    """Return a water tap behind a basin, its mouth towards -y, optionally with two knobs."""
     x, y, z = at
     reach, tall = size * random.uniform(0.6, 1.0), size * random.uniform(0.5, 1.2)
     bend = np.linspace(0, math.pi, 7)
@@ -228,6 +233,7 @@ def tap(random: Random, at: Point, size: Number) -> list[Solid]:
 
 
 def bathtub(random: Random) -> Solid:
+    """Return a bathtub."""
     width, depth, height = random.uniform(1.3, 2.0), random.uniform(0.65, 1.0), random.uniform(0.4, 0.7)
     kind, wall = random.random(), random.uniform(0.03, 0.1)
     if kind < 0.4:
@@ -258,6 +264,7 @@ def bathtub(random: Random) -> Solid:
 
 
 def sink(random: Random) -> Solid:
+    """Return a sink, on a column, on a cabinet, or with a draining board."""
     width, depth = random.uniform(0.4, 0.9), random.uniform(0.35, 0.6)
     kind, height = random.random(), random.uniform(0.12, 0.25)
     low = 0.0
@@ -291,6 +298,7 @@ def sink(random: Random) -> Solid:
 
 
 def toilet(random: Random) -> Solid:
+    """Return a toilet, with or without a lid."""
     high, long = random.uniform(0.35, 0.45), random.uniform(1.15, 1.5)
     foot = random.uniform(0.1, 0.15)
     profile = [(foot, 0), (random.uniform(0.08, 0.12), 0.4 * high), (0.19, high)]
@@ -316,7 +324,7 @@ def toilet(random: Random) -> Solid:
 
 
 def cone(random: Random) -> Solid:
-    """Traffic cones, plain ones, and a few that stand on their tip."""
+    """Return a traffic cone, a plain cone, or sometimes a cone that stands on its tip."""
     radius, height = random.uniform(0.12, 0.35), random.uniform(0.3, 0.9)
     tip = radius * random.choice([0.0, random.uniform(0.05, 0.35)])
     sides = int(random.choice([32, 32, 8, 6]))
