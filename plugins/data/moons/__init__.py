@@ -1,1 +1,1 @@
-"""Two interleaved half circles with overlapping noise, and points far from both, as data sets."""
+"""Data sets of points in the plane: two interleaved half circles with overlapping noise, and outliers far from both."""

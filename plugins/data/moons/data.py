@@ -1,4 +1,4 @@
-"""The two moons with overlapping noise; the contract is framework.data's."""
+"""Data set of two moons with overlapping noise; framework.data describes the contract."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -14,11 +14,11 @@ from plugins.data.moons.points import Draws, PlanePoints, fingerprint, split_of
 class Moons(PlanePoints):
     """Two interleaved half circles whose noise makes the classes overlap (thesis Figure 2.2, §2.3.1).
 
-    The classes are equally likely, and each batch holds the exact "posterior" of its points, (batch, 2): nothing can
-    predict better. The splits are independent draws that depend on the seed of the data alone.
+    The classes are equally likely, and each batch holds the exact "posterior" of its points, (batch, 2), which no
+    prediction can improve on. The splits are independent draws that depend only on the seed of the data.
 
     Args:
-        draws: of the points.
+        draws: sizes and seed of the splits.
         noise: standard deviation of both coordinates, in radii of the half circles.
     """
 

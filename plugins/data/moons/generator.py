@@ -1,9 +1,9 @@
 """Two interleaved half circles under Gaussian noise: drawing points, and their exact densities and posterior.
 
-A unit circle's upper half about (0, 0) is class 0, the lower half about (1, ½) is class 1; a point is at a uniform
-angle of its class's arc, plus normal noise. Points are given in standard units: each coordinate less its mean, over its
-standard deviation, both those of the law itself and not of a sample. The arcs are each other's mirror image in the
-origin, and so are the two densities.
+The upper half of a unit circle about (0, 0) is class 0, the lower half of one about (1, ½) is class 1. A point lies at
+a uniform angle of its class's arc, with normal noise added. Points are in standard units: each coordinate minus its
+mean, divided by its standard deviation, where both are those of the distribution and not of a sample. The arcs are
+mirror images of each other in the origin, and so are the two densities.
 """
 
 import math
@@ -13,15 +13,15 @@ from jaxtyping import Float, Int
 from scipy.special import log_expit
 
 CENTRE = np.array([0.5, 0.25])
-"""Mean of the law and centre of its symmetry, in radii of the arcs."""
+"""Mean of the distribution and centre of its symmetry, in radii of the arcs."""
 NODES = 64
-"""Of the Gauss-Legendre rule on each piece of an arc."""
+"""Number of nodes of the Gauss-Legendre rule on each piece of an arc."""
 DECAY = 40.0
 """Nats below a piece's largest value at which its integral is cut off: e⁻⁴⁰ is below float64's resolution."""
 
 
 def scale(noise: float) -> np.ndarray:
-    """Standard deviation of either coordinate, in radii, of the two classes together.
+    """Return the standard deviation of either coordinate over both classes, in radii.
 
     E x² = ½ + ¼ + σ² about the centre; E y² = E (sin θ - ¼)² + σ² = ½ - 1/π + 1/16 + σ², as E sin θ = 2/π.
     """
@@ -29,10 +29,12 @@ def scale(noise: float) -> np.ndarray:
 
 
 def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"], Int[np.ndarray, "size"]]:
-    """Points in standard units and their classes in turn; the first of a larger draw are those of a smaller one.
+    """Return points in standard units and their classes in turn; a larger draw begins with the points of a smaller one.
 
     Args:
-        key: numbers that choose the stream; other numbers give independent points.
+        size: number of points.
+        noise: standard deviation of the noise, in radii.
+        key: numbers that choose the random stream; other numbers give independent points.
     """
     angles, normals = (np.random.default_rng([*key, part]) for part in range(2))
     angle = math.pi * angles.random(size)
@@ -45,7 +47,7 @@ def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"
 
 
 def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Log of p(x | y) for y = 0 and 1, nats, of points in standard units; finite for every finite float32."""
+    """Return log p(x | y) for y = 0 and 1, nats, of points in standard units; finite for every finite float32."""
     distance, around = _seen_from_arcs(points, noise)
     # |x - (cos θ, sin θ)|² = (d - 1)² + 4 d sin²(t/2), where d is x's distance from the circle's centre
     along = -((distance - 1) ** 2) / (2 * noise**2)
@@ -54,7 +56,7 @@ def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np
 
 
 def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """Log of p(y | x) for y = 0 and 1, equally likely beforehand, of points in standard units."""
+    """Return log p(y | x) for y = 0 and 1, with equal prior probabilities, of points in standard units."""
     distance, around = _seen_from_arcs(points, noise)
     total = distance.sum(-1)
     # log p(x | 1) - log p(x | 0) without the cancellation of large squares: for p from the centre of symmetry and
@@ -65,17 +67,17 @@ def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[
 
 
 def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
-    """p(y | x) for y = 0 and 1: the best that can be predicted."""
+    """Return p(y | x) for y = 0 and 1, the best possible prediction."""
     return np.exp(log_posterior(points, noise))
 
 
 def _seen_from_arcs(
     points: Float[np.ndarray, "*batch 2"], noise: float
 ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
-    """For either class: distance d from its circle's centre, radii, and log of ∫ exp(-2 d sin²(t/2) / σ²) dt.
+    """Return, for each class, the distance d from its circle's centre, radii, and log ∫ exp(-2 d sin²(t/2) / σ²) dt.
 
-    Here t is the angle between x and a point of the arc. The integrand falls with |t|, and the arc is two pieces of
-    |t|: both start at x's direction where the arc has it, and else at the arc's ends.
+    Here t is the angle between x and a point of the arc. The integrand falls with |t|, and the arc is divided into two
+    pieces of |t|: both start at x's direction if the arc contains it, and otherwise at the arc's ends.
     """
     centred = points * scale(noise)
     seen = np.stack([centred + CENTRE, CENTRE - centred], -2)
@@ -92,7 +94,9 @@ def _seen_from_arcs(
 
 
 def _log_piece(low: np.ndarray, high: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Log of ∫ exp(-rate sin²(t/2)) dt from `low` to `high`, 0 ≤ low ≤ high ≤ π, over where the integrand counts."""
+    """Return log ∫ exp(-rate sin²(t/2)) dt from `low` to `high`, 0 ≤ low ≤ high ≤ π, where the integrand is not
+    negligible.
+    """
     start = np.sin(low / 2) ** 2
     width = np.minimum(high - low, _reach(low, rate))
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
@@ -106,7 +110,7 @@ def _log_piece(low: np.ndarray, high: np.ndarray, rate: np.ndarray) -> np.ndarra
 
 
 def _reach(low: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """The w at which rate (sin²((low + w)/2) - sin²(low/2)) is DECAY; infinite where it never is.
+    """Return the w at which rate (sin²((low + w)/2) - sin²(low/2)) is DECAY; infinite where it never is.
 
     With u = tan(w/2) and e = DECAY / rate: (cos low - e) u² + u sin low - e = 0, solved without cancellation.
     """

@@ -1,4 +1,4 @@
-"""Points where no moon is; the contract is framework.data's."""
+"""Data set of points far from the moons; framework.data describes the contract."""
 
 import math
 from collections.abc import Mapping
@@ -17,16 +17,16 @@ FEWER = Draws(test=1000)
 class MoonsOutliers(PlanePoints):
     """Two discs in the upper left and the lower right corner of [-4, 4]², far from every moon.
 
-    A network trained on `moons` has seen nothing there and is sure all the same (the triangles of thesis Figure 2.2;
-    §2.3.1).
+    A network trained on `moons` has seen no points there and is nevertheless certain (the triangles of thesis Figure
+    2.2; §2.3.1).
 
     Points are uniform on the discs, in the standard units of `moons`. Their targets name the moon on whose side they
-    lie and mean nothing. The splits are independent draws.
+    lie and have no meaning. The splits are independent draws.
 
     Args:
-        draws: of the points, the discs in turn.
+        draws: sizes and seed of the splits; points lie on the two discs in turn.
         corner: the discs' centres are (-corner, corner) and (corner, -corner).
-        radius: of the discs.
+        radius: radius of the discs.
     """
 
     bibtex = """@phdthesis{prokudin2020robust,
@@ -49,7 +49,7 @@ class MoonsOutliers(PlanePoints):
         self.radius = radius
 
     def drawn(self, size: int, split: int) -> Fields:
-        # 1: a stream of its own beside those of moons with the same seed
+        # the last 1 makes the stream differ from those of moons with the same seed
         random = np.random.default_rng([self.draws.data_seed, split, 1, 1]).random((size, 2))
         label = np.arange(size) % 2
         centre = np.where(label == 0, 1.0, -1.0)[:, None] * [-self.corner, self.corner]

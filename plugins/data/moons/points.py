@@ -1,4 +1,4 @@
-"""Labelled points of the plane: as a split holds them, from a user's files, and as a person would see them."""
+"""Labelled points of the plane: their splits, their reading from a user's files, and an image of them."""
 
 import hashlib
 from abc import abstractmethod
@@ -24,15 +24,15 @@ Size = Annotated[int, Field(ge=1, le=10_000_000)]
 DataSeed = Annotated[int, Field(ge=0, lt=2**31)]
 TARGET = Target("class", ("upper", "lower"))
 SIDE = 96
-"""Pixels of a picture."""
+"""Side of the image, pixels."""
 REACH = 4.0
-"""A picture shows [-4, 4]², the square in which thesis §2.3.5 draws outliers."""
+"""Half the side of the square [-4, 4]² that the image shows, in which thesis §2.3.5 draws outliers."""
 COLOURS = np.array([[31, 119, 180], [255, 127, 14]], np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Draws:
-    """How many points each split has, and what seeds their draws, whatever the seed of the run."""
+    """Number of points of each split, and the seed of their draws, which does not depend on the seed of the run."""
 
     train: Size = 500
     validation: Size = 500
@@ -41,8 +41,10 @@ class Draws:
 
 
 class PlanePoints(Data):
-    """Labelled points, independent draws in each split. A data set of the family adds its constructor, what to cite,
-    `drawn` and `fingerprint`."""
+    """Base class of data sets of labelled points with independent draws in each split.
+
+    A data set adds its constructor, its citation, `drawn` and `fingerprint`.
+    """
 
     target = TARGET
     input_shape = (2,)
@@ -54,7 +56,7 @@ class PlanePoints(Data):
 
     @abstractmethod
     def drawn(self, size: int, split: int) -> Fields:
-        """So many points of a split, 0 to 2."""
+        """Return `size` points of a split, 0 to 2."""
 
     def prepare(self) -> None:
         sizes = (self.draws.train, self.draws.validation, self.draws.test)
@@ -74,7 +76,7 @@ class PlanePoints(Data):
 
 
 def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
-    """Points with their labels, in one group."""
+    """Return a split of points with their labels, in one group."""
     return Fields(
         input=inputs,
         target=torch.from_numpy(label),
@@ -85,7 +87,7 @@ def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], 
 
 
 def fingerprint(version: str, splits: Sequence[Fields], **parameters: object) -> dict[str, str]:
-    """What identifies draws: their parameters and sizes, and a hash over their points."""
+    """Return the parameters and sizes of the draws and a hash of their points, which identify a data set."""
     digest = hashlib.sha256()
     for split in splits:
         digest.update(split.fields["input"].numpy().tobytes())
@@ -99,11 +101,11 @@ def fingerprint(version: str, splits: Sequence[Fields], **parameters: object) ->
 
 
 def read_points(files: Sequence[Path]) -> Fields:
-    """The columns `x` and `y` of CSV files, in standard units, one sample a row.
+    """Read the columns `x` and `y` of CSV files, in standard units, one sample for each row.
 
     Raises:
-        DataError: there is no file, or one cannot be read, lacks a column, or holds a cell that is no finite
-            number; names it.
+        DataError: there is no file, or a file cannot be read, lacks a column, or holds a cell that is not a finite
+            number; the message names it.
     """
     found = []
     for columns, points in tables(files, ("x", "y"), "A file of points"):
@@ -120,7 +122,10 @@ def read_points(files: Sequence[Path]) -> Fields:
 
 
 def picture(inputs: Float[Tensor, "2"], among: Fields) -> UInt8[np.ndarray, "side side 3"]:
-    """All points of a split in two colours on white, and a black cross at one, at the border where it lies outside."""
+    """Return an image of all points of a split in two colours, and a black cross at one point.
+
+    A point outside of the image has its cross at the border.
+    """
     point = inputs.detach().cpu().double().numpy()
     cloud, label = among.fields["input"].double().numpy(), among.fields["target"].numpy()
     canvas = np.full((SIDE, SIDE, 3), 255, np.uint8)
@@ -135,6 +140,6 @@ def picture(inputs: Float[Tensor, "2"], among: Fields) -> UInt8[np.ndarray, "sid
 
 
 def _pixel(points: Float[np.ndarray, "*batch 2"]) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column, the y axis upwards."""
+    """Return row and column of points, with the y axis upwards."""
     place = ((points + REACH) / (2 * REACH) * SIDE).astype(np.int64).clip(0, SIDE - 1)
     return SIDE - 1 - place[..., 1], place[..., 0]

@@ -1,4 +1,4 @@
-"""Rows of the contract: a few points."""
+"""Rows of the contract: small draws of both data sets."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from framework.testing.rows import DataRow
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """A point in one file, two in another, whose columns stand the other way round."""
+    """Write two files, with one point and with two points, whose columns are in different orders."""
     first, second = folder / "first.csv", folder / "second.csv"
     first.write_text("x,y\n0.50000000,-1.25\n", encoding="utf-8")
     second.write_text("y,note,x\n2,hello,1\n4.75,,-3.5\n", encoding="utf-8")
