@@ -1,1 +1,1 @@
-"""PASCAL3D+ viewpoints: the official layout, and a generator that writes it."""
+"""Data set PASCAL3D+ of viewpoints: reading of the official layout, and a generator that writes it."""

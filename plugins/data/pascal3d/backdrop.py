@@ -1,4 +1,4 @@
-"""What surrounds an object: textures, a horizon, clutter, and things that stand in the way."""
+"""Surroundings of an object: textures, a horizon, clutter, and things that stand in front of it."""
 
 import math
 
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 Picture = NDArray[np.float32]
-"""Values 0…1; (height, width, 3) unless said otherwise."""
+"""Image with values 0…1; (height, width, 3) unless stated otherwise."""
 
 
 def texture(random: Generator, height: int, width: int) -> Picture:
-    """Smooth noise on three scales between two random colours."""
+    """Return smooth noise on three scales between two random colours."""
     noise = np.zeros((height, width), np.float32)
     for cells, weight in ((3, 1.0), (9, 0.5), (30, 0.3)):
         grid = random.random((cells, cells), dtype=np.float32) - np.float32(0.5)
@@ -24,7 +24,7 @@ def texture(random: Generator, height: int, width: int) -> Picture:
 
 
 def muted(random: Generator) -> Picture:
-    """A colour (3,) of any brightness and little saturation, as most surroundings have."""
+    """Return a colour (3,) of any brightness and little saturation, as most surroundings have."""
     grey = random.uniform(0.12, 0.9)
     return np.clip(grey + random.normal(0, 0.1, 3), 0, 1).astype(np.float32)
 
@@ -32,11 +32,14 @@ def muted(random: Generator) -> Picture:
 def background(
     random: Generator, height: int, width: int, horizon: tuple[float, float], tilt: float
 ) -> Picture:
-    """A texture, or ground and sky that meet at the horizon, with clutter.
+    """Return a texture, or ground and sky that meet at the horizon, with clutter.
 
     Args:
+        random: source of all draws.
+        height: height of the image, pixels.
+        width: width of the image, pixels.
         horizon: a point of the horizon (x, y), pixels.
-        tilt: by how much the horizon leans, radians, counter-clockwise in the image.
+        tilt: angle by which the horizon leans, radians, counter-clockwise in the image.
     """
     ground = texture(random, height, width)
     if random.random() < 0.5:
@@ -54,7 +57,7 @@ def background(
 def blob(
     random: Generator, height: int, width: int, center: tuple[float, float], size: float
 ) -> NDArray[np.float32]:
-    """The mask of a random ellipse, quadrangle or pole near `center`, at most about `size` pixels across."""
+    """Return the mask of a random ellipse, quadrangle or pole near `center`, at most about `size` pixels across."""
     canvas = Image.new("L", (width, height))
     draw = ImageDraw.Draw(canvas)
     x, y = center

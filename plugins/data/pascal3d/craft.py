@@ -1,4 +1,4 @@
-"""Parametric craft of the air and the water: aeroplane and boat; every number in metres."""
+"""Parametric aeroplanes and boats; every number is in metres."""
 
 import numpy as np
 from numpy.random import Generator
@@ -20,7 +20,7 @@ from plugins.data.pascal3d.shapes import (
 
 
 def aeroplane(random: Generator) -> Body:
-    """A jet airliner, or a light aircraft with a propeller."""
+    """Return a jet airliner, or a light aircraft with a propeller."""
     body = Body()
     skin = shade((0.9, 0.9, 0.92), random.uniform(0.8, 1.05)) if random.random() < 0.6 else paint(random)
     mark = paint(random)
@@ -97,7 +97,7 @@ def _fuselage(length: float, nose: float, radius: float) -> Solid:
 
 
 def boat(random: Generator) -> Body:
-    """A sailing boat, a motor boat with a cabin, or an open rowing boat: bow in front, broad stern behind."""
+    """Return a sailing boat, a motor boat with a cabin, or an open rowing boat: bow in front, broad stern behind."""
     body = Body()
     hull = paint(random) if random.random() < 0.6 else (0.92, 0.92, 0.9)
     deck = (0.75, 0.6, 0.42) if random.random() < 0.5 else (0.85, 0.85, 0.82)
@@ -129,7 +129,7 @@ def boat(random: Generator) -> Body:
         roof = floor + high
 
         def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
-            """The cabin's outline at a share of its height."""
+            """Return the cabin's outline at a share of its height."""
             wide = (0.33 - 0.03 * share) * beam + grow
             return wide, front + 0.1 * share * length - grow, behind + grow, floor + share * high
 
@@ -153,7 +153,7 @@ def boat(random: Generator) -> Body:
 
 
 def _hull(along: Array, half: Array, rim: Array, keel: Array) -> Solid:
-    """Cross sections of a boat from bow to stern: half widths, heights of the rim and of the keel."""
+    """Return the hull of a boat from bow to stern: half widths, and heights of the rim and of the keel."""
     rings = []
     for y, wide, high, low in zip(along, half, rim, keel, strict=True):
         side = [(1.0, high), (0.92, 0.45 * high + 0.55 * max(low, 0.0)), (0.5, low)]

@@ -1,4 +1,4 @@
-"""Parametric two-wheelers: bicycle and motorbike; every number in metres."""
+"""Parametric two-wheelers, bicycle and motorbike; every number is in metres."""
 
 from itertools import pairwise
 
@@ -10,7 +10,7 @@ from plugins.data.pascal3d.shapes import Body, box, ellipsoid, loft, off, plate,
 
 
 def bicycle(random: Generator) -> Body:
-    """A diamond frame, or a step-through one, with a saddle, bent or straight bars and cranks."""
+    """Return a bicycle with a diamond or step-through frame, a saddle, bent or straight bars, and cranks."""
     body = Body()
     frame = paint(random, vivid=True)
     size = random.uniform(0.32, 0.36)
@@ -56,7 +56,7 @@ def bicycle(random: Generator) -> Body:
 
 
 def motorbike(random: Generator) -> Body:
-    """A road machine: fat tyres, tank, engine, exhaust on both sides, headlamp on a raked fork."""
+    """Return a road machine: fat tyres, tank, engine, exhaust on both sides, headlamp on a raked fork."""
     body = Body()
     skin = paint(random, vivid=True)
     base, size = random.uniform(0.7, 0.8), random.uniform(0.29, 0.33)

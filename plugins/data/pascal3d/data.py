@@ -1,4 +1,4 @@
-"""Reads PASCAL3D+ as labelled crops; the contract is framework.data's."""
+"""Data set PASCAL3D+ as labelled crops; framework.data describes the contract."""
 
 import hashlib
 from collections import Counter
@@ -27,19 +27,21 @@ from plugins.data.pascal3d import layout
 from plugins.data.pascal3d.generator import VERSION, generated
 from plugins.data.pascal3d.layout import CLASSES, Annotation
 
-SPLIT_SEED = 13  # that of the thesis authors' code
+SPLIT_SEED = 13  # the seed of the thesis authors' code
 MIRRORED = (-1.0, 1.0, -1.0)
-"""A mirror image of a mirror-symmetric object multiplies azimuth, elevation and tilt by these."""
+"""Factors of azimuth, elevation and tilt in a mirror image of a mirror-symmetric object."""
 
 
 class Sample(NamedTuple):
+    """One object, and the index of its class among the data set's groups."""
+
     annotation: Annotation
     group: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Which objects are learned from: those of one class or several, and of their images a share for validation."""
+    """Choice of the objects to learn from: one class or several, and the share of their images for validation."""
 
     category: str | list[str] = "car"
     include_occluded: bool = False
@@ -48,23 +50,26 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class Framing:
-    """How an object is cut out: a square of `image_size` pixels with a margin, a share of the box's longer side."""
+    """Crop of an object: a square of `image_size` pixels with a margin, a share of the box's longer side."""
 
     image_size: Annotated[int, Field(ge=8, le=1024)] = 48
     margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1
 
     def crop(self, annotation: Annotation) -> Crop:
+        """Return the crop of an annotated object."""
         return Crop(annotation.image, annotation.box, self.margin, self.image_size)
 
     def scale(self, box: Box) -> float:
-        """Say how many pixels of the input show one pixel of the picture."""
+        """Return how many pixels of the input show one pixel of the image."""
         left, top, right, bottom = box
         return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """How training images vary: half of them mirrored, all shifted, scaled and made brighter by up to `jitter`."""
+    """Variation of training images: half of them are mirrored, all are shifted, scaled and made brighter by up to
+    `jitter`.
+    """
 
     mirror: bool = True
     jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08
@@ -72,7 +77,7 @@ class Variation:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """What is generated where there is no root: how many images a class, from which seed, drawn by what."""
+    """Settings of the images that are generated without a root: number per class, seed, and renderer."""
 
     images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400
     generator_seed: Annotated[int, Field(ge=0)] = 0
@@ -86,7 +91,7 @@ class Pascal3D(Data):
     standard deviation of the blur, pixels of the input).
 
     Attributes:
-        excluded: how many objects the protocol left out, by reason; set by `prepare`.
+        excluded: number of objects that the protocol left out, by reason; set by `prepare`.
     """
 
     bibtex = """@inproceedings{xiang2014beyond,
@@ -145,7 +150,7 @@ class Pascal3D(Data):
         self._digest = _digest(samples)
 
     def _roots(self) -> dict[str, Path]:
-        """Find where the data of every class lie, and generate them where no root is given."""
+        """Return the root of every class; roots are generated if none is given."""
         for category in self.categories:
             if category not in CLASSES:
                 raise DataError(
@@ -173,7 +178,7 @@ class Pascal3D(Data):
         include_occluded: bool,
         faults: list[DataError],
     ) -> Iterator[Annotation]:
-        """Read the objects of a split that the protocol keeps; what cannot be read is added to `faults`."""
+        """Yield the objects of a split that the protocol keeps; errors of unreadable ones are added to `faults`."""
         names = [(source, name) for source, file in lists for name in layout.read_list(root / file)]
         for source, name in dict.fromkeys(names):
             try:
@@ -189,7 +194,7 @@ class Pascal3D(Data):
                     self.excluded[reason] += 1
 
     def _read(self, samples: Mapping[str, Sequence[Sample]], faults: Sequence[DataError]) -> None:
-        """Read every split's crops; complain at once of all that could not be read, here or before."""
+        """Read every split's crops, and refuse all together that could not be read, here or before."""
         self._tables, self.skipped = images.load_splits(
             {split: [self.framing.crop(one) for one, _ in chosen] for split, chosen in samples.items()},
             {split: self._fields(chosen) for split, chosen in samples.items()},
@@ -244,7 +249,7 @@ class Pascal3D(Data):
 
 
 def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
-    """Say why the protocol leaves an object out; None where it does not."""
+    """Return why the protocol leaves an object out; None where it does not."""
     if annotation.angles is None:
         return "without a fine label"
     if annotation.difficult:
@@ -255,7 +260,7 @@ def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | N
 
 
 def validation_files(annotations: Sequence[Annotation], share: float) -> set[Path]:
-    """Choose the files held out of training: whole images, so that no image is in both splits."""
+    """Return the files held out of training; whole images are chosen, so that no image is in both splits."""
     files = sorted({annotation.file for annotation in annotations})
     order = np.random.default_rng(SPLIT_SEED).permutation(len(files))
     return {files[index] for index in order[: round(share * len(files))]}
@@ -276,7 +281,7 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
 
 
 def _digest(samples: Mapping[str, Sequence[Sample]]) -> str:
-    """Hash the names, boxes and labels of every split."""
+    """Return a hash of the names, boxes and labels of every split."""
     digest = hashlib.sha256()
     for split, chosen in samples.items():
         for annotation, _ in chosen:

@@ -1,4 +1,4 @@
-"""The twelve object families by their PASCAL3D+ class names, with the symmetry each is built with."""
+"""The twelve object families by their PASCAL3D+ class names, with the symmetry of their objects."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,9 +10,9 @@ from plugins.data.pascal3d.shapes import Body
 
 
 class Family(NamedTuple):
-    """How to build an object of a class.
+    """Builder of an object of a class, and the symmetry of the object.
 
-    `symmetry` about the vertical: 1 none, 2 the same after 180°, 4 after 90°, 0 after any turn.
+    `symmetry` about the vertical axis is 1 for none, 2 for invariance under 180°, 4 under 90°, 0 under any rotation.
     """
 
     build: Callable[[Generator], Body]

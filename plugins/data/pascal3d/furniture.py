@@ -1,4 +1,4 @@
-"""Parametric household objects: bottle, chair, diningtable, sofa and tvmonitor; every number in metres."""
+"""Parametric household objects: bottle, chair, diningtable, sofa and tvmonitor; every number is in metres."""
 
 import numpy as np
 from numpy.random import Generator
@@ -10,9 +10,9 @@ BOTTLE_GLASS: tuple[Color, ...] = ((0.1, 0.28, 0.12), (0.35, 0.18, 0.06), (0.55,
 
 
 def bottle(random: Generator) -> Body:
-    """A wine, beer or water bottle: a body of revolution, its colours rings about the vertical.
+    """Return a wine, beer or water bottle: a body of revolution whose colours are rings about the vertical.
 
-    The polygon that stands for the circle is turned by a random angle: not even its edges tell the azimuth.
+    The polygon that approximates the circle is rotated by a random angle, so that not even its edges show the azimuth.
     """
     body = Body()
     glass = BOTTLE_GLASS[int(random.integers(len(BOTTLE_GLASS)))]
@@ -49,7 +49,7 @@ def bottle(random: Generator) -> Body:
 
 
 def chair(random: Generator) -> Body:
-    """Four legs, a seat, and a back of slats, rails or one panel; sometimes with arms."""
+    """Return a chair with four legs, a seat, and a back of slats, rails or one panel; sometimes with arms."""
     body = Body()
     frame = wood(random) if random.random() < 0.6 else paint(random)
     cloth = frame if random.random() < 0.4 else paint(random)
@@ -63,7 +63,7 @@ def chair(random: Generator) -> Body:
     body.pair(rod((x, rear, seat), (x, rear + lean, top), 0.65 * thick, sides=4), frame)
 
     def board(low: float, high: float, half: float, middle: float = 0.0) -> Solid:
-        """A board in the leaning plane of the back, between two heights."""
+        """Return a board in the leaning plane of the back, between two heights."""
         levels = []
         for z in (low, high):
             y = rear + lean * (z - seat) / (top - seat)
@@ -91,9 +91,10 @@ def chair(random: Generator) -> Body:
 
 
 def diningtable(random: Generator) -> Body:
-    """A rectangular table, the same after half a turn: one half is built, and that half turned is the other.
+    """Return a rectangular table with twofold symmetry: one half is built, and its copy rotated by half a turn is the
+    other.
 
-    A long side faces the front. Plates and chairs, where there are any, lie and stand in turned pairs.
+    A long side faces the front. Plates and chairs, where there are any, come in pairs that are rotated likewise.
     """
     half = Body()
     color = wood(random)
@@ -130,7 +131,7 @@ def diningtable(random: Generator) -> Body:
 
 
 def sofa(random: Generator) -> Body:
-    """Two or three seat cushions between arms, back cushions, short feet."""
+    """Return a sofa with two or three seat cushions between arms, back cushions, and short feet."""
     body = Body()
     cloth = paint(random) if random.random() < 0.7 else (0.45, 0.3, 0.2)
     seats = int(random.integers(2, 4))
@@ -164,7 +165,7 @@ def sofa(random: Generator) -> Body:
 
 
 def tvmonitor(random: Generator) -> Body:
-    """A flat screen on a foot, or an old set with a deep back; the picture is lit and faces the front."""
+    """Return a flat screen on a foot, or an old set with a deep back; the screen is lit and faces the front."""
     body = Body()
     case = DARK if random.random() < 0.6 else ((0.8, 0.79, 0.74) if random.random() < 0.6 else METAL)
     width = random.uniform(0.5, 1.0)

@@ -1,7 +1,7 @@
-"""Generated pictures in the layout of PASCAL3D+: annotation files, lists and images, and `synthetic.json`.
+"""Generator of images in the layout of PASCAL3D+: annotation files, lists and images, and `synthetic.json`.
 
-A root is a function of class, number of images, seed and renderer, to the byte: each picture has its own
-random stream, whichever thread draws it. It is written beside its place and renamed when whole.
+A root is a function of class, number of images, seed and renderer, to the byte: each image has its own random stream,
+whichever thread draws it. A root is written beside its place and renamed when it is complete.
 """
 
 import io
@@ -22,15 +22,18 @@ from plugins.data.pascal3d.layout import VOC_LISTS
 from plugins.data.pascal3d.scene import Shot, Thing, shoot
 
 VERSION = 1
-"""Of the generator; a change in what it draws or writes takes a new number, and with it a new folder."""
+"""Version of the generator; a change in what it draws or writes takes a new number, and thus a new folder."""
 SHARES = {"imagenet_train": 0.4, "imagenet_val": 0.2, "pascal_train": 0.2, "pascal_val": 0.2}
 SAVING = Lock()
-"""SciPy's writers of MATLAB files share the tag that they write sizes with: two at once write each other's."""
+"""Lock for SciPy's writers of MATLAB files.
+
+They share the tag with which they write sizes: two of them at once would write each other's.
+"""
 HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)  # SciPy's holds the date
 
 
 def generated(parent: Path, category: str, images: int, seed: int, renderer: Renderer) -> Path:
-    """The root of a generated class; drawn now unless it is there.
+    """Return the root of a generated class; it is drawn now if it is not there.
 
     Raises:
         DataError: the cache cannot be written, or holds something else in its place.
@@ -79,7 +82,7 @@ def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Rende
 
 
 def _names(images: int) -> Iterator[tuple[str, str]]:
-    """List and name of every picture."""
+    """Yield list and name of every image."""
     ends = np.round(np.cumsum([0.0, *SHARES.values()]) * images).astype(int)
     for split, first, last in zip(SHARES, ends, ends[1:], strict=False):
         for number in range(first, last):
@@ -99,7 +102,7 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
         "database": "synthetic",
         "objects": _objects(shot),
     }
-    from scipy.io import savemat  # a quarter of a second, for those alone who generate
+    from scipy.io import savemat  # takes a quarter of a second, which only the generation needs
 
     content = io.BytesIO()
     with SAVING:
@@ -108,7 +111,7 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
 
 
 def _objects(shot: Shot) -> np.ndarray:
-    """The struct array `record.objects`; `symmetry` and `blur` are not in the official files."""
+    """Return the struct array `record.objects`; `symmetry` and `blur` are not in the official files."""
     entries = [
         {
             "class": thing.category,
@@ -131,7 +134,7 @@ def _objects(shot: Shot) -> np.ndarray:
 
 
 def _viewpoint(thing: Thing) -> dict[str, float]:
-    """The official fields; `focal` × `viewport` is the focal length, (px, py) the principal point, pixels."""
+    """Return the official fields; `focal` × `viewport` is the focal length, (px, py) the principal point, pixels."""
     view = thing.view
     coarse = {
         "azimuth_coarse": float(45 * round(view.azimuth / 45) % 360),
@@ -150,7 +153,7 @@ def _viewpoint(thing: Thing) -> dict[str, float]:
 
 
 def _save_lists(part: Path, category: str, names: Sequence[tuple[str, str]], easy: Sequence[bool]) -> None:
-    """VOC lists flag an image 1, or 0 where its only objects of the class are difficult."""
+    """Write the lists; those of VOC flag an image 1, or 0 where its only objects of the class are difficult."""
     (part / "Image_sets").mkdir()
     (part / VOC_LISTS).mkdir(parents=True)
     for split in SHARES:

@@ -1,4 +1,4 @@
-"""The official folders of PASCAL3D+ release 1.1: its lists of images, and its annotations in MATLAB files.
+"""Official folders of PASCAL3D+ release 1.1: its lists of images, and its annotations in MATLAB files.
 
 Annotations/<class>_{pascal,imagenet}/<name>.mat, Images/<class>_{pascal,imagenet}/<name>.{jpg,JPEG},
 Image_sets/<class>_imagenet_{train,val}.txt, PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_{train,val}.txt.
@@ -29,15 +29,16 @@ SUFFIXES = {"pascal": (".jpg", ".JPEG"), "imagenet": (".JPEG", ".jpg")}
 
 @dataclass(frozen=True)
 class Annotation:
-    """One object of the class that was asked for.
+    """One object of the requested class.
 
     Attributes:
-        file: of the annotation.
+        file: file of the annotation.
         image: where the image should be.
-        box: in pixels from the image's outer corner; may reach beyond the image.
-        angles: azimuth, elevation and tilt in degrees, any number of turns; None where there is only a coarse
-            label, or none at all.
-        symmetry, blur: only in generated data; 1 and None elsewhere.
+        box: box in pixels from the image's outer corner; it may reach beyond the image.
+        angles: azimuth, elevation and tilt in degrees, any number of turns; None where there is only a coarse label, or
+            none at all.
+        symmetry: symmetry of a generated object; 1 elsewhere.
+        blur: blur of a generated image; None elsewhere.
     """
 
     file: Path
@@ -55,7 +56,7 @@ def check_root(root: Path, category: str) -> None:
     """Refuse a folder that does not hold the release.
 
     Raises:
-        DataError: it is missing, or a folder or list is missing from it; says which.
+        DataError: the folder is missing, or a folder or list is missing from it; the message says which.
     """
     if not root.is_dir():
         raise DataError(
@@ -74,9 +75,9 @@ def check_root(root: Path, category: str) -> None:
 
 
 def split_lists(category: str) -> dict[str, list[tuple[str, Path]]]:
-    """Sources and lists for training (VOC train, all of ImageNet) and test (VOC val).
+    """Return sources and lists for training (VOC train, all of ImageNet) and test (VOC val).
 
-    The protocol of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
+    The protocol is that of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
     """
     return {
         "train": [
@@ -89,7 +90,7 @@ def split_lists(category: str) -> dict[str, list[tuple[str, Path]]]:
 
 
 def read_list(file: Path) -> list[str]:
-    """The image names of a list; names whose flag is -1 (the class is not in the image) are left out.
+    """Return the image names of a list; names whose flag is -1 (the class is not in the image) are left out.
 
     Raises:
         DataError: a line is neither a name nor a name and one of the flags -1, 0, 1.
@@ -114,10 +115,10 @@ def read_list(file: Path) -> list[str]:
 
 
 def read_annotations(root: Path, category: str, source: str, name: str) -> list[Annotation]:
-    """The objects of class `category` in one annotation file.
+    """Return the objects of class `category` in one annotation file.
 
     Raises:
-        DataError: the file is missing, is no MATLAB file, or is not built like an annotation.
+        DataError: the file is missing, is not a MATLAB file, or does not have the structure of an annotation.
     """
     file = root / "Annotations" / f"{category}_{source}" / f"{name}.mat"
     with guarded(file, "a PASCAL3D+ annotation", "Restore it from the release."):
@@ -166,7 +167,7 @@ def _load(file: Path) -> Struct:
 
 
 def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
-    """The image that lies in the folder; the likeliest name where there is none."""
+    """Return the image in the folder; the most likely name where there is none."""
     candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES[source]]
     if recorded:
         candidates.append(folder / Path(recorded).name)
@@ -174,32 +175,32 @@ def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
 
 
 def _structs(value: Any) -> Iterator[Struct]:
-    """The structs of a struct array or cell array of any length; one struct alone comes without the array."""
+    """Yield the structs of a struct array or cell array of any length; a single struct comes without the array."""
     for item in np.atleast_1d(np.asarray(value, dtype=object)).ravel():
         if isinstance(item, dict):
             yield item
 
 
 def _text(entry: Struct, name: str) -> str:
-    """A field's text; nothing where it is missing, empty or no text."""
+    """Return a field's text; an empty string where it is missing, empty or not text."""
     value = entry.get(name)
     return value.strip() if isinstance(value, str) else ""
 
 
 def _numbers(entry: Struct, name: str) -> list[float]:
-    """A field's numbers, at most five; none where it is missing, empty or holds something else."""
+    """Return a field's numbers, at most five; an empty list where it is missing, empty or holds something else."""
     value = np.asarray(entry.get(name))
     real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
     return value.ravel()[:5].astype(np.float64).tolist() if real else []
 
 
 def _number(entry: Struct, name: str) -> float | None:
-    """A field's first number; None where there is none."""
+    """Return a field's first number; None where there is none."""
     return next(iter(_numbers(entry, name)), None)
 
 
 def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
-    """The fine labels in degrees, which may be NaN in a damaged file; None where there are only coarse ones.
+    """Return the fine labels in degrees, which may be NaN in a damaged file; None where there are only coarse ones.
 
     An object is finely annotated where the fields are filled and its distance is not 0.
     """
@@ -212,5 +213,5 @@ def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
 
 
 def radians(degrees: float) -> float:
-    """The same angle in [-π, π)."""
+    """Return an angle given in degrees as radians in [-π, π)."""
     return math.radians((degrees + 180) % 360 - 180)

@@ -15,7 +15,7 @@ TAIL_LAMP: Color = (0.85, 0.08, 0.08)
 
 
 def paint(random: Generator, *, vivid: bool = False) -> Color:
-    """A random lacquer: any hue; now and then white, silver or near black unless `vivid`."""
+    """Return a random lacquer of any hue; sometimes white, silver or nearly black unless `vivid`."""
     hue, saturation, value = random.random(), random.uniform(0.5, 0.9), random.uniform(0.45, 0.95)
     grey, level = random.random() < 0.4, random.random()
     if grey and not vivid:
@@ -24,13 +24,13 @@ def paint(random: Generator, *, vivid: bool = False) -> Color:
 
 
 def wood(random: Generator) -> Color:
-    """A random kind of wood, from beech to wenge."""
+    """Return the colour of a random kind of wood, from beech to wenge."""
     return colorsys.hsv_to_rgb(
         random.uniform(0.05, 0.1), random.uniform(0.35, 0.65), random.uniform(0.3, 0.85)
     )
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Brighter or darker, within [0, 1]."""
+    """Return a brighter or darker colour, within [0, 1]."""
     red, green, blue = (min(1.0, max(0.0, factor * part)) for part in color)
     return red, green, blue

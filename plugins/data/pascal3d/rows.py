@@ -1,4 +1,4 @@
-"""Rows of the contract: a few generated cars, and bottles beside them."""
+"""Rows of the contract: a few generated cars, alone and with bottles."""
 
 from dataclasses import replace
 

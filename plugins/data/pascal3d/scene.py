@@ -1,4 +1,4 @@
-"""One labelled picture: objects from random viewpoints over a backdrop, and what a camera does to them."""
+"""One labelled image: objects from random viewpoints over a backdrop, and the effects of a camera."""
 
 import dataclasses
 import math
@@ -22,11 +22,13 @@ from plugins.data.pascal3d.viewpoints import viewpoint
 SUPERSAMPLING = 2
 Edges = tuple[float, float, float, float]
 Draw = Callable[[Scene, Collection[str]], Mapping[str, Tensor]]
-"""A framework.renderer.Renderer."""
+"""Type of a framework.renderer.Renderer."""
 
 
 class View(NamedTuple):
-    """Degrees; `distance` in object diagonals; `focal` and `principal` in pixels, as in framework.geometry.camera."""
+    """Viewpoint in degrees; `distance` in object diagonals; `focal` and `principal` in pixels
+    (framework.geometry.camera).
+    """
 
     azimuth: float
     elevation: float
@@ -37,10 +39,10 @@ class View(NamedTuple):
 
 
 class Thing(NamedTuple):
-    """An object in a picture, as it is annotated.
+    """Annotation of an object in an image.
 
-    `box` holds its first column and row and its last ones, counted from 0; `fine` is False where only a
-    coarse label is given.
+    `box` holds its first column and row and its last ones, counted from 0; `fine` is False where only a coarse label is
+    given.
     """
 
     category: str
@@ -54,21 +56,21 @@ class Thing(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """A drawn object: colour times cover, (height, width, 3), and cover, (height, width), both 0…1."""
+    """Rendered object: colour times cover, (height, width, 3), and cover, (height, width), both 0…1."""
 
     color: Picture
     cover: NDArray[np.float32]
 
 
 def camera_of(view: View) -> Camera:
-    """The camera of a view; its picture is one pixel, until `window` says which part is wanted."""
+    """Return the camera of a view; its image is one pixel, until `window` chooses a part."""
     angles = (math.radians(angle) for angle in (view.azimuth, view.elevation, view.tilt))
     camera = look_from(*angles, distance=view.distance, field_of_view=1.0, size=(1, 1))
     return dataclasses.replace(camera, focal=(view.focal, view.focal), principal=view.principal)
 
 
 def window(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale: int) -> Camera:
-    """The camera for `size` (height, width) pixels from `corner` (x, y) on, each divided `scale` times."""
+    """Return the camera for `size` (height, width) pixels from `corner` (x, y) on, each divided `scale` times."""
     middle = (scale - 1) / 2  # where a pixel's centre lies among its parts
     (fx, fy), (cx, cy) = camera.focal, camera.principal
     return dataclasses.replace(
@@ -81,7 +83,7 @@ def window(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale
 
 
 def outline(mesh: Mesh, camera: Camera) -> Edges:
-    """Left, top, right and bottom of the projected vertices, pixels."""
+    """Return left, top, right and bottom of the projected vertices, pixels."""
     inside = camera.rotation.double().numpy() @ mesh.vertices.T + camera.translation.double().numpy()[:, None]
     column = camera.focal[0] * inside[0] / inside[2] + camera.principal[0]
     row = camera.focal[1] * inside[1] / inside[2] + camera.principal[1]
@@ -89,7 +91,7 @@ def outline(mesh: Mesh, camera: Camera) -> Edges:
 
 
 def lit(mesh: Mesh, random: Generator) -> NDArray[np.float64]:
-    """Vertex colours under sky light and one lamp, whose azimuth is independent of the camera's."""
+    """Return vertex colours under sky light and one lamp, whose azimuth is independent of the camera's."""
     azimuth, height = random.uniform(0, 2 * np.pi), random.uniform(0.2, 1.4)
     lamp = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     ambient = random.uniform(0.4, 0.7)
@@ -106,7 +108,7 @@ def draw(
     edges: Edges,
     size: tuple[int, int],
 ) -> Layer:
-    """The object alone, (height, width) = `size`; only what lies within `edges` (`outline`) is rendered."""
+    """Return the object alone, (height, width) = `size`; only the part within `edges` (`outline`) is rendered."""
     height, width = size
     left, top, right, bottom = edges
     x0, x1 = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
@@ -127,14 +129,14 @@ def draw(
 
 
 def _averaged(fine: Picture) -> Picture:
-    """The mean of every block of SUPERSAMPLING × SUPERSAMPLING pixels."""
+    """Return the mean of every block of SUPERSAMPLING × SUPERSAMPLING pixels."""
     step = range(SUPERSAMPLING)
     total = sum(fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in step for column in step)
     return np.asarray(total / np.float32(SUPERSAMPLING**2))
 
 
 class Shot(NamedTuple):
-    """A finished picture. `blur` is the standard deviation of the Gaussian it was blurred with, pixels."""
+    """Finished image; `blur` is the standard deviation of the Gaussian that blurred it, pixels."""
 
     pixels: NDArray[np.uint8]
     things: list[Thing]
@@ -142,7 +144,7 @@ class Shot(NamedTuple):
 
 
 def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
-    """A picture of an object of `category`; sometimes with a second object, or something in the way."""
+    """Return an image of an object of `category`; sometimes with a second object, or something in front of it."""
     size = height, width = int(random.integers(96, 129)), int(random.integers(112, 145))
     main = _place(category, random, renderer, size, aside=random.random() < 0.1)
     pieces = [main]
@@ -179,7 +181,7 @@ class _Piece(NamedTuple):
 
 
 def _place(category: str, random: Generator, renderer: Draw, size: tuple[int, int], *, aside: bool) -> _Piece:
-    """A new object of `category`, drawn; `aside` lets it reach out of the picture."""
+    """Return a new rendered object of `category`; `aside` lets it extend beyond the image."""
     mesh = FAMILIES[category].build(random).mesh()
     view = View(*viewpoint(category, random), float(random.uniform(2.2, 6.0)), 1.0, (0.0, 0.0))
     camera = camera_of(view)
@@ -189,7 +191,7 @@ def _place(category: str, random: Generator, renderer: Draw, size: tuple[int, in
     room = np.array([size[1], size[0]], dtype=np.float64)
     focal = float(min(longest / extent.max(), ((room - 6) / extent).min()))
     span = focal * extent
-    low, high = span / 2 + 2, room - 3 - span / 2  # of the middle, so that the whole object is seen
+    low, high = span / 2 + 2, room - 3 - span / 2  # limits of the middle that keep the whole object visible
     if aside:
         low, high = low - 0.4 * span, high + 0.4 * span
     middle = random.uniform(low, high)
@@ -204,7 +206,7 @@ def _place(category: str, random: Generator, renderer: Draw, size: tuple[int, in
 
 
 def box_of(layer: Layer) -> tuple[int, int, int, int]:
-    """First column and row and last column and row of what the object clearly covers."""
+    """Return first column and row and last column and row of what the object clearly covers."""
     covered = layer.cover >= 0.5 * layer.cover.max()
     columns, rows = np.flatnonzero(covered.any(0)), np.flatnonzero(covered.any(1))
     return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
@@ -227,7 +229,7 @@ def _annotated(piece: _Piece, hidden: NDArray[np.float32], random: Generator) ->
 
 
 def _exposed(pixels: Picture, blur: float, random: Generator) -> NDArray[np.uint8]:
-    """Brightness, blur and the sensor's noise."""
+    """Return the image with random brightness, blur and sensor noise."""
     gain, offset = random.uniform(0.8, 1.2), random.uniform(-0.05, 0.05)
     image = Image.fromarray((255 * np.clip(gain * pixels + offset, 0, 1)).astype(np.uint8))
     if blur:

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Number = float | int
 Points = Sequence[Any] | NDArray[Any]
-"""A point (3,), or a list of them (points, 3), or of those."""
+"""Point (3,), or a list of points (points, 3), or a list of such lists."""
 Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A closed surface; vertices that two facets share are shaded smoothly across them.
+    """Closed surface; vertices that two facets share are shaded smoothly across them.
 
     Attributes:
         vertices: (vertices, 3).
-        faces: (faces, 3), all seen one way round from outside; which way, `Body.mesh` finds out.
+        faces: (faces, 3), all with the same orientation seen from outside; `Body.mesh` finds out which one.
     """
 
     vertices: Array
@@ -34,7 +34,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A coloured object, centred, the diagonal of its bounding box 1.
+    """Coloured object, centred, the diagonal of its bounding box 1.
 
     Attributes:
         vertices: (vertices, 3).
@@ -50,13 +50,14 @@ class Mesh:
 
 
 class Body:
-    """Collects coloured solids into one mesh."""
+    """Collection of coloured solids that become one mesh."""
 
     def __init__(self) -> None:
         self._solids: list[Solid] = []
         self._colors: list[Color] = []
 
     def add(self, solid: Solid, color: Color) -> None:
+        """Add a solid of one colour."""
         self._solids.append(solid)
         self._colors.append(color)
 
@@ -66,7 +67,7 @@ class Body:
         self.add(transformed(solid, scale=(-1.0, 1.0, 1.0)), color)
 
     def turned(self, *angles: Number) -> "Body":
-        """One copy of this body for each angle (radians), turned by it about the vertical."""
+        """Return a body with one copy of this one for each angle (radians), rotated by it about the vertical."""
         whole = Body()
         for angle in angles:
             cos, sin = np.cos(angle), np.sin(angle)
@@ -76,6 +77,7 @@ class Body:
         return whole
 
     def mesh(self) -> Mesh:
+        """Return all solids as one mesh, centred, scaled, with faces counter-clockwise seen from outside."""
         counts = [len(solid.vertices) for solid in self._solids]
         starts = np.cumsum([0, *counts[:-1]])
         vertices = np.concatenate([solid.vertices for solid in self._solids])
@@ -103,17 +105,17 @@ class Body:
 
 
 def transformed(solid: Solid, *, scale: Points = (1.0, 1.0, 1.0), shift: Points = (0.0, 0.0, 0.0)) -> Solid:
-    """Scaled per axis, then shifted."""
+    """Return the solid scaled per axis, then shifted."""
     return Solid(solid.vertices * np.asarray(scale) + np.asarray(shift), solid.faces)
 
 
 def off(point: Points, x: Number, y: Number, z: Number) -> Array:
-    """The point that far from another."""
+    """Return the point at the offset (x, y, z) from another point."""
     return np.asarray(point) + np.array([x, y, z])
 
 
 def box(size: Points, center: Points) -> Solid:
-    """An upright box: (width in x, length in y, height in z)."""
+    """Return an upright box of size (width in x, length in y, height in z)."""
     return transformed(_unit_box(), scale=size, shift=center)
 
 
@@ -124,7 +126,7 @@ def _unit_box() -> Solid:
 
 
 def loft(rings: Points, *, smooth: bool = False) -> Solid:
-    """The hull of a stack of rings (rings, points, 3), closed by a flat cap at either end.
+    """Return the hull of a stack of rings (rings, points, 3), closed by a flat cap at either end.
 
     A ring may shrink to a point. `smooth` shades across the ring's points, but not over the rim of a cap.
     """
@@ -152,7 +154,7 @@ def _loft_faces(layers: int, points: int, smooth: bool) -> NDArray[np.int64]:
 
 
 def _quads(layers: int, points: int, *, closed: bool) -> NDArray[np.int64]:
-    """Corner indices of the quadrangles between rings; `closed` joins the last ring to the first."""
+    """Return corner indices of the quadrangles between rings; `closed` joins the last ring to the first."""
     layer, point = np.meshgrid(np.arange(layers if closed else layers - 1), np.arange(points), indexing="ij")
     above, after = (layer + 1) % layers, (point + 1) % points
     corners = [layer * points + point, layer * points + after, above * points + after, above * points + point]
@@ -166,7 +168,7 @@ def _circle(sides: int) -> Array:
 
 
 def lathe(profile: Sequence[tuple[Number, Number]], sides: int = 24) -> Solid:
-    """A body of revolution about z: (radius, height) pairs from the bottom up."""
+    """Return a body of revolution about z, from (radius, height) pairs from the bottom up."""
     rings = np.empty((len(profile), sides, 3))
     for layer, (radius, height) in enumerate(profile):
         rings[layer, :, :2] = radius * _circle(sides)
@@ -177,7 +179,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], sides: int = 24) -> Solid:
 def rod(
     start: Points, end: Points, radius: Number, end_radius: Number | None = None, sides: int = 6
 ) -> Solid:
-    """A straight round bar, or a cone."""
+    """Return a straight round bar, or a cone."""
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     x, y, z = (last - first).tolist()
     length, flat = math.hypot(x, y, z), math.hypot(y, z)
@@ -194,14 +196,14 @@ def rod(
 
 
 def wheel(center: Points, radius: Number, width: Number, sides: int = 16) -> Solid:
-    """A disc that turns about x."""
+    """Return a disc whose axis is parallel to x."""
     middle = np.asarray(center, dtype=np.float64)
     half = np.array([width / 2, 0, 0])
     return rod(middle - half, middle + half, radius, sides=sides)
 
 
 def ring(center: Points, radius: Number, thickness: Number, sides: int = 20, around: int = 5) -> Solid:
-    """A torus that turns about x: `radius` to the middle of a tyre of `thickness` (its diameter)."""
+    """Return a torus whose axis is parallel to x: `radius` reaches to the middle of a tyre of diameter `thickness`."""
     out, along = _circle(sides), _circle(around)
     reach = radius + thickness / 2 * along[:, 0]
     vertices = np.empty((sides, around, 3))
@@ -218,24 +220,25 @@ def _ring_faces(sides: int, around: int) -> NDArray[np.int64]:
 
 
 def ellipsoid(center: Points, radii: Points, sides: int = 14, layers: int = 9) -> Solid:
+    """Return an ellipsoid with half axes `radii`."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, layers)
     unit = lathe([(float(np.cos(a)), float(np.sin(a))) for a in angle], sides)
     return transformed(unit, scale=radii, shift=center)
 
 
 def plate(outline: Points, offset: Points) -> Solid:
-    """A convex plane outline (points, 3), thickened by the vector `offset` to both sides."""
+    """Return a convex plane outline (points, 3), thickened by the vector `offset`, half to either side."""
     points, half = np.asarray(outline, dtype=np.float64), np.asarray(offset, dtype=np.float64) / 2
     return loft([points - half, points + half])
 
 
 def side_plate(outline: Sequence[tuple[Number, Number]], x: Number, thickness: Number) -> Solid:
-    """A convex outline of (y, z) pairs, thick in x, its middle at `x`."""
+    """Return a convex outline of (y, z) pairs, thickened in x, its middle at `x`."""
     return plate([(x, y, z) for y, z in outline], (thickness, 0, 0))
 
 
 def tapered(levels: Sequence[tuple[Number, Number, Number, Number]], middle: Number = 0.0) -> Solid:
-    """A stack of level rectangles (half width, y in front, y behind, height) about x = `middle`."""
+    """Return a stack of level rectangles (half width, y in front, y behind, height) about x = `middle`."""
     rings = [
         [(middle + half, near, z), (middle + half, far, z), (middle - half, far, z), (middle - half, near, z)]
         for half, near, far, z in levels
@@ -244,7 +247,7 @@ def tapered(levels: Sequence[tuple[Number, Number, Number, Number]], middle: Num
 
 
 def rounded(width: Number, low: Number, high: Number, y: Number, bevel: Number = 0.25) -> Array:
-    """A ring of eight points across y: a rectangle, its corners cut by `bevel` of the shorter half side."""
+    """Return a ring of eight points across y: a rectangle, its corners cut by `bevel` of the shorter half side."""
     half, middle, tall = width / 2, (low + high) / 2, (high - low) / 2
     cut = bevel * min(half, tall)
     plan = [

@@ -1,4 +1,4 @@
-"""Parametric vehicles of road and rail: bus, car and train; every number in metres."""
+"""Parametric vehicles of road and rail: bus, car and train; every number is in metres."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,7 +8,7 @@ from plugins.data.pascal3d.shapes import Body, box, loft, off, plate, rod, round
 
 
 def bus(random: Generator) -> Body:
-    """A city bus, coach or double-decker: a long box with bands of windows, a wide windscreen and lamps."""
+    """Return a city bus, coach or double-decker: a long box with bands of windows, a wide windscreen and lamps."""
     body = Body()
     skin, length = paint(random, vivid=True), random.uniform(8, 11)
     width, height, ground = 2.5, random.uniform(2.6, 3.1), 0.4
@@ -46,11 +46,11 @@ def bus(random: Generator) -> Body:
 
 
 CAR_REAR = {"saloon": (0.2, 0.5), "hatchback": (0.03, 0.42), "estate": (0.01, 0.15), "pickup": (0.43, 0.1)}
-"""Where the cabin's rear window starts, in car lengths from the back, and by how far it leans, metres."""
+"""Start of the cabin's rear window, in car lengths from the back, and how far it leans, metres, by kind of car."""
 
 
 def car(random: Generator) -> Body:
-    """A saloon, hatchback, estate or pickup."""
+    """Return a saloon, hatchback, estate or pickup."""
     body = Body()
     skin = paint(random)
     length, width = random.uniform(3.9, 4.8), random.uniform(1.7, 1.85)
@@ -75,12 +75,12 @@ def car(random: Generator) -> Body:
     end = rear - room * length
 
     def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
-        """The cabin's outline at a share of its height."""
+        """Return the cabin's outline at a share of its height."""
         half, z = (0.47 - 0.09 * share) * width + grow, belt - 0.03 + share * (roof - belt + 0.03)
         return half, start + share * rake - grow, end - share * slope + grow, z
 
     def pillar(low: float, high: float, along: float, grow: float) -> tuple[np.ndarray, np.ndarray]:
-        """Foot and tip of a post at a share of the cabin's length."""
+        """Return foot and tip of a post at a share of the cabin's length."""
         (x, near, far, z), (top_x, top_near, top_far, top_z) = level(low, grow), level(high, grow)
         foot, tip = near + along * (far - near), top_near + along * (top_far - top_near)
         return np.array([x, foot, z]), np.array([top_x, tip, top_z])
@@ -117,7 +117,7 @@ def car(random: Generator) -> Body:
 
 
 def train(random: Generator) -> Body:
-    """A locomotive, streamlined or flat-nosed, with a carriage behind it, on a piece of track."""
+    """Return a locomotive, streamlined or flat-nosed, with a carriage behind it, on a piece of track."""
     body = Body()
     skin, second = paint(random, vivid=True), paint(random)
     width, height, ground = 2.8, 3.4, 0.9
@@ -125,7 +125,7 @@ def train(random: Generator) -> Body:
     front = -0.55 * length
     streamlined = random.random() < 0.6
     nose = random.uniform(1.2, 3.5) if streamlined else 0.25
-    along = np.array([0.0, 0.3, 0.65, 1.0])  # of the nose
+    along = np.array([0.0, 0.3, 0.65, 1.0])  # shares of the nose's length
     share = np.array([0.5, 0.78, 0.93, 1.0]) if streamlined else np.array([0.93, 0.97, 0.99, 1.0])
     rings = [
         rounded(width * size, ground, ground + height * size, front + nose * place, 0.3)

@@ -1,4 +1,4 @@
-"""Which viewpoints occur: elevations and tilts distributed as in the PASCAL3D+ annotations."""
+"""Random viewpoints: elevations and tilts are distributed as in the PASCAL3D+ annotations."""
 
 import numpy as np
 from numpy.random import Generator
@@ -54,12 +54,15 @@ QUANTILES: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
         (-88, -21, -13, -5, -2, 0, 2, 4, 8, 11, 15),
     ),
 }
-"""Elevation and tilt of each class, degrees, at `LEVELS`: measured on the 2,108 objects of PASCAL3D+ (Xiang
-et al., WACV 2014) that are in the VOC 2012 validation set and neither truncated, occluded nor difficult."""
+"""Elevation and tilt of each class, degrees, at `LEVELS`.
+
+They were measured on the 2,108 objects of PASCAL3D+ (Xiang et al., WACV 2014) that are in the VOC 2012 validation set
+and neither truncated, occluded nor difficult.
+"""
 
 
 def viewpoint(category: str, random: Generator) -> tuple[float, float, float]:
-    """Azimuth (uniform), elevation and tilt (between the measured quantiles), degrees."""
+    """Return azimuth (uniform), elevation and tilt (between the measured quantiles), degrees."""
     elevation, tilt = (
         float(np.interp(random.uniform(LEVELS[0], LEVELS[-1]), LEVELS, levels))
         for levels in QUANTILES[category]
