@@ -1,1 +1,1 @@
-"""Flights of a table-tennis ball: recorded and simulated."""
+"""Data set of flights of a table-tennis ball, recorded and simulated."""

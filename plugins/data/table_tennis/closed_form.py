@@ -1,7 +1,7 @@
-"""Landing on a spring and damper in closed form, with 50 digits: what the solvers are measured against.
+"""Landing on a spring and damper in closed form, with 50 digits: the reference for the accuracy of the solvers.
 
-Without air and friction the height is a parabola in the air, and a damped oscillation about its rest while the table
-pushes. Each phase ends at a root of its own formula, so nothing is integrated.
+Without air and friction the height is a parabola in the air, and a damped oscillation about its rest height while the
+table pushes. Each phase ends at a root of its own formula, so nothing is integrated.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,22 @@ from plugins.data.table_tennis.contact import Spring
 
 DIGITS = 50
 Motion = Callable[[Any], tuple[Any, Any]]
-"""Seconds since the phase began → height above the touching ball's and velocity upwards."""
+"""Function from seconds since the phase began to height above the touching ball's, and velocity upwards."""
 
 
 def landing(
     height: float, climb: float, times: list[float], constants: Constants, spring: Spring
 ) -> list[float]:
-    """Heights above the touching ball's, m, at rising times, s, of a ball let go above the table at time 0."""
+    """Return heights above the touching ball's, m, at rising times, s, of a ball that is released above the table at 0
+    s.
+
+    Args:
+        height: height above the touching ball's at time 0, m.
+        climb: velocity upwards at time 0, m/s.
+        times: rising times, s.
+        constants: constants of the ball and the table.
+        spring: frequency and damping of the table.
+    """
     with mpmath.workdps(DIGITS):
         fall, rate, damping = map(mpmath.mpf, (constants.gravity, spring.frequency, spring.damping))
         found: list[float] = []
@@ -56,7 +65,7 @@ def _thrown(place: Any, speed: Any, fall: Any) -> Motion:
 
 
 def _pressed(place: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Motion:
-    """z'' = -Ω² z - 2 ζ Ω z' - g, about its rest at -g/Ω²."""
+    """Return the motion under z'' = -Ω² z - 2 ζ Ω z' - g, about its rest height at -g/Ω²."""
     rest = -fall / rate**2
     first = place - rest
 
@@ -80,7 +89,7 @@ def _push(place: Any, speed: Any, rate: Any, damping: Any) -> Any:
 
 
 def _until(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | None:
-    """The first time at which a value that starts above 0 falls to it; None where it stays above for 60 scales."""
+    """Return the first time at which a value that starts above 0 falls to 0; None if not by `longest` or 60 scales."""
     step = scale / 64
     before, number = step / 2**20, 0
     while number < 60 * 64:
@@ -95,7 +104,7 @@ def _until(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | None:
 
 
 def _out(place: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Any:
-    """When a ball inside that is not pushed comes out, or is pushed again, whichever is first."""
+    """Return when a ball that is inside the table and not pushed leaves it or is pushed again, whichever is first."""
     under = speed**2 + 2 * fall * place
     leaves = (speed - mpmath.sqrt(under)) / fall if under >= 0 else None
     # Ω² z + 2 ζ Ω z' = 0 along the parabola: a quadratic in t

@@ -8,16 +8,16 @@ from framework.flights.physics import Constants, NotNegative, Positive, Vector, 
 
 @dataclass(frozen=True, kw_only=True)
 class Spring:
-    """The table as a spring and a damper: contact in a short time, not in none.
+    """Spring and damper that model the table, so that a contact takes a short time instead of none.
 
     The ball is pushed up while it is inside the table and the push is upwards: N = max(0, Ω² p + 2 ζ Ω p'), where p is
-    how far inside it is. While it touches, the height has the eigenvalues Ω (-ζ ± √(ζ² - 1)): with Ω of 1e8/s
+    its depth inside the table. While it touches, the height has the eigenvalues Ω (-ζ ± √(ζ² - 1)): with an Ω of 1e8/s
     the contact is 1e8 times as fast as a flight of a second.
 
     Attributes:
         frequency: Ω, 1/s.
         damping: ζ; at 1 the contact is critically damped.
-        grip: slip below which friction is less than Coulomb's, m/s, so that its sign needs no jump.
+        grip: slip below which friction is less than Coulomb's, m/s, so that friction changes its sign without a jump.
     """
 
     frequency: Positive = 3000.0
@@ -27,11 +27,12 @@ class Spring:
 
 @no_type_check
 def push(height: Any, climb: Any, spring: Spring) -> Any:
-    """Push upwards per mass of a ball that is inside the table, m/s², before it is cut at 0.
+    """Return the push upwards per mass on a ball that is inside the table, m/s², before it is clipped at 0.
 
     Args:
-        height: of its centre above where it touches, m; negative inside.
+        height: height of its centre above the touching ball's, m; negative inside.
         climb: its velocity upwards, m/s.
+        spring: frequency and damping of the table.
     """
     return -(spring.frequency**2) * height - 2 * spring.damping * spring.frequency * climb
 
@@ -40,7 +41,7 @@ def push(height: Any, climb: Any, spring: Spring) -> Any:
 def pressed(
     velocity: Vector, spin: Vector, up: Any, constants: Constants, spring: Spring
 ) -> tuple[Vector, Vector]:
-    """Change of velocity and of spin, per second, by a push upwards and the friction that comes with it."""
+    """Return the change of velocity and of spin, per second, by a push upwards and the friction that comes with it."""
     along, across = slip(velocity, spin, constants.radius)
     share = constants.friction * up / (along * along + across * across + spring.grip**2) ** 0.5
     push_x, push_y = -share * along, -share * across

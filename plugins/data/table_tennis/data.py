@@ -1,4 +1,4 @@
-"""Flights of a table-tennis ball; the contract is framework.data's."""
+"""Data set of flights of a table-tennis ball; framework.data describes the contract."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -40,26 +40,27 @@ Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 
 class TableTennis(Data):
-    """Where a ball will be, from where it was seen (thesis §4.2): simulated where no root is given.
+    """Future positions of a ball, predicted from the positions seen so far (thesis §4.2); simulated without a root.
 
-    An input is `observed` frames of `PARTS`, flattened; the target the positions at the next `future` multiples of the
-    step, metres, as they were recorded. Batches hold "truth" too, shaped like the target: of simulated flights the
-    positions without noise, of recorded ones the target itself; and "flight", the flight's number.
+    An input is `observed` frames of `PARTS`, flattened. The target is the positions at the next `future` multiples of
+    the step, metres, as they were recorded. Batches also hold "truth", shaped like the target: for simulated flights
+    the positions without noise, for recorded ones the target itself; and "flight", the flight's number.
 
-    A flight's windows are all in one split; a flight that is recorded twice counts once.
+    All windows of a flight are in one split; a flight that is recorded twice counts once.
 
     Args:
         root: a folder of flights, or one file: *.csv with the columns t (s), x, y, z (m), or *.mat of the WAM
-            laboratory. None: simulated flights.
-        grid: what is read and predicted.
-        validation, test: shares of the flights, drawn at random.
-        data_seed: of that draw, whatever the seed of the run.
-        forget: share of the seen frames that are hidden from each training window anew.
-        unreadable: what becomes of files that cannot be read.
+            laboratory. None for simulated flights.
+        grid: the frames that are read and predicted.
+        validation: share of the flights for validation, drawn at random.
+        test: share of the flights for the test, drawn at random.
+        data_seed: seed of that draw; it does not depend on the seed of the run.
+        forget: share of the seen frames that are hidden at random from each training window.
+        unreadable: treatment of files that cannot be read: refuse or skip.
         times_in: the unit of the files' times.
         writing: how CSV files are written.
-        simulation: what is simulated.
-        constants: of the ball and the table that are simulated.
+        simulation: settings of the simulated flights.
+        constants: constants of the simulated ball and table.
     """
 
     bibtex = """@article{gomez2020real,
@@ -155,7 +156,9 @@ class TableTennis(Data):
         for file in listed(root):
             try:
                 flights += self._flights_of(file)
-                others = other_columns(file, self.writing) if others is None else others  # of the first alone
+                others = (
+                    other_columns(file, self.writing) if others is None else others
+                )  # of the first file alone
             except DataError:
                 if self.unreadable == "error":
                     raise
@@ -170,7 +173,7 @@ class TableTennis(Data):
         return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Of each flight what is read at its last frame: the next frames are predicted."""
+        """Return the input at the last frame of each flight; the next frames are predicted from it."""
         if not files:
             raise DataError(
                 "No file was given; wanted a flight as CSV with the columns t, x, y, z, or as *.mat."
@@ -190,7 +193,7 @@ class TableTennis(Data):
         return torch.from_numpy(found).float()
 
     def inputs(self, given: Any) -> Tensor:
-        """Of files, of one flight as an array (frame, 4) of t, x, y, z, or of inputs as they are."""
+        """Return inputs from files, from one flight as an array (frame, 4) of t, x, y, z, or from ready inputs."""
         if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == 4:
             try:
                 table = real(given, "the given flight")
@@ -200,7 +203,7 @@ class TableTennis(Data):
         return Data.inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
-        """Hide frames; the last one stays."""
+        """Return the batch with frames hidden at random; the last frame stays visible."""
         if not self.forget:
             return batch
         inputs = batch["input"].unflatten(-1, (self.grid.observed, len(PARTS)))

@@ -1,17 +1,17 @@
-"""The frames that a model reads, seen from the side."""
+"""Image of the frames that a model reads, seen from the side."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 HEIGHT, WIDTH = 96, 256
-"""Pixels."""
+"""Height and width of the image, pixels."""
 DOT = 2
-"""Half the side of a frame's square, pixels."""
+"""Half the side of the square that shows a frame, pixels."""
 MARGIN = 8
 
 
 def side_view(frames: Float[np.ndarray, "frame 5"]) -> UInt8[np.ndarray, "height width 3"]:
-    """y to the right, z up, to one scale; early frames are pale, the last one is red."""
+    """Return an image with y to the right and z up, to one scale; early frames are pale, and the last one is red."""
     canvas = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     seen = frames[frames[:, 4] > 0.5]
     if not len(seen):

@@ -1,4 +1,4 @@
-"""Recorded flights, from CSV files and from MATLAB files of the WAM laboratory; checked, each flight once."""
+"""Reading and checking of recorded flights, from CSV files and from MATLAB files of the WAM laboratory."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,25 +16,25 @@ COLUMNS = ("t", "x", "y", "z")
 TRUE = ("true_x", "true_y", "true_z")
 SUFFIXES = (".csv", ".mat")
 ALIKE = 1e-4
-"""Metres by which frames of one flight in two recordings may differ."""
+"""Greatest difference, metres, of frames of one flight in two recordings."""
 COMPARED = 8
-"""Frames from the beginning by which a flight is known again."""
+"""Number of first frames by which two recordings of one flight are recognised."""
 SLOWEST = 1.0
-"""Seconds from frame to frame that data.step may be."""
+"""Largest step between frames, seconds, that data.step allows."""
 TimesIn = Literal["seconds", "milliseconds", "microseconds"]
 SECONDS: dict[TimesIn, float] = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6}
 FARTHEST = 100.0
-"""Metres from the origin within which a ball is believed to be."""
+"""Greatest plausible distance of a ball from the origin, metres."""
 
 
 class Flight(NamedTuple):
-    """One flight.
+    """Times and positions of one flight.
 
     Attributes:
         name: the file, and the flight's number in it where it holds several.
         times: (frame,), s, rising.
         places: (frame, 3), m.
-        truth: the same without noise, where the flight was simulated; else None.
+        truth: positions without noise, (frame, 3), m, where the flight was simulated; otherwise None.
     """
 
     name: str
@@ -44,10 +44,10 @@ class Flight(NamedTuple):
 
 
 def listed(root: Path) -> list[Path]:
-    """The files of flights of a folder, by name; or the one file itself.
+    """Return the files of flights in a folder, sorted by name; or the file itself.
 
     Raises:
-        DataError: there is none.
+        DataError: there is no such file or folder, or the folder has no flight.
     """
     if root.is_file():
         return [root]
@@ -65,15 +65,16 @@ def listed(root: Path) -> list[Path]:
 def flights_of(
     file: Path, step: float, times_in: TimesIn = "seconds", writing: Writing | None = None
 ) -> list[Flight]:
-    """The flights of one file: of a CSV file one, of a MATLAB file all.
+    """Read the flights of one file: one from a CSV file, all from a MATLAB file.
 
     Args:
-        step: seconds between two frames, as the config says.
+        file: the file.
+        step: seconds between two frames, as the configuration says.
         times_in: the unit of the file's times.
         writing: how a CSV file is written.
 
     Raises:
-        DataError: the file is damaged, or a flight's times or places are wrong; says which and where.
+        DataError: the file is damaged, or a flight's times or places are wrong; the message says which and where.
     """
     if file.suffix.lower() == ".mat":
         return [_checked(_in_seconds(flight, times_in), step, times_in) for flight in _from_matlab(file)]
@@ -92,7 +93,7 @@ def _in_seconds(flight: Flight, times_in: TimesIn) -> Flight:
 
 
 def other_columns(file: Path, writing: Writing | None) -> list[str]:
-    """What a CSV file holds beside a flight."""
+    """Return the names of the columns of a CSV file that do not belong to a flight."""
     if file.suffix.lower() == ".mat":
         return []
     columns = read_columns(file, writing)
@@ -100,7 +101,7 @@ def other_columns(file: Path, writing: Writing | None) -> list[str]:
 
 
 def _from_matlab(file: Path) -> list[Flight]:
-    """`ballTrain.data` of cells (frame, 4), or `time` and `ball` of cells (frame,) and (frame, 3)."""
+    """Read `ballTrain.data` of cells (frame, 4), or `time` and `ball` of cells (frame,) and (frame, 3)."""
     found = read_variables(file)
     held: Any = found.get("ballTrain")
     if isinstance(held, Mapping) and "data" in held:
@@ -131,11 +132,11 @@ def _joined(time: Any, ball: Any) -> np.ndarray:
 def _checked(
     flight: Flight, step: float, times_in: TimesIn = "seconds", lines: Sequence[int] | None = None
 ) -> Flight:
-    """The flight itself.
+    """Return the flight unchanged, after checking it.
 
     Raises:
-        DataError: fewer than two frames; a number that is not finite, or far from any table; times that do not rise;
-            frames at another rate than `step`.
+        DataError: the flight has fewer than two frames; a number is not finite, or far from any table; times do not
+            rise; or the frames have another rate than `step`.
     """
     name, times, places, _ = flight
 
@@ -169,7 +170,7 @@ def _checked(
 
 
 def _other_rate(usual: float, step: float, times_in: TimesIn) -> str:
-    """What to do about frames every `usual` seconds."""
+    """Return the advice for frames that are `usual` seconds apart."""
     for unit, seconds in SECONDS.items():
         if unit != times_in and 0.6 < usual / SECONDS[times_in] * seconds / step < 1.6:
             return f"Set data.times_in={unit}."
@@ -184,9 +185,9 @@ def _millimetres(places: Float[np.ndarray, "frame 3"]) -> str:
 
 
 def distinct(flights: Sequence[Flight]) -> tuple[list[Flight], int]:
-    """The flights without repetitions, in their order, and how many repetitions there were.
+    """Return the flights without repetitions, in their order, and the number of repetitions.
 
-    One that begins with the same places is the same flight, wherever it is recorded; the longest recording is kept.
+    Flights that begin with the same places are one flight, wherever they are recorded; the longest recording is kept.
     """
     kept: list[Flight] = []
     for flight in sorted(flights, key=lambda one: -len(one.times)):
@@ -202,5 +203,5 @@ def _same(one: Flight, other: Flight) -> bool:
 
 
 def irregular(flight: Flight, step: float) -> int:
-    """How many frames are missing, by the times of those that are there."""
+    """Return how many frames are missing, according to the times of the others."""
     return int(np.maximum(np.rint(np.diff(flight.times) / step) - 1, 0).sum())

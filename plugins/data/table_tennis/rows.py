@@ -12,7 +12,7 @@ SMALL = {"flights": 12, "observed": 6, "future": 4, "least": 4, "stride": 20}
 
 
 def table(number: int, frames: int = 40) -> np.ndarray:
-    """t, x, y, z of a ball thrown from a place of its own."""
+    """Return t, x, y, z of a ball whose start depends on the number."""
     t = 0.016 * np.arange(frames)
     return np.column_stack([t, 0.1 * number + 0.5 * t, -4 + 5 * t, -0.6 + 1.5 * t - 4.9 * t**2])
 
@@ -23,7 +23,7 @@ def write_csv(file: Path, rows: np.ndarray) -> Path:
 
 
 def folder(place: Path) -> Mapping[str, str]:
-    """Eight flights, one of them twice, the second time cut short."""
+    """Write eight flights, and one of them again, cut short."""
     for number in range(8):
         write_csv(place / f"{number}.csv", table(number))
     write_csv(place / "again.csv", table(3)[:30])
@@ -31,7 +31,7 @@ def folder(place: Path) -> Mapping[str, str]:
 
 
 def matlab(place: Path) -> Mapping[str, str]:
-    """The laboratory's two layouts side by side, with two flights in both."""
+    """Write the laboratory's two layouts side by side, with two flights in both."""
     cells, times, balls = (np.empty(count, object) for count in (6, 4, 4))
     for number in range(6):
         cells[number] = table(number, 36)
@@ -48,7 +48,10 @@ def files(place: Path) -> Sequence[Path]:
 
 
 SEEN: tuple[Damage, ...] = ("empty", "garbage", "folder")
-"""Which files there are is for the folder to say: one fewer is a smaller set, and half a flight is a shorter one."""
+"""Kinds of damage that the data set detects.
+
+It cannot detect a missing file, which makes a smaller set, or half a flight, which is a shorter one.
+"""
 ROWS = {
     "table_tennis": (
         DataRow(

@@ -21,12 +21,15 @@ from plugins.data.table_tennis.solvers import SolverGaveUp, flight
 
 VERSION = "1"
 LONGEST = 1.15
-"""Seconds of a flight; it ends earlier where the ball is past the robot, or well below the table."""
+"""Duration of a flight, seconds; it ends earlier where the ball is past the robot, or well below the table."""
 PAST, BELOW = 0.4, 0.25
-"""y, m, and metres below the table."""
+"""Limits at which a flight ends: y, m, and depth below the table, m."""
 MEAN = (0.6, -4.1, -0.62, -0.4, 6.0, 1.6, 0.0, 0.0, 0.0)
 SPREAD = (0.2, 0.08, 0.05, 0.4, 0.5, 0.25, 40.0, 40.0, 40.0)
-"""Of the state at the start, normal: m, m/s, rad/s. Flights recorded in the WAM laboratory start so, less varied."""
+"""Standard deviations of the normal state at the start: m, m/s, rad/s.
+
+Flights recorded in the WAM laboratory start like this, with less variation.
+"""
 JITTER = 5e-5
 """Standard deviation of the time of a frame, s."""
 Share = Annotated[float, Field(ge=0, lt=0.5, allow_inf_nan=False)]
@@ -34,16 +37,17 @@ Share = Annotated[float, Field(ge=0, lt=0.5, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """What is simulated where no root is given.
+    """Settings of the flights that are simulated where no root is given.
 
     Attributes:
-        flights: how many.
-        noise: standard deviation of what is observed of each coordinate, m.
+        flights: number of flights.
+        noise: standard deviation of the noise of each observed coordinate, m.
         outliers: share of the frames in which something else was taken for the ball.
         dropped: share of the frames that are missing.
-        contact: "bounce" takes no time; "spring" is a stiff spring and damper, solved implicitly, 30 ms a flight.
-        frequency, damping: of that spring: Ω in 1/s, and ζ (of 0.04, it bounces as high as `restitution` 0.88 does).
-        generator_seed: of everything drawn, whatever the seed of the run.
+        contact: "bounce" takes no time; "spring" is a stiff spring and damper, solved implicitly in 30 ms per flight.
+        frequency: Ω of that spring, 1/s.
+        damping: ζ of that spring (at 0.04, the ball bounces as high as with `restitution` 0.88).
+        generator_seed: seed of everything that is drawn; it does not depend on the seed of the run.
     """
 
     flights: Annotated[int, Field(ge=4, le=100_000)] = 1000
@@ -57,7 +61,7 @@ class Simulation:
 
 
 def simulated(what: Simulation, constants: Constants, step: float) -> Path:
-    """The folder in the cache, written now unless it is there.
+    """Return the folder of simulated flights in the cache; it is written now if it is not there.
 
     Raises:
         DataError: the cache cannot be written, or a solver gave up.
@@ -72,7 +76,7 @@ def simulated(what: Simulation, constants: Constants, step: float) -> Path:
 
 
 def write(root: Path, what: Simulation, constants: Constants, step: float) -> None:
-    """flight_00000.csv and so on: t, x, y, z as observed, and true_x, true_y, true_z."""
+    """Write flight_00000.csv and so on, with t, x, y, z as observed, and true_x, true_y, true_z."""
     starts = [drawn(stream(what.generator_seed, f"start {number}")) for number in range(what.flights)]
     times = np.arange(0, LONGEST, step)
     jitter = [
@@ -107,7 +111,7 @@ def write(root: Path, what: Simulation, constants: Constants, step: float) -> No
 
 
 def drawn(random: np.random.Generator) -> Float[np.ndarray, "9"]:
-    """The state at the start of a flight that lands on the table: position, velocity and spin."""
+    """Return the state at the start of a flight that lands on the table: position, velocity and spin."""
     return np.array(MEAN) + np.array(SPREAD) * np.clip(random.normal(size=9), -2.5, 2.5)
 
 
@@ -117,7 +121,7 @@ def solved(
     what: Simulation,
     constants: Constants,
 ) -> Float[np.ndarray, "flight time 3"]:
-    """Positions without noise.
+    """Return the positions without noise.
 
     Raises:
         DataError: the solver of the stiff contact gave up.

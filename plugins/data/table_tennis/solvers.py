@@ -19,24 +19,24 @@ METHODS: dict[str, Callable[..., OdeSolver]] = {
 }  # fmt: skip
 EXPLICIT = ("RK45", "DOP853")
 MOST_PHASES = 1000
-"""Of free flight and of contact, one after the other."""
+"""Largest number of phases, of free flight and of contact, in one flight."""
 REST = 1e-6
-"""Speed upwards, m/s, below which a bounce without a spring is none."""
+"""Speed upwards, m/s, below which a ball without a spring comes to rest instead of bouncing."""
 
 
 class SolverGaveUp(UserError):
-    """A solver did not reach the end; says where, after how much, and what to choose."""
+    """Error of a solver that did not reach the end; the message says where, after how much, and what to choose."""
 
 
 class Path(NamedTuple):
-    """One flight.
+    """Solution of one flight.
 
     Attributes:
-        times: asked for, s.
+        times: requested times, s.
         states: (time, 9): position, velocity, spin.
-        contacts: when the ball came down on the table, s.
-        evaluations: of the derivative.
-        steps: of the solver.
+        contacts: times at which the ball came down on the table, s.
+        evaluations: number of evaluations of the derivative.
+        steps: number of steps of the solver.
     """
 
     times: Float[np.ndarray, "time"]
@@ -56,15 +56,21 @@ def flight(
     tolerance: float = 1e-8,
     most_steps: int = 20_000,
 ) -> Path:
-    """The flight from a state at `times[0]`, at all times, which increase.
+    """Return the flight from a state at `times[0]`, at all times, which increase.
 
-    A flight is a sequence of phases, each with a smooth right-hand side: in the air; in the table, pushed; in the
-    table, no longer pushed ("loose"); at rest on it; fallen beside it. The border between two is an event, found on the
-    solver's dense output. Without a spring a bounce takes no time (`bounced`), and ends at `REST`.
+    A flight is a sequence of phases, each with a smooth right-hand side: in the air; in the table and pushed; in the
+    table and no longer pushed ("loose"); at rest on it; fallen beside it. The border between two phases is an event,
+    which is located on the solver's dense output. Without a spring a bounce takes no time (`bounced`), and bouncing
+    ends at `REST`.
 
     Args:
-        tolerance: relative; the absolute one is as much of a metre, of a metre per second, and of 100 rad/s.
-        most_steps: in all phases together.
+        start: position, velocity and spin at `times[0]`.
+        times: increasing times, s.
+        constants: constants of the ball and the table.
+        spring: the table as a spring and a damper; None for a bounce that takes no time.
+        method: SciPy's solver.
+        tolerance: relative tolerance; the absolute one is as much of a metre, of a metre per second, and of 100 rad/s.
+        most_steps: largest number of steps in all phases together.
 
     Raises:
         SolverGaveUp: the steps do not suffice, or become smaller than rounding.
@@ -86,7 +92,7 @@ def flight(
 
 
 class _Walk:
-    """The state of one integration over its phases."""
+    """State of one integration over its phases."""
 
     def __init__(
         self,
@@ -107,8 +113,8 @@ class _Walk:
     def phase(
         self, time: float, state: NDArray[np.float64], phase: str
     ) -> tuple[float, NDArray[np.float64], str]:
-        """Integrate until an event or the end; returns the time, the state and the phase that follows."""
-        # time counts from the phase's begin: a contact of 1e-8 s has no digits left in the time of day
+        """Integrate until an event or the end, and return the time, the state and the phase that follows."""
+        # time counts from the beginning of the phase: in the time of the flight, a contact of 1e-8 s has no digits left
         end = float(self.times[-1]) - time
         times = self.times - time
         event = self._event(phase)
@@ -149,10 +155,11 @@ class _Walk:
         )
 
     def _solver(self, state: NDArray[np.float64], end: float, phase: str) -> OdeSolver:
-        """With errors measured by what moves in this phase, and a first step that cannot leap over all of it.
+        """Return a solver whose error scale fits the motion of this phase, and whose first step cannot pass over all of
+        it.
 
-        Of a ball pressed into a hard table the height counts in g/Ω², of a small hop in the hop's height: measured in
-        metres, it would be lost in the tolerance, and the ball might come out below the table.
+        The height of a ball pressed into a hard table is measured in g/Ω², that of a small hop in the hop's height.
+        Measured in metres it would be lost in the tolerance, and the ball might come out below the table.
         """
         gravity, (height, climb) = self.constants.gravity, state[[2, 5]]
         first, tall, fast = np.inf, 1.0, 1.0
@@ -191,7 +198,7 @@ class _Walk:
         return rate
 
     def _event(self, phase: str) -> Callable[[NDArray[np.float64]], float]:
-        """A function that falls through 0 where the phase ends."""
+        """Return a function of the state that falls through 0 where the phase ends."""
         spring = self.spring
         if phase == "air":
             return lambda state: float(state[2])
@@ -209,7 +216,7 @@ class _Walk:
         self, dense: Callable[..., NDArray[np.float64]], event: Callable[..., float], start: float, end: float,
         armed: bool,
     ) -> float | None:  # fmt: skip
-        """Where the event falls through 0 within a step, looked at in eight places."""
+        """Return where the event falls through 0 within a step, searched at eight places; None if it does not."""
         places = np.linspace(start, end, 9)
         values = [event(dense(place)) for place in places]
         for left, right, one, other in zip(places[:-1], places[1:], values[:-1], values[1:], strict=True):
@@ -221,7 +228,7 @@ class _Walk:
         return None
 
     def _after(self, time: float, state: NDArray[np.float64], phase: str) -> tuple[NDArray[np.float64], str]:
-        """The state and the phase behind an event."""
+        """Return the state and the phase after an event."""
         constants, spring = self.constants, self.spring
         if phase == "pushed":
             return state, "loose"

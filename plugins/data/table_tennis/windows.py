@@ -1,4 +1,4 @@
-"""What a model reads and predicts: the frames of a flight until now, and where the ball is at fixed times after it."""
+"""Windows of a flight: the frames until now, which a model reads, and the positions at fixed later times."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -13,17 +13,18 @@ from plugins.data.table_tennis.recordings import Flight
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """What is read and predicted of a flight.
+    """Frames of a flight that are read and predicted.
 
     Attributes:
-        observed: most frames that are read; earlier ones are forgotten.
-        future: frames that are predicted.
-        least: frames that must be there of those that are read.
+        observed: largest number of frames that are read; earlier ones are dropped.
+        future: number of frames that are predicted.
+        least: number of frames that must be present among those that are read.
         stride: frames from one window of a flight to the next.
         step: seconds from frame to frame.
-        gap: seconds between two frames of the flight across which a position that is to be predicted may be
-            interpolated; a window with a wider gap in its future is left out.
-        outlier: metres from what its neighbours say beyond which a frame is no truth to predict. It is still read.
+        gap: longest time between two frames, seconds, across which a position to predict may be interpolated; a window
+            with a wider gap in its future is left out.
+        outlier: distance, metres, from the position that its neighbours suggest, beyond which a frame is not used as a
+            target. It is still read.
     """
 
     observed: Annotated[int, Field(ge=3, le=1000)] = 20
@@ -41,7 +42,7 @@ class Grid:
 
 
 class Window(NamedTuple):
-    """One sample: (observed × 5,) read, (future × 3,) to predict, the same without noise where known; the frame."""
+    """One sample: input (observed × 5,), target and target without noise (future × 3,), and its frame in the flight."""
 
     inputs: Float[np.ndarray, "number"]
     target: Float[np.ndarray, "number"]
@@ -50,10 +51,10 @@ class Window(NamedTuple):
 
 
 def prefix(flight: Flight, now: int, grid: Grid) -> Float[np.ndarray, "number"] | None:
-    """What is read at frame `now`; None where fewer frames than `least` are there.
+    """Return the input at frame `now`; None where fewer frames than `least` are present.
 
-    Each frame has a place of its own, the nearest multiple of `step` before now. Where two want the same, the nearer
-    has it.
+    Each frame is put at the nearest multiple of `step` before now. If two frames have the same place, the nearer one
+    takes it.
     """
     since = flight.times[: now + 1] - flight.times[now]
     place = np.rint(since / grid.step).astype(int)
@@ -67,7 +68,7 @@ def prefix(flight: Flight, now: int, grid: Grid) -> Float[np.ndarray, "number"] 
 
 
 def windows(flight: Flight, grid: Grid) -> list[Window]:
-    """Those of a flight, every `stride` frames; none of a flight that is too short."""
+    """Return the windows of a flight, every `stride` frames; an empty list for a flight that is too short."""
     good = believed(flight, grid.outlier)
     times, places = flight.times[good], flight.places[good]
     truth = places if flight.truth is None else flight.truth[good]
@@ -91,7 +92,7 @@ def between(
     asked: Float[np.ndarray, "time"],
     after: np.ndarray,
 ) -> Float[np.ndarray, "time 3"]:
-    """Places at the times asked for: straight between two frames, and in z on the parabola of a free fall."""
+    """Return the places at the requested times: linear between two frames, and in z on the parabola of a free fall."""
     left, right = times[after - 1], times[after]
     share = ((asked - left) / (right - left))[:, None]
     found = (1 - share) * places[after - 1] + share * places[after]
@@ -100,8 +101,11 @@ def between(
 
 
 def believed(flight: Flight, farthest: float) -> Bool[np.ndarray, "frame"]:
-    """Which frames are no outliers: while one is farther than so many metres from what its neighbours say, the worst
-    goes. The first and the last have but one neighbour and stay."""
+    """Return a mask of the frames that are not outliers.
+
+    While a frame is farther than `farthest` metres from the position that its neighbours suggest, the worst frame is
+    removed. The first and the last frame have only one neighbour and stay.
+    """
     kept = np.arange(len(flight.times))
     while len(kept) > 2:
         times, places = flight.times[kept], flight.places[kept]
