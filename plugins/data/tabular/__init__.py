@@ -1,1 +1,1 @@
-"""A user's own CSV table as a data set."""
+"""Data set that reads a user's own CSV table."""

@@ -1,4 +1,4 @@
-"""A user's own table; the contract is framework.data's."""
+"""Data set of a user's own table; framework.data describes the contract."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -31,22 +31,24 @@ Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 
 class Tabular(Data):
-    """Your own CSV table: columns of numbers are read, one column (or several, of one kind) is predicted.
+    """Your own CSV table: columns of numbers are the input, one column (or several of one kind) is predicted.
 
     Inputs are standardised by the mean and standard deviation of the training rows; a column that is constant there
-    becomes 0. Targets keep their own unit; degrees become radians. Batches also hold "line", the row's line in the
-    file. A column `split` says which rows are for train, validation or test, a column `group` in which groups results
-    are also reported.
+    becomes 0. Targets keep their own unit; degrees become radians. Batches also hold "line", the row's line number in
+    the file. A column `split` assigns each row to train, validation or test. A column `group` names the groups for
+    which results are also reported separately.
 
     Args:
-        path: the file.
-        target: the column to predict, or columns where they are numbers.
-        kind: what the target is: a class label, a real number, or an angle in degrees or radians.
-        columns: what is read; None: every other column most of whose cells are numbers.
-        validation, test: shares of the rows, drawn at random, where there is no column `split`.
-        data_seed: of that draw, whatever the seed of the run.
-        missing: what becomes of rows with an empty cell where a number or a label is wanted.
-        small_angles: angles in degrees may all lie within ±2π, which otherwise looks like radians and is refused.
+        path: the CSV file.
+        target: the column to predict, or several columns where they are numbers.
+        kind: kind of the target: a class label, a real number, or an angle in degrees or radians.
+        columns: columns of the input; None for every other column most of whose cells are numbers.
+        validation: share of the rows for validation, drawn at random, where there is no column `split`.
+        test: share of the rows for the test, likewise.
+        data_seed: seed of that draw; it does not depend on the seed of the run.
+        missing: treatment of rows with an empty cell where a number or a label is wanted: refuse or skip.
+        small_angles: whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
+            look like radians.
         writing: how the file, and others like it, are written.
     """
 
@@ -125,14 +127,16 @@ class Tabular(Data):
         return read(files, self._reading, self.writing)
 
     def inputs(self, given: Any) -> Tensor:
-        """Of rows as the table has them: a CSV file, a DataFrame, a mapping by column, or an array."""
+        """Return standardised inputs (row, column) from a CSV file, a DataFrame, a mapping by column, or an array of
+        rows.
+        """
         if isinstance(given, str | Path) or (isinstance(given, list) and isinstance(given[0], str | Path)):
             return Data.inputs(self, given)
         return of_rows(given, self._reading)
 
     @property
     def _reading(self) -> Reading:
-        # a checkpoint of version 0.1 does not hold it: then the training table is read again
+        # a checkpoint of version 0.1 does not hold the reading: then the training table is read again
         return self._trained or self._table.reading
 
     def state_dict(self) -> Mapping[str, Any]:

@@ -1,18 +1,20 @@
-"""A row of numbers as bars."""
+"""Image that shows a row of numbers as bars."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 HEIGHT = 64
 WIDTH = 256
-"""Pixels; with more columns than half as many, one of two pixels each."""
+"""Width of the image, pixels; with more columns than half as many, each column has two pixels."""
 REACH = 3.0
 """Standard deviations from the middle to the border; longer bars are cut off."""
 UP, DOWN, MIDDLE = (31, 119, 180), (214, 39, 40), (150, 150, 150)
 
 
 def bars(values: Float[np.ndarray, "column"]) -> UInt8[np.ndarray, "height width 3"]:
-    """One bar a column, blue above the mean of the training rows and red below it, on white."""
+    """Return an image with one bar for each column, blue above the mean of the training rows and red below it, on
+    white.
+    """
     pitch = max(2, WIDTH // len(values))
     canvas = np.full((HEIGHT, pitch * len(values), 3), 255, np.uint8)
     middle = HEIGHT // 2

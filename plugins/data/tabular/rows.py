@@ -1,4 +1,4 @@
-"""Rows of the contract: one table, of which a label, numbers or an angle are predicted."""
+"""Rows of the contract: one table, with a label, numbers or an angle as the target."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ LABELS = ("cat", "dog", "emu")
 
 
 def write(folder: Path, rows: int = 40) -> Mapping[str, str]:
-    """Rows with a number, its square, a group, and three columns worth predicting."""
+    """Write a table with a number, its square, a group, and three columns that can be predicted."""
     lines = ["number,square,group,class,real,angle"]
     for row in range(rows):
         lines.append(f"{row},{row * row},{'ab'[row % 2]},{LABELS[row % 3]},{row / 2 - 3},{20 * row - 360}")
@@ -18,7 +18,7 @@ def write(folder: Path, rows: int = 40) -> Mapping[str, str]:
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """Two rows in one file, one in another, with the columns that are read in any order."""
+    """Write two files, of two rows and of one row, with the input columns in different orders."""
     first, second = folder / "first.csv", folder / "second.csv"
     first.write_text("square,number\n9,3\n1000000,1000\n", encoding="utf-8")
     second.write_text("number,note,square\n5,hello,25\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""From a user's CSV table to numbers: which columns, which rows, which split."""
+"""Conversion of a user's CSV table to tensors: choice of columns, rows and splits."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -38,11 +38,11 @@ Missing = Literal["error", "skip"]
 SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
 MANY_LABELS = 20
-"""More labels than this, all of them numbers and most on one row alone, are no classes."""
+"""Largest number of numeric labels that may be classes where most of them occur on one row only."""
 
 
 class Question(NamedTuple):
-    """What is asked of a table; the words are those of the config."""
+    """Settings that say how a table is read; the names are those of the configuration."""
 
     target: tuple[str, ...]
     kind: Kind
@@ -54,7 +54,7 @@ class Question(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """Of each column x: (x / largest - mean) / deviation; divided first so that no square overflows."""
+    """Scaling of each column x to (x / largest - mean) / deviation; it divides first, so that no square overflows."""
 
     largest: Float[np.ndarray, "column"]
     mean: Float[np.ndarray, "column"]
@@ -62,17 +62,17 @@ class Scaling(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """How rows become inputs."""
+    """Columns and scaling by which rows become inputs."""
 
     columns: tuple[str, ...]
     scaling: Scaling
 
 
 def stored_reading(state: Mapping[str, Any]) -> Reading:
-    """How a model's training data became inputs, out of a checkpoint.
+    """Return the reading of a model's training data from a checkpoint.
 
     Raises:
-        DataError: it is not one finite number for each column, or something that would divide by 0.
+        DataError: the state is not one finite number for each column, or it would divide by 0.
     """
     columns: Sequence[Any] = state["columns"] if isinstance(state.get("columns"), list | tuple) else ()
     named = bool(columns) and all(isinstance(name, str) for name in columns)
@@ -94,7 +94,7 @@ def stored_reading(state: Mapping[str, Any]) -> Reading:
 
 
 class Table(NamedTuple):
-    """A table's answer."""
+    """Everything that is read from a table: target, inputs, splits, and remarks about what was left out."""
 
     target: Target
     reading: Reading
@@ -118,12 +118,14 @@ def load(
     """Read, check, split and standardise a table.
 
     Args:
-        trained: how the model reads rows for which the table is; None: its own training rows say.
+        file: the CSV file.
+        question: the settings of the data set.
+        trained: the reading of the model for which the table is read; None to fit it to the table's training rows.
         writing: how the file is written.
         small_angles: whether angles in degrees may all lie within ±2π.
 
     Raises:
-        DataError: the file, a column, a cell, a label or a split is not as wanted; names line and column.
+        DataError: the file, a column, a cell, a label or a split is not as wanted; the message names line and column.
     """
     cells = read_columns(file, writing or LabelledWriting())
     digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
@@ -162,10 +164,10 @@ def load(
 
 
 def read(files: Sequence[Path], reading: Reading, writing: Writing | None = None) -> Fields:
-    """The same columns of other files, standardised as the training rows were, one sample a row.
+    """Return the input columns of other files, standardised as the training rows were, one sample for each row.
 
     Raises:
-        DataError: there is no file, or one cannot be read, lacks a column, or a cell of one is no finite number.
+        DataError: there is no file, or a file cannot be read, lacks a column, or has a cell that is no finite number.
     """
     parts = []
     for cells, inputs in tables(files, reading.columns, "The trained model", writing or LabelledWriting()):
@@ -176,10 +178,11 @@ def read(files: Sequence[Path], reading: Reading, writing: Writing | None = None
 
 
 def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
-    """Rows that a user has in memory, standardised: a DataFrame or a mapping by column, or an array in their order.
+    """Return standardised inputs from rows in memory: a DataFrame, a mapping by column, or an array in the columns'
+    order.
 
     Raises:
-        DataError: a column is missing, a cell is no finite number, or an array has another number of columns.
+        DataError: a column is missing, a cell is not a finite number, or an array has another number of columns.
     """
     if hasattr(given, "columns") or isinstance(given, Mapping):
         missing = [name for name in reading.columns if name not in given]
@@ -208,7 +211,7 @@ def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
 
 
 def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.ndarray]:
-    """The scaling to mean 0 and standard deviation 1, and which columns are constant: those become 0."""
+    """Return the scaling to mean 0 and standard deviation 1, and a mask of the constant columns, which become 0."""
     constant = inputs.max(0) == inputs.min(0)
     largest = np.where(constant, 1.0, np.abs(inputs).max(0))
     shrunk = inputs / largest
@@ -220,8 +223,8 @@ def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.nd
 def standardised(
     inputs: Float[np.ndarray, "row column"], scaling: Scaling
 ) -> Float[np.ndarray, "row column"]:
-    """The columns in standard deviations from their mean."""
-    with np.errstate(over="ignore"):  # refused by as_float32, with its place
+    """Return the columns in standard deviations from their mean."""
+    with np.errstate(over="ignore"):  # as_float32 refuses the result and names its place
         return (inputs / scaling.largest - scaling.mean) / scaling.deviation
 
 
@@ -231,10 +234,10 @@ def as_float32(
     rows: Int[np.ndarray, "row"],
     values: Float[np.ndarray, "row column"],
 ) -> Float[Tensor, "row column"]:
-    """Single precision.
+    """Return the values in single precision.
 
     Raises:
-        DataError: a number has no place in it; names line and column.
+        DataError: a number is too large for single precision; the message names line and column.
     """
     with np.errstate(over="ignore"):
         narrow = values.astype(np.float32)
@@ -272,14 +275,14 @@ def _inputs(cells: Columns, question: Question) -> Chosen:
 
 
 def _named(cells: Columns, question: Question, columns: tuple[str, ...]) -> Chosen:
-    """The columns that somebody names, and those that nobody does."""
+    """Return the columns that are named, and list all others as left out."""
     known = (*columns, *question.target, SPLIT, GROUP)
     others = [name for name in cells.cells if name not in known]
     return Chosen(columns, dict(cells.left_out) | dict.fromkeys(others, "not among those to read"), {})
 
 
 def _targets(cells: Columns, question: Question, otherwise: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """The targets as the table has them, (row, name) numbers or (row,) labels, and whether a row has none."""
+    """Return the targets as they are in the table, (row, name) numbers or (row,) labels, and which rows have none."""
     if question.kind != "class":
         for name in question.target:
             if is_boolean(cells, name):
@@ -306,7 +309,7 @@ def _check_unit(cells: Columns, question: Question, values: np.ndarray, *, small
     """Refuse angles that look like the other unit.
 
     Raises:
-        DataError: says which, and what to set.
+        DataError: the angles look like the other unit; the message names it, and what to set.
     """
     if question.kind not in ("degrees", "radians"):
         return
@@ -340,7 +343,7 @@ def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ..
 
 
 def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndarray, "row"]:
-    """Index into SPLITS of each row: as the column says, else shares of a permutation."""
+    """Return the index into SPLITS of each row, from the column `split` or, without one, by shares of a permutation."""
     if SPLIT in cells.cells:
         for row, word in enumerate(cells.cells[SPLIT]):
             if word not in SPLITS:
@@ -369,17 +372,17 @@ def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndar
 def _encode(
     cells: Columns, rows: np.ndarray, training: np.ndarray, values: np.ndarray, question: Question
 ) -> tuple[Target, Tensor]:
-    """What the target is, and its values as a batch holds them."""
+    """Return the target's description, and its values as a batch holds them."""
     if question.kind == "real":
-        as_float32(cells, question.target, rows, values[rows])  # refuses what has no place in it
+        as_float32(cells, question.target, rows, values[rows])  # refuses numbers beyond single precision
         seen = values[training]
         constant = seen.max(0) == seen.min(0)
         deviation = np.where(constant, 1.0, seen.std(0))
         target = Target("real", question.target, tuple(seen.mean(0).tolist()), tuple(deviation.tolist()))
-        # in double precision: what varies little about a large value would be rounded
+        # keep double precision: small differences about a large value would be rounded away
         return target, torch.from_numpy(values[rows])
     if question.kind == "degrees":
-        # whole turns are taken off before the unit is changed: their multiple of 2π would be rounded
+        # remove whole turns before the unit is changed: their multiple of 2π would be rounded
         angle = wrap(torch.from_numpy(np.deg2rad(np.fmod(values[rows], 360.0))))
         return Target("angle", question.target), angle.float()
     if question.kind == "radians":
@@ -432,6 +435,6 @@ def _check_labels(
 
 
 def _order(word: str) -> tuple[float, str]:
-    """Numbers by size, before and apart from words."""
+    """Return a sort key that puts numbers by size before words."""
     value = number(word)
     return (float("inf") if value is None or value != value else value, word)
