@@ -171,6 +171,7 @@ class Bins:
         return self.with_at_least(1)
 
     def with_at_least(self, samples: int) -> "Bins":
+        """Return the bins that have at least the given number of samples."""
         kept = self.count >= samples
         return Bins(self.count[kept], self.confidence[kept], self.right[kept])
 

@@ -125,6 +125,7 @@ class Cubic(NamedTuple):
 
     @classmethod
     def of(cls, seen: CircularMoments) -> "Cubic":
+        """Return the cubic through density and slope of the given moments."""
         density = seen.density(FINER)
         return cls(density, seen.density(FINER, slope=True) * (2 * math.pi / len(density)))
 

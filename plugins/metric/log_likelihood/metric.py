@@ -25,6 +25,7 @@ class Moments(Metric):
         self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
 
     def take_in(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
+        """Add the log-likelihoods of a batch and what their estimate says of the sampling."""
         self.moments = merged_moments(torch.stack([self.moments, moments_of(log_prob)]))
         self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(estimate)]))
 
