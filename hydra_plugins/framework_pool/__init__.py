@@ -1,4 +1,7 @@
-"""Hydra's way to `framework.sweeps.jobs`. Hydra imports this at every start: nothing heavy here."""
+"""Hydra launcher that runs jobs through `framework.sweeps.jobs`.
+
+Hydra imports this module at every start; therefore it imports nothing heavy.
+"""
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,14 +36,14 @@ _COMPOSING = "framework.configuration.composition"
 
 
 class PoolLauncher(Launcher):
-    """Runs each job of a multirun as a process of its own, several at once; `framework.sweeps.jobs` says how.
+    """Launcher that runs each job of a multirun as its own process, several at once; see `framework.sweeps.jobs`.
 
     Args:
-        jobs: how many at once; None is half the cores.
+        jobs: number of jobs that run at once; None for half the cores.
         retries: how often a job that was killed is started again (it resumes from its checkpoint).
-        devices: CUDA devices to hand out, one to each running job, e.g. [0, 1]; None shows all to all.
-        fork: whether jobs are forks of one process that has imported what their modes need, which each would take
-            seconds for; None is on Linux, where there are several. A job is a process of its own either way.
+        devices: CUDA devices to assign, one to each running job, e.g. [0, 1]; None shows all devices to all jobs.
+        fork: whether jobs are forks of one process that has already imported what their modes need, which would take
+            each job seconds; None forks on Linux if there are several jobs. A job is its own process either way.
     """
 
     def __init__(
@@ -58,13 +61,17 @@ class PoolLauncher(Launcher):
         self.parent: str | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Keep the sweep's configuration, and refuse a sweep folder that is not enclosed."""
         self.loader = hydra_context.config_loader
         self.config = config
         require_enclosed(Path(str(config.hydra.sweep.dir)))  # before Hydra writes multirun.yaml into it
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Called once, or by some sweepers once for each batch of jobs."""
-        from framework.sweeps import comparison, rehearsal  # Hydra imports this module at every start
+        """Run the jobs and return their results; some sweepers call this once for each batch of jobs."""
+        from framework.sweeps import (
+            comparison,
+            rehearsal,
+        )  # imported late: Hydra imports this module at every start
 
         setup_globals()
         hydra = self.config.hydra
@@ -78,7 +85,7 @@ class PoolLauncher(Launcher):
                 "or a glob that fits a name."
             )
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
-        # for the rehearsal, which takes longer than other sweeps should wait
+        # number the jobs for the rehearsal, which runs before the lock because it takes long and other sweeps wait
         for index, config in enumerate(configs, initial_job_idx):
             _place(folder, config, index)
         try:
@@ -112,7 +119,7 @@ class PoolLauncher(Launcher):
 
     @contextmanager
     def _starter(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Iterator[Starter]:
-        from framework.modes import MODES  # Hydra imports this module at every start
+        from framework.modes import MODES  # imported late: Hydra imports this module at every start
 
         several = sum(not job.completed for job in jobs) > 1
         if not (several and sys.platform == "linux" if self.fork is None else self.fork):
@@ -161,7 +168,7 @@ class PoolLauncher(Launcher):
         return jobs
 
     def _passed_on(self) -> list[str]:
-        """What else of the sweep's command line a job needs, to compose the same config."""
+        """Return the other arguments of the sweep's command line that a job needs to compose the same configuration."""
         hydra = self.config.hydra
         given: Any = OmegaConf.to_container(hydra.overrides.hydra, resolve=False)
         folders = [
@@ -176,7 +183,7 @@ class PoolLauncher(Launcher):
 
 
 def _leave_nothing(folder: Path) -> None:
-    """Remove the folder of a sweep that never began, where it holds but the command that Hydra wrote into it."""
+    """Remove the folder of a sweep that never began, if it holds only the command that Hydra wrote into it."""
     left = list(folder.glob("*"))
     if {file.name for file in left} <= {"multirun.yaml", _LOCK}:
         for file in left:
@@ -204,7 +211,7 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 
 def _plain(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """A job's config as values, as the job itself will see it but for its folder."""
+    """Return a job's configuration as plain values, as the job itself will see it except for its folder."""
     with read_write(config), read_write(config.hydra), open_dict(config):
         config.hydra.runtime.output_dir = str(folder)
     before = HydraConfig.instance().cfg

@@ -1,4 +1,7 @@
-"""Hydra's random search. Hydra imports this at every start: nothing heavy here."""
+"""Hydra sweeper for random search.
+
+Hydra imports this module at every start; therefore it imports nothing heavy.
+"""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -21,17 +24,18 @@ log = logging.getLogger(__name__)
 
 
 class RandomSearch(Sweeper):
-    """Draws trials at random, runs them all under the launcher, ranks them and writes the best as an experiment.
+    """Sweeper that draws trials at random, runs all under the launcher, ranks them, and writes the best as an
+    experiment.
 
-    A draw is a function of (seed, number of the trial, key) alone: more trials, or another parameter, leave the
-    draws there were as they are. [Bergstra & Bengio, JMLR 13, 2012]
+    A draw is a function of (seed, number of the trial, key) alone: more trials, or another parameter, do not change the
+    existing draws. [Bergstra & Bengio, JMLR 13, 2012]
 
     Args:
-        trials: how many different trials; a space that holds fewer is run whole.
-        seed: of the draws.
-        metric: a key of results.json; None is the value a job returns, the best validation loss in nats.
-        direction: "minimize" or "maximize"; None is what the metric itself says.
-        params: sweeps by key, in Hydra's grammar; one on the command line replaces that of its key.
+        trials: number of different trials; a space that holds fewer is run whole.
+        seed: seed of the draws.
+        metric: a key of results.json; None for the value that a job returns, the best validation loss in nats.
+        direction: "minimize" or "maximize"; None for the direction that the metric itself declares.
+        params: sweeps by key, in Hydra's grammar; a sweep on the command line replaces that of its key.
     """
 
     def __init__(
@@ -49,6 +53,7 @@ class RandomSearch(Sweeper):
         self.params = dict(params or {})
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Keep the configuration, and make the launcher that it chooses."""
         self.hydra_context = hydra_context
         self.config = config
         self.launcher = Plugins.instance().instantiate_launcher(
@@ -56,7 +61,12 @@ class RandomSearch(Sweeper):
         )
 
     def sweep(self, arguments: list[str]) -> list[Sequence[JobReturn]]:
-        """Raises ConfigError before anything runs where the search makes no sense, and at the end what failed."""
+        """Draw the trials, run them, rank them, and return their results.
+
+        Raises:
+            ConfigError: the search makes no sense; this is raised before anything runs.
+            Exception: the error of a failed job; this is raised after all jobs.
+        """
         from hydra_plugins.framework_random_search import _draws
 
         assert self.config is not None
@@ -72,7 +82,7 @@ class RandomSearch(Sweeper):
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
         self.validate_batch_is_legal(drawn)
-        # all at once: a launcher that runs several at a time is then never short of one
+        # launch all trials in one batch, so that a launcher that runs several at once is always busy
         returned = self.launcher.launch(drawn, initial_job_idx=0)
         self._rank(folder, space, returned, self.hydra_context.config_loader)
         for one in returned:
@@ -95,7 +105,7 @@ class RandomSearch(Sweeper):
     def _rank(
         self, folder: Path, space: Mapping[str, Any], returned: Sequence[JobReturn], loader: ConfigLoader
     ) -> None:
-        from framework.sweeps import comparison  # Hydra imports this module at every start
+        from framework.sweeps import comparison  # imported late: Hydra imports this module at every start
         from hydra_plugins.framework_random_search import _best
 
         trials = [
@@ -119,7 +129,7 @@ class RandomSearch(Sweeper):
 
 
 def _folder(one: JobReturn) -> Path:
-    """A job's folder; `working_dir` is the one it was started in where a launcher runs it in this process."""
+    """Return a job's folder; if a launcher ran the job in this process, `working_dir` is where it was started."""
     if one.hydra_cfg is not None:
         return Path(str(one.hydra_cfg.hydra.runtime.output_dir))
     return Path(str(one.working_dir))

@@ -1,4 +1,4 @@
-"""The best trial of a search as an experiment file."""
+"""Experiment file of the best trial of a search."""
 
 import shlex
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: s
     name, content = experiment(overrides, loader, found)
     path = folder / "best.yaml"
     write_whole(path, content.encode())
-    for old in (folder / "experiment").rglob("*.yaml"):  # of an earlier search in this folder
+    for old in (folder / "experiment").rglob("*.yaml"):  # files of an earlier search in this folder
         old.unlink()
     write_whole(folder / "experiment" / f"{name}.yaml", content.encode())
     command = content.splitlines()[1].removeprefix("# python -m framework ")
@@ -37,16 +37,16 @@ def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: s
 
 
 AFTER = ("preset", "debug")
-"""Groups that config.yaml composes after the experiment, which therefore cannot override them but can hold one."""
+"""Groups that config.yaml composes after the experiment, which cannot override them but can hold one of them."""
 
 
 def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tuple[str, str]:
-    """Name and content of an experiment that is what `overrides` make of theirs.
+    """Return name and content of an experiment that has the same effect as `overrides`.
 
     Args:
-        overrides: of one job, nothing swept.
-        loader: knows which keys are config groups.
-        found: a line on where it comes from.
+        overrides: overrides of one job, without sweeps.
+        loader: Hydra's configuration loader, which knows the config groups.
+        found: a line that says where the experiment comes from.
     """
     base: str | None = None
     added: list[Any] = []
@@ -68,8 +68,8 @@ def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tu
         else:
             OmegaConf.update(values, key, value, merge=True, force_add=True)
     name = f"{base}_best" if base else "best"
-    # As a group of its own package: a plain name would have its own defaults looked for beside itself, and
-    # plain "experiment" would be taken for the choice on the command line.
+    # The base is named as a group with its own package: Hydra would look for the defaults of a plain name beside
+    # it, and would take plain "experiment" for the choice on the command line.
     defaults = [*([{"/experiment@_global_": base}] if base else []), *added, *chosen]
     body = OmegaConf.create({"defaults": defaults} if defaults else {})
     body.update(values)
@@ -78,5 +78,5 @@ def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tu
 
 
 def _only_on_a_command_line(one: Override) -> bool:
-    """Deletions, moved packages and items of lists have no word in an experiment file."""
+    """Return whether an experiment file cannot express it: a deletion, a moved package or an item of a list."""
     return one.is_delete() or one.package is not None or any(map(str.isdigit, one.key_or_group.split(".")))

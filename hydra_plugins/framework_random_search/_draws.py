@@ -1,4 +1,4 @@
-"""What a sweep in Hydra's grammar can take, and values drawn from it that depend on nothing else."""
+"""Domains of sweeps in Hydra's grammar, and reproducible draws from them."""
 
 import math
 import re
@@ -12,26 +12,28 @@ from framework.errors import ConfigError, did_you_mean
 
 WHOLE = re.compile(r"[+-]?\d+(_\d+)*")
 NARROWEST = 1e-12
-"""Least width of an interval, as a part of its larger end: below it too few numbers are left to tell apart."""
+"""Smallest width of an interval, as a share of its larger end; a narrower one holds too few distinct numbers."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values, each as it stands in an override; all equally likely."""
+    """Choice among values, each as it is written in an override; all are equally likely."""
 
     options: Sequence[object]
 
     @property
     def size(self) -> float:
+        """Number of different values."""
         return len(self.options) if isinstance(self.options, range) else len(set(self.options))
 
     def at(self, quantile: float) -> str:
+        """Return the value at a quantile in [0, 1), as it is written in an override."""
         return str(self.options[min(int(quantile * len(self.options)), len(self.options) - 1)])
 
 
 @dataclass(frozen=True)
 class Interval:
-    """start <= value < end, the value or its logarithm uniform; rounded down where it is to be whole."""
+    """Interval start <= value < end; the value or its logarithm is uniform, and rounded down if it is to be whole."""
 
     start: float
     end: float
@@ -40,9 +42,11 @@ class Interval:
 
     @property
     def size(self) -> float:
+        """Number of values; infinite for real numbers."""
         return self.end - self.start if self.whole else math.inf
 
     def at(self, quantile: float) -> str:
+        """Return the value at a quantile in [0, 1), as it is written in an override."""
         if self.logarithmic:
             least, most = math.log(self.start), math.log(self.end)
             value = math.exp(least + quantile * (most - least))
@@ -58,7 +62,7 @@ Domain = Choice | Interval
 
 
 def space(overrides: Sequence[Override]) -> dict[str, Domain]:
-    """What each override can take, by its key with its prefix; a fixed one is a choice of one.
+    """Return the domain of each override, by its key with its prefix; a fixed override is a choice of one value.
 
     The last override of a key counts, as in Hydra's own sweeper.
 
@@ -80,10 +84,10 @@ def space(overrides: Sequence[Override]) -> dict[str, Domain]:
 
 
 def draw(space: Mapping[str, Domain], trials: int, seed: int) -> tuple[list[list[str]], int]:
-    """The overrides of so many different trials (of all there are where those are fewer), and how many draws
-    repeated an earlier one.
+    """Return the overrides of different trials, and how many draws repeated an earlier one.
 
-    A space is run whole by drawing on until all of it has come, so that the order is that of a shorter search.
+    There are `trials` of them, or all of the space if it holds fewer. To run a whole space, draws continue until all of
+    its points have occurred, so that its order begins with that of a shorter search.
     """
     wanted = min(trials, math.prod(domain.size for domain in space.values()))
     found: dict[tuple[str, ...], None] = {}
@@ -99,13 +103,13 @@ def draw(space: Mapping[str, Domain], trials: int, seed: int) -> tuple[list[list
 
 
 def quantile(seed: int, trial: int, key: str) -> float:
-    """A number from [0, 1), uniform over any of its arguments; the same on every machine."""
+    """Return a number in [0, 1), uniform over any of its arguments, and the same on every machine."""
     digest = sha256(f"{seed}\0{trial}\0{key}".encode()).digest()
     return (int.from_bytes(digest[:8], "big") >> 11) * 2.0**-53  # the 53 bits a float can hold
 
 
 def described(space: Mapping[str, Domain], found: int, trials: int, repeated: int) -> str:
-    """One line on what is about to run."""
+    """Return one line that describes the search that is about to run."""
     keys = [key.lstrip("+") for key, domain in space.items() if domain.size > 1]
     line = f"random search over {', '.join(keys) or 'a single point'}: {found} trials"
     if found < trials:
@@ -133,7 +137,7 @@ def _domain(override: Override) -> Domain:
             raise _wrong(
                 override, f"the tag {', '.join(sorted(value.tags))} means nothing on it. Leave the tag out."
             )
-        value.shuffle = False  # Hydra shuffles anew each time, and the draws are a shuffle
+        value.shuffle = False  # Hydra would shuffle differently each time, and the draws are random already
     if isinstance(value, RangeSweep):
         if value.step == 0:
             raise _wrong(override, "its step is 0. Give another one.")
@@ -173,7 +177,7 @@ def _interval(override: Override, sweep: IntervalSweep) -> Interval:
 
 
 def _whole(override: Override, sweep: IntervalSweep) -> bool:
-    """Whether both ends are written as whole numbers, or cast to them; Hydra's parser has made them floats."""
+    """Return whether both ends are written as whole numbers, or cast to them; Hydra's parser has made them floats."""
     if isinstance(sweep.start, int) and isinstance(sweep.end, int):  # int(interval(...))
         return True
     text = override.get_value_string()
@@ -184,7 +188,7 @@ def _whole(override: Override, sweep: IntervalSweep) -> bool:
 
 
 def _short(value: float, start: float, end: float) -> float:
-    """The nearest number of few digits, for tables and files; moved by at most a millionth of the interval."""
+    """Return the nearest number of few digits, for tables and files, within a millionth of the interval."""
     rounded = (float(f"{value:.{digits}g}") for digits in range(6, 18))
     return next(
         number for number in rounded if start <= number < end and abs(number - value) <= 1e-6 * (end - start)
