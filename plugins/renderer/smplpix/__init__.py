@@ -1,1 +1,1 @@
-"""People rendered by neural pixels: a trained network paints the picture of a body's points."""
+"""Renderer that paints people with a trained network from the points of a body (SMPLpix)."""

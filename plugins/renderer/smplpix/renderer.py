@@ -1,4 +1,4 @@
-"""A trained network in place of a rasteriser: a scene's vertices in, the picture it paints out."""
+"""Renderer with a trained network in place of a rasteriser: it reads a scene's vertices and paints the image."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -21,31 +21,32 @@ from framework.renderer import Renderer, Scene
 COLUMNS = (*XYZ, *COLOURS)
 """Columns of the points that a run must have been trained on."""
 SIZES_KEPT = 4
-"""Networks of so many image sizes are kept ready."""
+"""Number of image sizes whose networks are kept ready."""
 
 
 class SMPLpix(Renderer):
-    """What a run of `smplpix/quick` or its like predicts for a scene, wherever the scene is drawn.
+    """Image that a trained run of `smplpix/quick` or a similar experiment predicts for a scene.
 
-    The camera may be any: vertices go to the canonical one of its image size, which sees them at the same pixels
-    (`Camera.canonical`). Faces matter only to a run that paints over a rasterised mesh, and then those of its own
-    topology are drawn; a run of projected points draws sets of points too. Vertices that are not finite or nearer than
-    the near plane are left out where points are projected.
+    The camera may be any camera: vertices are transformed to the canonical camera of its image size, which sees them at
+    the same pixels (`Camera.canonical`). Faces matter only to a run that paints over a rasterised mesh, which then
+    draws the faces of its own topology. A run of projected points also draws sets of points; it leaves out vertices
+    that are not finite or nearer than the near plane.
 
-    The ground is white, as in the photographs of training: near enough to 1 in a trained network that 8 bits hardly
-    tell. Networks read pictures of any size; but they have seen points as dense as those of the run's own size, and
-    paint best there.
+    The background is white: in a trained network it is so near to 1 that 8 bits hardly show the difference. Networks
+    read images of any size, but in training they have seen points as dense as those of the run's own size, and paint
+    best there.
 
     Args:
         checkpoint: folder of a run, its model.ckpt, or an MLflow run id.
-        paths: files and folders of that run's config, which are used only where they are said again:
+        paths: files and folders of that run's configuration, which are used only if they are given again here:
             `renderer.paths={encoder: {rasterised: {body: ...}}}`.
-        precision: of evaluation, as of `encoder=unet`; "trained": as the run's config says.
-        crop: margin around the subject's box, pixels, that is computed; "whole": all is; "trained" likewise.
+        precision: precision of evaluation, as in `encoder=unet`; "trained" for that of the run's configuration.
+        crop: margin around the subject's box, pixels, within which the image is computed; "whole" for the whole image;
+            "trained" for the run's setting.
 
     Raises:
-        ConfigError: no checkpoint, or one of a model that makes no picture of coloured points.
-        CheckpointError: it is damaged, or nothing is there.
+        ConfigError: there is no checkpoint, or its model does not predict an image from coloured points.
+        CheckpointError: the checkpoint is damaged, or does not exist.
     """
 
     channels = frozenset({"color"})
@@ -103,7 +104,7 @@ class SMPLpix(Renderer):
         return {"color": found.float().to(scene.vertices.device)}
 
     def _predictor(self, height: int, width: int) -> Predictor:
-        """The network for pictures of a size; its weights are the same for all."""
+        """Return the network for images of a size; the weights are the same for all sizes."""
         size = (height, width)
         if size not in self._ready:
             encoders = [
@@ -115,7 +116,9 @@ class SMPLpix(Renderer):
                 config={**self.description.config, "encoder": encoders},
                 target=replace(self.description.target, size=size),
             )
-            with torch.random.fork_rng(devices=[]):  # building draws weights, which are then overwritten
+            with torch.random.fork_rng(
+                devices=[]
+            ):  # building draws random weights, which are then overwritten
                 try:
                     made = rebuilt(changed, self._weights)
                 except CheckpointError as error:
@@ -132,10 +135,10 @@ class SMPLpix(Renderer):
 
 
 def cloud(scene: Scene) -> Float[Tensor, "points 6"]:
-    """Vertices as data of coloured points give them: in the canonical camera's frame, colours as files hold them.
+    """Return the vertices as data of coloured points give them: in the canonical camera's frame, with sRGB colours.
 
-    What must not be seen lies in the camera itself: a vertex with a number that is not finite, or before the near
-    plane; of a scene without vertices one such.
+    A vertex that must not be seen (not finite, or before the near plane) is put into the camera itself; a scene without
+    vertices has one such vertex.
     """
     assert scene.colors is not None
     if not len(scene.vertices):

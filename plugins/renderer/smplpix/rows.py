@@ -1,4 +1,4 @@
-"""Rows of the contract: runs with drawn weights, of points, of splats, and of other sizes than are drawn."""
+"""Rows of the contract: checkpoints with random weights, for points, for splats, and for other image sizes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ SLIM = {"widths": [8, 12, 16]}
 
 
 def seeing(size: tuple[int, int], name: str = "projection", **config: Any) -> dict[str, Any]:
-    """An encoder that makes pictures of points, of (height, width)."""
+    """Return the settings of an encoder that projects points to an image of (height, width)."""
     return {"name": name, "height": size[0], "width": size[1], **config}
 
 
@@ -36,7 +36,7 @@ def checkpoint(
     names: tuple[str, ...] = COLUMNS[3:],
     uncertainty: Sequence[dict[str, Any]] = (),
 ) -> str:
-    """What a run of people would leave behind, with drawn weights; its path."""
+    """Write a checkpoint like that of a run on people, but with random weights, and return its path."""
     state, target = {"height": size[0], "width": size[1]}, Target("image", names, size=size)
     config: Resolved = {
         "data": resolve("data", {"name": "human_scans", **state}),
@@ -63,8 +63,8 @@ POINTS_ARE_DRAWN = {
     "bad triangles are left out": "it draws vertices: those of a triangle without area too",
     "points": "drawn weights paint them in any colour",
 }
-WHITE = {"nothing seen is background": 0.05}  # the drawn weights' answer to an empty picture
-UNBOUNDED_WHITE = {"nothing seen is background": 0.2}  # and where no sigmoid keeps it near 1
+WHITE = {"nothing seen is background": 0.05}  # random weights paint an empty image only nearly white
+UNBOUNDED_WHITE = {"nothing seen is background": 0.2}  # less so where no sigmoid keeps the colour near 1
 SLIM_RUN, SURFACE_RUN, UNET_RUN = (
     checkpoint(
         Path(FOLDER.name) / f"{network['name']}_{size[0]}.ckpt",
