@@ -1,1 +1,1 @@
-"""Data sets, a folder for each or for a family that shares code."""
+"""Data sets, one folder for each or for a family that shares code."""
