@@ -164,6 +164,8 @@ def test_the_newest_run_is_that_whose_checkpoint_is_newest(tmp_path: Path) -> No
 )
 def test_no_run_goes_to_an_experiment_called_default(config: dict[str, Any], wanted: str) -> None:
     assert store_experiment(config) == wanted
+    # a stored model, which a command without data tests
+    assert store_experiment(config, "moons") == (wanted if wanted != "Default" else "moons")
 
 
 @pytest.mark.parametrize("names", [(), ("cat", "dog"), tuple(map(str, range(100)))], ids=len)

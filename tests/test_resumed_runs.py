@@ -139,6 +139,12 @@ def test_a_training_reads_its_checkpoint_and_builds_its_model_once(
     assert sorted(calls) == ["build_predictor", "read"]
 
 
+def test_a_stored_model_is_tested_under_the_name_of_its_data(tmp_path: Path, composed: Composed) -> None:
+    train.run(composed(tmp_path / "first", *SMALL))
+    config = composed(tmp_path / "tested", "mode=test", f"checkpoint={tmp_path / 'first'}", *SMALL[-3:])
+    assert session.for_trained(config).config.trained_on == "moons"
+
+
 @pytest.mark.parametrize("rows", [1, 2, 3])
 def test_batch_norm_wants_more_than_one_row(rows: int, tmp_path: Path, composed: Composed) -> None:
     config = composed(tmp_path / "run", *SMALL, f"batch_size={rows}", "encoder.mlp.batch_norm=true")
