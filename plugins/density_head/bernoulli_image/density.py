@@ -100,7 +100,7 @@ def _(density: BernoulliImage, temperature: Tensor) -> BernoulliImage:
 
 @images.register
 def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
-    """Return the probabilities in linear RGB as "color", and as "mask" the pixels whose number is at least as likely 1."""
+    """Return the probabilities in linear RGB as "color"; as "mask" the pixels whose number is at least as likely 1."""
     if (
         not channels
         or not set(channels) <= {"color", "mask"}

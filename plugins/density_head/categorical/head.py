@@ -79,7 +79,7 @@ class BernoulliHead(DensityHead):
 
 
 def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:
-    """Their softmax; logits so large that their differences overflow are cut off first."""
+    """Return the density of the classes by softmax of the logits, clamped so that their differences do not overflow."""
     most = torch.finfo(logits.dtype).max / 4
-    # normalised here, the largest logit subtracted first: torch's own normalisation loses the digits of large logits
+    # Normalised here with the largest logit subtracted first: torch's own normalisation loses digits of large logits.
     return CategoricalDensity(logits=logits.clamp(-most, most).log_softmax(-1), validate_args=False)

@@ -246,7 +246,7 @@ class NormalPoints:
         dimensions: dimensions of z.
         dtype, device: of the points.
         kept: number of first points of each replicate that are kept from first use, for many values at the same points;
-            0 if they exceed LARGEST_KEPT.
+            none are kept if they exceed LARGEST_KEPT.
     """
 
     def __init__(

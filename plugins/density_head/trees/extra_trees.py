@@ -190,4 +190,5 @@ def fitted_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor,
 
 
 def array(tensor: Tensor) -> np.ndarray:
+    """Return the tensor as a NumPy array."""
     return tensor.cpu().numpy()

@@ -1,4 +1,4 @@
-"""Half of the difference of two angles, taken without rounding, however many turns they are apart."""
+"""Half of the difference of two angles, computed without rounding for any number of turns between them."""
 
 import math
 
@@ -9,11 +9,11 @@ _PI = tuple(
     float.fromhex(part)
     for part in ("0x1.921fb54p+1", "0x1.10b461p-29", "0x1.a62633p-57", "0x1.45c06e0e68948p-85")
 )
-"""π in three parts of 27 bits, of which a whole number below 2^26 has exact multiples, and a rest."""
+"""Parts of π: three of 27 bits, whose multiples by an integer below 2^26 are exact, and a rest."""
 
 
 def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """sin and cos of (φ-μ)/2 up to one common sign, the difference taken without rounding."""
+    """Return sin and cos of (φ-μ)/2 up to one common sign, with the difference computed without rounding."""
     if in_single(value, mean):
         return _half_angle_in_single(value, mean)
     sine, cosine, odd = _reduced(value, mean)
@@ -21,30 +21,32 @@ def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """sin²((φ-μ)/2) and sin((φ-μ)/2) cos((φ-μ)/2)."""
+    """Return sin²((φ-μ)/2) and sin((φ-μ)/2) cos((φ-μ)/2)."""
     if in_single(value, mean):
         sine, cosine = _half_angle_in_single(value, mean)
         return sine * sine, sine * cosine
     sine, cosine, odd = _reduced(value, mean)
-    # by arithmetic: a compiler that splits value and gradient would store a mask, at several times the cost of all else
+    # Arithmetic replaces `where`: a compiler that splits value and gradient would store a mask, at several times the
+    # cost of everything else.
     square = sine * sine
     return square + odd * (cosine * cosine - square), (1 - 2 * odd) * (sine * cosine)
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
+    """Return whether both arguments are float32 and nothing is compiled, so that float32 alone is used."""
     return value.dtype == mean.dtype == torch.float32 and not torch.compiler.is_compiling()
 
 
 def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """As `half_angle`, in float32 alone."""
+    """Return the result of `half_angle`, computed in float32 alone."""
     sine, cosine, small_sine, small_cosine = parts_in_single(value, mean)
     return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
 
 
 def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """sin and cos of half of the rounded difference and of what rounding took: fewer operations than `_reduced`.
+    """Return sin and cos of half the rounded difference, and of half its rounding error.
 
-    float32's sine and cosine read large angles exactly.
+    This takes fewer operations than `_reduced`. float32's sine and cosine are exact for large angles.
     """
     high = value - mean
     with torch.no_grad():
@@ -52,7 +54,7 @@ def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor
         square = low * low  # below 2^-10 for angles up to 1e6 rad
         small_sine, small_cosine = low - low * square / 6, 1 - square / 2
         far = square > 2**-10
-        if far.device.type != "cpu" or bool(far.any()):  # no device waits for an answer
+        if far.device.type != "cpu" or bool(far.any()):  # reading `far` would synchronise a device
             small_sine = torch.where(far, torch.sin(low), small_sine)
             small_cosine = torch.where(far, torch.cos(low), small_cosine)
     half = high / 2
@@ -60,13 +62,13 @@ def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def _lost(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
-    """What rounding took from φ-μ: with it `high` is the exact difference (Knuth's two-sum)."""
+    """Return the rounding error of φ-μ: `high` plus it is the exact difference (Knuth's two-sum)."""
     back = value - high
     return (value - (high + back)) + (back - mean)
 
 
 def _reduced(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sin and cos of half of what φ-μ is beyond the nearest multiple of π, and that multiple's parity, 0 or 1."""
+    """Return sin and cos of half the remainder of φ-μ from the nearest multiple of π, and its parity, 0 or 1."""
     if value.dtype == torch.float32 and mean.dtype == torch.float32:
         high = value.double() - mean.double()
         low = None
@@ -84,11 +86,14 @@ def _reduced(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _sine_and_cosine(angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Of an angle in [-π/4, π/4], or one that says nothing: of numbers so large that they are a turn apart."""
+    """Return sin and cos of an angle in [-π/4, π/4].
+
+    Other angles only come from numbers so large that neighbouring ones are a turn apart; their result has no meaning.
+    """
     if not torch.compiler.is_compiling():
         return torch.sin(angle), torch.cos(angle)
     angle = angle.clamp(-0.8, 0.8)
-    # Taylor's series, to 1e-17 and 2e-9: what the compiler calls instead reduces the angle once more
+    # Taylor's series, to 1e-17 and 2e-9: the functions that the compiler calls reduce the angle once more
     square = angle * angle
     count = 8 if angle.dtype == torch.float64 else 4
     sine, cosine = torch.zeros_like(square), torch.zeros_like(square)

@@ -1,4 +1,4 @@
-"""The Bessel functions I0 and I1 as the von Mises density needs them, by the polynomials of coefficients.py."""
+"""The Bessel functions I0 and I1 in the forms of the von Mises density, by the polynomials of coefficients.py."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -17,11 +17,12 @@ _TABLES = {
 
 
 def log_height(concentration: Tensor) -> Tensor:
+    """Return the log-density at the mean, κ - log(2π I0(κ)), nats, without gradient of its own."""
     return torch.log(concentration + 2) / 2 - polynomial("log_peak", 2 / (concentration + 2))
 
 
 def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """log_peak and its derivative 1 - A = v (1/4 + v G'(v)/2), G the polynomial, in one pass."""
+    """Return log_peak and its derivative 1 - A = v (1/4 + v G'(v)/2), G the polynomial, in one pass."""
     v = 2 / (concentration + 2)
     rows, piece, y, by_v = _place("log_peak", v)
     total = _coefficient(rows[-1], piece, y)
@@ -33,11 +34,12 @@ def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def deviation_of(concentration: Tensor) -> Tensor:
+    """Return 1 - A(κ)."""
     return height_and_deviation(concentration)[1]
 
 
 def polynomial(name: str, v: Tensor) -> Tensor:
-    """One of the smooth functions of v = 2/(κ+2) in fit_coefficients.py."""
+    """Return one of the smooth functions of v = 2/(κ+2) in fit_coefficients.py."""
     rows, piece, y, _ = _place(name, v)
     total = _coefficient(rows[-1], piece, y)
     for row in range(len(rows) - 2, -1, -1):
@@ -46,9 +48,9 @@ def polynomial(name: str, v: Tensor) -> Tensor:
 
 
 def _place(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
-    """A function's rows of coefficients, v's piece of [0, 1], its place y ∈ [-1, 1] there, and dy/dv.
+    """Return a function's rows of coefficients, v's piece of [0, 1], its position y ∈ [-1, 1] there, and dy/dv.
 
-    Compiled, float32 has few pieces, among whose coefficients comparisons choose; otherwise there is a table.
+    Compiled float32 has few pieces, and comparisons choose among their coefficients; otherwise a table is read.
     """
     if v.dtype == torch.float32 and torch.compiler.is_compiling():
         borders, rows = CHAINS[name]
@@ -60,13 +62,13 @@ def _place(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
     rows = _TABLES[v.dtype, name].to(v.device)
     pieces = rows.shape[1]
     place = v * pieces
-    # nan has no piece: it takes one, and stays nan in y
+    # NaN has no piece: it gets any piece, and stays NaN in y
     piece = place.detach().to(torch.int32).clamp_(0, pieces - 1)
     return rows, piece, 2 * (place - piece) - 1, 2 * pieces
 
 
 def _chosen(values: Sequence[float], beyond: tuple[Tensor, ...], like: Tensor) -> Tensor:
-    """The value of the last border that is passed."""
+    """Return the value of the last border that is passed."""
     found = torch.full_like(like, values[0])
     for passed, value in zip(beyond, values[1:], strict=True):
         found = torch.where(passed, value, found)
@@ -78,12 +80,12 @@ def _coefficient(row: Any, piece: Any, like: Tensor) -> Tensor:
         return _chosen(row, piece, like)
     if torch.compiler.is_compiling():
         return row[piece]
-    # the same in a quarter of the time where nothing is compiled
+    # the same result in a quarter of the time without a compiler
     return row.index_select(0, piece.reshape(-1)).view(piece.shape)
 
 
 def _fused(coefficient: Tensor, total: Tensor, y: Tensor) -> Tensor:
-    """coefficient + total y, in the coefficient's own place where nobody else reads it."""
+    """Return coefficient + total y, in the coefficient's own memory if nothing else reads it."""
     if torch.compiler.is_compiling() or (torch.is_grad_enabled() and total.requires_grad | y.requires_grad):
         return torch.addcmul(coefficient, total, y)
     return coefficient.addcmul_(total, y)

@@ -1,4 +1,4 @@
-"""Passes over many elements, in blocks that fit a processor's cache."""
+"""Passes over many elements in blocks that fit a processor's cache."""
 
 from collections.abc import Callable
 
@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 BLOCK = 2**16
-"""Elements of a pass on a processor without a compiler: its intermediate results stay in the cache."""
+"""Number of elements of a pass on a processor without a compiler: its intermediate results stay in the cache."""
 
 
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
-    """The function, element by element, of arguments of one shape in blocks; of others, and compiled, at once."""
+    """Return the elementwise function, in blocks for arguments of one shape; otherwise, and compiled, at once."""
     first = arguments[0]
     if (
         torch.compiler.is_compiling()

@@ -24,11 +24,14 @@ from framework.distributions.protocol import (
 from plugins.density_head.von_mises import functions, integrals
 
 LARGEST = {torch.float32: torch.finfo(torch.float32).max, torch.float64: 1e300}
-"""κ beyond, a point mass in all but its height, is read as this: what is computed from it stays a number."""
+"""Largest κ of each dtype; a larger κ is replaced by it, so that all results stay finite numbers.
+
+At this κ the density is a point mass in all but its height.
+"""
 
 
 class VonMises(Distribution):
-    """Angles, each von Mises, independent of one another given their parameters (thesis eq. 3.3).
+    """Angles with independent von Mises densities given their parameters (thesis eq. 3.3).
 
     Args:
         mean: (*batch, angle), radians, read modulo 2π.
@@ -61,7 +64,7 @@ class VonMises(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """The mean direction."""
+        """Mean direction of each angle, (*batch, angle), radians."""
         return self.location
 
     @property
@@ -108,7 +111,7 @@ def _(density: VonMises, index: tuple[Tensor, ...], place: Tensor) -> VonMises:
 
 @median.register
 def _(density: VonMises, samples: int) -> Tensor:
-    # symmetric about its mean and falling on both sides of it
+    # the density is symmetric around its mean and falls on both sides of it
     return density.location
 
 

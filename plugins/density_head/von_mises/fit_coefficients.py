@@ -1,9 +1,9 @@
-"""Writes coefficients.py: run by hand, `python -m plugins.density_head.von_mises.fit_coefficients`; needs mpmath.
+"""Generator of coefficients.py, run with `python -m plugins.density_head.von_mises.fit_coefficients`; needs mpmath.
 
-Every function below is smooth on κ ∈ [0, ∞] as a function of v = 2/(κ+2) ∈ [0, 1]. That interval is cut into
-equal pieces, as many as a power of two, so that v's piece and its place y ∈ [-1, 1] there are found without rounding.
-On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial in y; the
-tolerance holds for the polynomial's first derivative in v too, from which 1 - A(κ) is computed.
+Every function below is smooth on κ ∈ [0, ∞] as a function of v = 2/(κ+2) ∈ [0, 1]. That interval is divided into equal
+pieces, whose number is a power of two, so that v's piece and its position y ∈ [-1, 1] there are found without rounding.
+On each piece the function is interpolated at Chebyshev nodes in 60 digits and written as a polynomial in y. The
+tolerance also holds for the polynomial's first derivative in v, from which 1 - A(κ) is computed.
 """
 
 from functools import cache
@@ -19,14 +19,17 @@ NAMES = ("log_peak", "ratio", "ratio_slope")
 PIECES = {"float32": 32, "float64": 64}
 BORDERS = ("0", "0.125", "0.3125", "0.625", "1")
 CHAIN_TOLERANCE = mpmath.mpf("4e-8")
-"""Of the few pieces of compiled float32; near 0 they are shorter, since the singularities of log I0 gather there."""
+"""Tolerance of the few pieces of compiled float32.
+
+Pieces are shorter near 0, since the singularities of log I0 accumulate there.
+"""
 TOLERANCE = {"float32": mpmath.mpf("1e-8"), "float64": mpmath.mpf("2e-17")}
 NODES = 24
 QUADRATURES = (14, 40)
 
 
 def bessel(kappa: Real) -> tuple[Real, Real]:
-    """log(I0(κ) exp(-κ)) and 1 - I1(κ)/I0(κ); by asymptotic series (DLMF 10.40.1) where it has 60 digits."""
+    """Return log(I0(κ) exp(-κ)) and 1 - I1(κ)/I0(κ), by asymptotic series (DLMF 10.40.1) where it has 60 digits."""
     if kappa < 400:
         zero, one = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
         return mpmath.log(zero) - kappa, 1 - one / zero
@@ -35,7 +38,7 @@ def bessel(kappa: Real) -> tuple[Real, Real]:
 
 
 def _hankel_series(order: int, kappa: Real) -> Real:
-    """√(2πκ) exp(-κ) I_order(κ)."""
+    """Return √(2πκ) exp(-κ) I_order(κ)."""
     total = term = mpmath.mpf(1)
     for j in range(1, 400):
         term *= -mpmath.mpf(4 * order**2 - (2 * j - 1) ** 2) / (8 * j * kappa)
@@ -47,9 +50,9 @@ def _hankel_series(order: int, kappa: Real) -> Real:
 
 @cache
 def smooth(v: Real) -> tuple[Real, ...]:
-    """The three functions at v, in the order of NAMES, with A = I1/I0:
+    """Return the three functions at v, in the order of NAMES, with A = I1/I0.
 
-    log(2π I0(κ) exp(-κ)) + log(κ+2)/2;  A (κ+2)/κ;  A' (κ+2)²/2 with A' = 1 - A² - A/κ.
+    They are log(2π I0(κ) exp(-κ)) + log(κ+2)/2;  A (κ+2)/κ;  A' (κ+2)²/2 with A' = 1 - A² - A/κ.
     """
     if v == 0:
         return mpmath.log(2 * mpmath.pi) / 2, mpmath.mpf(1), mpmath.mpf(1) / 4
@@ -67,7 +70,7 @@ def smooth(v: Real) -> tuple[Real, ...]:
 
 
 def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
-    """Of one function on [low, high] of v, by interpolation at NODES Chebyshev nodes."""
+    """Return the series of one function on [low, high] of v, by interpolation at NODES Chebyshev nodes."""
     angles = [mpmath.pi * (2 * i + 1) / (2 * NODES) for i in range(NODES)]
     values = [smooth((low + high) / 2 + (high - low) / 2 * mpmath.cos(angle))[which] for angle in angles]
     return [
@@ -79,9 +82,9 @@ def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
 
 
 def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
-    """The least at which the rest is within the tolerance and its derivative in v within four times as much.
+    """Return the least degree with a remainder within the tolerance and its derivative in v within four times as much.
 
-    1 - A takes at most half of the derivative and is at least a quarter where it takes any.
+    1 - A takes at most half of the derivative, and is at least a quarter where it takes any.
     """
     return next(
         d
@@ -92,7 +95,7 @@ def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
 
 
 def powers(series: list[Real]) -> list[Real]:
-    """Coefficients of 1, y, y², … of a Chebyshev series in y."""
+    """Return the coefficients of 1, y, y², … of a Chebyshev series in y."""
     found = [mpmath.mpf(0)] * len(series)
     before, current = [mpmath.mpf(1)], [mpmath.mpf(0), mpmath.mpf(1)]
     for j, weight in enumerate(series):
@@ -107,7 +110,7 @@ def powers(series: list[Real]) -> list[Real]:
 
 
 def table(dtype: str, which: int) -> list[tuple[float, ...]]:
-    """Row j: the coefficient of y^j on each piece, v ascending; all pieces have the degree of the hardest."""
+    """Return rows of coefficients of y^j on each piece, v ascending; all pieces have the largest degree needed."""
     count = PIECES[dtype]
     edges = [mpmath.mpf(i) / count for i in range(count + 1)]
     series = [chebyshev_series(low, high, which) for low, high in pairwise(edges)]
@@ -117,7 +120,7 @@ def table(dtype: str, which: int) -> list[tuple[float, ...]]:
 
 
 def chain(which: int) -> list[tuple[float, ...]]:
-    """Row j: the coefficient of y^j on each piece between BORDERS, for float32; all have the degree of the hardest."""
+    """Return rows of coefficients of y^j on each piece between BORDERS, for float32, of the largest degree needed."""
     spans = list(pairwise(mpmath.mpf(border) for border in BORDERS))
     series = [chebyshev_series(low, high, which) for low, high in spans]
     highest = max(
@@ -128,7 +131,10 @@ def chain(which: int) -> list[tuple[float, ...]]:
 
 
 def gauss_legendre(count: int) -> list[tuple[float, float]]:
-    """(place, weight) on [0, 1], by Newton's method in 60 digits: in float64 the outer weights lose two of theirs."""
+    """Return (position, weight) on [0, 1], by Newton's method in 60 digits.
+
+    In float64 the outer weights would lose two digits.
+    """
     found = []
     for i in range(count):
         x = mpmath.cos(mpmath.pi * (i + mpmath.mpf("0.75")) / (count + mpmath.mpf("0.5")))
@@ -144,6 +150,7 @@ def gauss_legendre(count: int) -> list[tuple[float, float]]:
 
 
 def main() -> None:
+    """Write coefficients.py."""
     lines = [
         '"""Written by fit_coefficients.py; do not edit.',
         "",

@@ -1,12 +1,12 @@
 """The von Mises density p(φ) = exp(κ cos(φ-μ)) / (2π I0(κ)) (thesis eq. 3.3), accurate from κ = 0 to 1e30.
 
-Nothing here subtracts two large numbers that nearly agree: the density is written as its height at the mean
-times exp(-2κ sin²((φ-μ)/2)), and the Bessel functions come from polynomials (coefficients.py) of what stays
-smooth from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0 is finite.
+No function subtracts two large numbers that nearly agree. The density is written as its height at the mean times
+exp(-2κ sin²((φ-μ)/2)). The Bessel functions are computed by polynomials (coefficients.py) of functions that are smooth
+from κ = 0 to infinity. Arguments broadcast, are float32 or float64, and κ ≥ 0 is finite.
 
-The density's value and slopes come from one pass, also under torch.compile; without a compiler the pass runs in
-blocks that fit a processor's cache. The difference of the angles is in angles.py, the Bessel functions in bessel.py,
-integrals of the density in integrals.py.
+The density's value and derivatives come from one pass, also under torch.compile; without a compiler the pass runs in
+blocks that fit a processor's cache. The difference of the angles is in angles.py, the Bessel functions are in
+bessel.py, and integrals of the density are in integrals.py.
 """
 
 import math
@@ -21,11 +21,11 @@ from plugins.density_head.von_mises.bessel import deviation_of, height_and_devia
 from plugins.density_head.von_mises.blocks import BLOCK, in_blocks
 
 SAMPLING_ROUNDS = 64
-"""At least 65.7 % of proposals are accepted: after 64 rounds fewer than one lane in 10^29 is left."""
+"""Largest number of proposals: at least 65.7 % are accepted, so that fewer than one lane in 10^29 is left after 64."""
 
 
 def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-    """Log-density, nats, with accurate gradients in all three arguments, also the second ones.
+    """Return the log-density, nats, with accurate first and second derivatives in all three arguments.
 
     The difference φ-μ is never rounded: float32 angles of any size are read modulo 2π exactly (compiled: up to 4e8
     radians), float64 ones up to 4e8 radians, and beyond that to one unit of their rounding.
@@ -38,52 +38,52 @@ def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
 
 def log_prob_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """log p, its derivative in the mean, κ sin(φ-μ), and in κ, 1 - A(κ) - 2 sin²((φ-μ)/2), in one pass.
+    """Return log p, its derivative in the mean, κ sin(φ-μ), and in κ, 1 - A(κ) - 2 sin²((φ-μ)/2), in one pass.
 
-    For arguments of one number type, without gradient of its own: what `log_prob` computes under gradient. Compiled,
-    it is one loop, while a compiler splits the gradient of `log_prob` in two that compute much of the same.
+    Arguments have one dtype, and the result has no gradient: it is what `log_prob` computes under gradient. Compiled,
+    it is one loop, while a compiler splits the gradient of `log_prob` into two that repeat much of the computation.
     """
     return _value_and_slopes(value, mean, concentration)
 
 
 def log_peak(concentration: Tensor) -> Tensor:
-    """Log-density at the mean, κ - log(2π I0(κ)), nats."""
+    """Return the log-density at the mean, κ - log(2π I0(κ)), nats."""
     return _LogPeak.apply(concentration)
 
 
 def mean_resultant(concentration: Tensor) -> Tensor:
-    """A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision at both ends."""
+    """Return A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision at both ends."""
     return _Ratio.apply(concentration)
 
 
 def mean_deviation(concentration: Tensor) -> Tensor:
-    """1 - A(κ) = E 2 sin²((φ-μ)/2), to full relative precision at both ends."""
+    """Return 1 - A(κ) = E 2 sin²((φ-μ)/2), to full relative precision at both ends."""
     return _OneMinusRatio.apply(concentration)
 
 
 def entropy(concentration: Tensor) -> Tensor:
-    """κ(1 - A(κ)) - log_peak(κ), nats; its derivative is -κ A'(κ)."""
+    """Return the entropy κ(1 - A(κ)) - log_peak(κ), nats; its derivative is -κ A'(κ)."""
     return _Entropy.apply(concentration)
 
 
 def mean_resultant_slope(concentration: Tensor) -> Tensor:
-    """A'(κ) = 1 - A² - A/κ (Mardia & Jupp 2000, A.14), the Fisher information of κ."""
+    """Return A'(κ) = 1 - A² - A/κ (Mardia & Jupp 2000, A.14), the Fisher information of κ."""
     part = 2 / (concentration + 2)
     return polynomial("ratio_slope", part) * part * part / 2
 
 
 @torch.no_grad()
 def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
-    """κ with A(κ) = resultant: the maximum-likelihood κ of angles about a known mean (eq. 3.5), float64.
+    """Return κ with A(κ) = resultant: the maximum-likelihood κ of angles around a known mean (eq. 3.5), float64.
 
     Args:
-        resultant: R, the mean of cos(φ-μ); below 0 it is answered with κ = 0.
-        deviation: V = 1 - R, the mean of 2 sin²((φ-μ)/2), given beside it because R carries no digits of a
-            large κ and V none of a small one. 0 is answered with infinity.
+        resultant: R, the mean of cos(φ-μ); below 0 the result is κ = 0.
+        deviation: V = 1 - R, the mean of 2 sin²((φ-μ)/2). It is given too, because R has no digits of a large κ and V
+            has none of a small one. For 0 the result is infinity.
     """
     resultant, deviation = resultant.double().clamp(min=0), deviation.double()
     spread_out = resultant < 0.5
-    # starts within 10 %: the series of the inverse at R = 0 and V = 0 (Mardia & Jupp 2000, 5.3.9-10)
+    # starting values within 10 %: the series of the inverse at R = 0 and V = 0 (Mardia & Jupp 2000, 5.3.9-10)
     small = resultant * (2 + resultant**2 + 5 / 6 * resultant**4)
     concentration = torch.where(spread_out, small, 0.5 / deviation + 0.25)
     tiny = torch.finfo(torch.float64).tiny
@@ -93,7 +93,7 @@ def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
         error = torch.log1p((have - wanted) / wanted.clamp(min=tiny))
         slope = concentration * mean_resultant_slope(concentration) / have
         step = error / torch.where(spread_out, slope, -slope)
-        # the two ends have no logarithm: they are right already
+        # κ = 0 and infinity have no finite logarithm; they are exact already
         step = torch.where((concentration > 0) & concentration.isfinite(), step, 0)
         concentration = concentration * torch.exp(-step)
     return concentration
@@ -101,11 +101,11 @@ def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
 
 @torch.no_grad()
 def sample(mean: Tensor, concentration: Tensor) -> Tensor:
-    """One angle in [-π, π] per element, by rejection (Best & Fisher 1979), float64 inside.
+    """Return one angle in [-π, π] per element, by rejection (Best & Fisher 1979), computed in float64.
 
-    Best and Fisher propose from a wrapped Cauchy of the same peak; with t = tan(θ/2) its proposal is
-    t = (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ.
-    Lanes that have not accepted after SAMPLING_ROUNDS keep their last proposal: no input can hang the loop.
+    Best and Fisher propose from a wrapped Cauchy density of the same peak. With t = tan(θ/2) its proposal is t =
+    (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ. Lanes that have
+    not accepted after SAMPLING_ROUNDS keep their last proposal, so that no input makes the loop endless.
     """
     mean, concentration = torch.broadcast_tensors(mean, concentration)
     kappa = concentration.double().flatten()
@@ -113,12 +113,12 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     half_tangent = torch.cat([_half_tangent(part) for part in kappa.split(block)])
     angle = mean.double() + 2 * torch.atan(half_tangent).reshape(mean.shape)
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
-    # angles that need no wrapping keep their last digits
+    # angles that need no wrapping stay exact
     return torch.where(angle.abs() <= math.pi, angle, wrapped).to(mean.dtype)
 
 
 def _half_tangent(kappa: Tensor) -> Tensor:
-    """tan(θ/2) of one accepted proposal per lane."""
+    """Return tan(θ/2) of one accepted proposal per lane."""
     root = torch.hypot(torch.ones_like(kappa), 2 * kappa)
     tau = 1 + root
     span = tau + torch.sqrt(2 * tau)  # 2κ/ρ
@@ -136,7 +136,7 @@ def _half_tangent(kappa: Tensor) -> Tensor:
 
 
 def _propose(kappa: Tensor, scale: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
-    """tan(θ/2) of one wrapped Cauchy proposal per lane, and whether it is rejected."""
+    """Return tan(θ/2) of one wrapped Cauchy proposal per lane, and whether it is rejected."""
     uniform, accept = torch.rand(2, kappa.numel(), dtype=kappa.dtype, device=kappa.device)
     tangent = scale * torch.tan(math.pi * (uniform - 0.5))
     square = tangent * tangent
@@ -161,20 +161,20 @@ def _value_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tup
 
 
 def slope(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """log p, -κ sin(φ-μ) and κ cos(φ-μ), without gradient."""
+    """Return log p, -κ sin(φ-μ) and κ cos(φ-μ), without gradient."""
     square, product = half_products(value, mean)
     log_prob = log_height(concentration) - concentration * (2 * square)
     return log_prob, -2 * concentration * product, concentration * (1 - 2 * square)
 
 
 def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-    """-2κ sin²((φ-μ)/2), which is κ(cos(φ-μ) - 1)."""
+    """Return -2κ sin²((φ-μ)/2), which is κ(cos(φ-μ) - 1)."""
     sine, _ = half_angle(value, mean)
     return -2 * (concentration * sine) * sine
 
 
 class _LogProb(Function):
-    """Value and slopes come from one pass in `forward`; `backward` multiplies."""
+    """The log-density: `forward` computes value and derivatives in one pass, and `backward` multiplies."""
 
     @staticmethod
     def forward(
@@ -189,7 +189,7 @@ class _LogProb(Function):
     def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         value, mean, concentration, by_mean, by_concentration = ctx.saved_tensors
         if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            # a second derivative is wanted: the same in operations that have one
+            # a second derivative is wanted: the same derivatives by differentiable operations
             sine, cosine = half_angle(value, mean)
             by_mean = 2 * concentration * sine * cosine
             by_concentration = mean_deviation(concentration) - 2 * sine * sine
@@ -203,7 +203,7 @@ class _LogProb(Function):
 
 
 class _LogPeak(Function):
-    """Its derivative is 1 - A(κ)."""
+    """The log-density at the mean; its derivative is 1 - A(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
@@ -217,7 +217,7 @@ class _LogPeak(Function):
 
 
 class _OneMinusRatio(Function):
-    """Its derivative is -A'(κ)."""
+    """The function 1 - A(κ); its derivative is -A'(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
@@ -231,7 +231,7 @@ class _OneMinusRatio(Function):
 
 
 class _Ratio(Function):
-    """A(κ); its derivative is A'(κ)."""
+    """The function A(κ); its derivative is A'(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
@@ -250,7 +250,7 @@ class _Entropy(Function):
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
         ctx.save_for_backward(concentration)
         height, deviation = height_and_deviation(concentration)
-        # 0 · inf where κ is infinite: κ(1 - A) is 1/2 there
+        # 0 · inf at infinite κ, where κ(1 - A) is 1/2
         return torch.where(concentration.isinf(), 0.5, concentration * deviation) - height
 
     @staticmethod

@@ -17,27 +17,30 @@ from plugins.density_head.von_mises.angles import half_angle
 from plugins.density_head.von_mises.density import VonMises
 
 LARGEST_CONCENTRATION = 1e12
-"""A standard deviation of a microradian; float32 angles resolve no more."""
+"""Largest κ: a standard deviation of a microradian, the resolution of float32 angles."""
 LEAST_SCALE = 0.25
-"""Of the pair, so that κ falls to 0 with the pair alone: were the scale to fall too, so would the pair's gradient, and
-an angle given up early would not be found again."""
+"""Smallest scale of the pair, so that κ falls to 0 with the pair alone.
+
+If the scale could fall to 0 too, so would the pair's gradient, and an angle that was given up early would not be
+learned again.
+"""
 
 
 class VonMisesHead(DensityHead):
     """One von Mises density per angle: biternion mean, predicted or one global concentration (thesis §3.4).
 
-    With `concentration="predicted"` it reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with
-    κ = |(cos, sin)| g(r): up to the scale g(r), which stays above a quarter, the pair is the density's natural
-    parameter, so that the uniform density is a point like any other. Were the pair normalised, as in eq. 3.1, and
-    κ = g(r), the gradients in both would vanish with κ, and a network that begins by finding an angle unpredictable
-    stays there (README).
+    With `concentration="predicted"` the head reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with κ =
+    |(cos, sin)| g(r). Up to the scale g(r), which stays above a quarter, the pair is the density's natural parameter,
+    so that the uniform density is an ordinary point. If the pair were normalised, as in eq. 3.1, and κ = g(r), the
+    gradients in both would vanish with κ, and a network that first finds an angle unpredictable would stay there
+    (README).
 
     With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to
-    constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on validation (eq. 3.5).
+    constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on the validation split (eq. 3.5).
 
     Args:
-        concentration: where κ comes from.
-        floor: the least κ.
+        concentration: source of κ.
+        floor: smallest κ.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -100,22 +103,22 @@ class VonMisesHead(DensityHead):
 def polar(
     cosine: Float[Tensor, "*shape"], sine: Float[Tensor, "*shape"]
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """Angle, radians, and length of a pair (eq. 3.1), with finite gradients at any pair, also at zero."""
+    """Return angle, radians, and length of a pair (eq. 3.1), with finite gradients at any pair, also at zero."""
     shortest = 1e-18
-    # pushed off zero, where the angle has no gradient; the gradient of length × cos(φ - angle) stays right there
+    # moved away from zero, where the angle has no gradient; that of length × cos(φ - angle) stays correct there
     cosine = torch.where((cosine.abs() < shortest) & (sine.abs() < shortest), cosine + 2 * shortest, cosine)
-    # the larger of the two is divided away so that no square over- or underflows
+    # both are divided by the larger one, so that no square over- or underflows
     size = torch.maximum(cosine.detach().abs(), sine.detach().abs())
     cosine, sine = cosine / size, sine / size
     return torch.atan2(sine, cosine), size * (cosine.square() + sine.square()).sqrt()
 
 
 def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """g(r) = c + (1 - c) exp(r / (1 - c)) for r ≤ 0 and (1 + r/4)⁴ above: from c to LARGEST_CONCENTRATION, 1 and
-    smooth at 0, c = LEAST_SCALE.
+    """Return g(r), from c = LEAST_SCALE to LARGEST_CONCENTRATION, 1 and smooth at 0.
 
-    The Fisher information of log κ is nearly constant (1/2 for large κ), so a logarithmic map trains best;
-    the power keeps that shape over the κ that occur, but lets neither κ nor an outlier's gradient explode.
+    g(r) = c + (1 - c) exp(r / (1 - c)) for r ≤ 0, and (1 + r/4)⁴ above. The Fisher information of log κ is nearly
+    constant (1/2 for large κ), so that a logarithmic map trains best. The power keeps that shape over the κ that occur,
+    but prevents κ and an outlier's gradient from exploding.
     """
     most = 4 * (LARGEST_CONCENTRATION**0.25 - 1)
     high = (1 + raw.clamp(0, most) / 4).square().square()

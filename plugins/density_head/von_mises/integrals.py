@@ -1,4 +1,4 @@
-"""Integrals of the von Mises density: divergence, distribution function, arcs that hold a mass.
+"""Integrals of the von Mises density: divergence, distribution function, arcs that hold a given probability.
 
 All are sums of positive terms by Gauss-Legendre quadrature, so that small results keep their digits too.
 """
@@ -18,31 +18,34 @@ from plugins.density_head.von_mises.coefficients import NODES
 from plugins.density_head.von_mises.functions import fall, mean_resultant, mean_resultant_slope
 
 ROUNDS = 64
-"""Of the inversion in `half_width`: bisection alone narrows [0, π] to its last digit in 53."""
+"""Largest number of rounds of the inversion in `half_width`: bisection alone narrows [0, π] to its last digit in 53."""
 
 CUT = 40.0
-"""Integrals of the density end where it has fallen by exp(-40) from where they begin: a quarter of float64's
-last digit, even in the tail."""
+"""Negative logarithm of the fall of the density at which integrals end.
+
+The factor exp(-40) is a quarter of float64's last digit, even in the tail.
+"""
 
 
 def kl_divergence(
     first_mean: Tensor, first_concentration: Tensor, second_mean: Tensor, second_concentration: Tensor
 ) -> Tensor:
-    """Kullback-Leibler divergence of the second density from the first, ∫ p₁ log(p₁/p₂), nats.
+    """Return the Kullback-Leibler divergence of the second density from the first, ∫ p₁ log(p₁/p₂), nats.
 
     A(κ₁) κ₂ (1 - cos(μ₁-μ₂)) + ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx, both without a negative part: log I0 has the derivative A,
-    so that the integral is log I0(κ₂) - log I0(κ₁) - A(κ₁)(κ₂-κ₁). It is 0 where the densities are equal and keeps
-    its digits where they nearly are. Differentiable like `log_prob`.
+    so that the integral is log I0(κ₂) - log I0(κ₁) - A(κ₁)(κ₂-κ₁). It is 0 for equal densities and keeps its digits for
+    nearly equal ones. It is differentiable like `log_prob`.
     """
     turned = -fall(first_mean, second_mean, mean_resultant(first_concentration) * second_concentration)
     return turned + _Bregman.apply(*torch.broadcast_tensors(first_concentration, second_concentration))
 
 
 def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-    """Mass of the arc from mean - π to value, in [0, 1] on that turn; each further turn adds 1, as in SciPy.
+    """Return the probability of the arc from mean - π to value, in [0, 1] on that turn; each further turn adds 1.
 
-    By quadrature in float64: absolute error below 1e-15, relative error of the lower tail below 4e-15 times the
-    greater of 1 and its logarithm. Differentiable, once, in all three arguments.
+    The convention is SciPy's. Quadrature in float64 has an absolute error below 1e-15; the relative error of the lower
+    tail is below 4e-15 times the greater of 1 and its logarithm. The result is differentiable, once, in all three
+    arguments.
     """
     dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
     wide = (argument.double() for argument in (value, mean, concentration))
@@ -51,10 +54,10 @@ def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
 @torch.no_grad()
 def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
-    """Half the width, radians in [0, π], of the shortest arc that holds the mass: it is centred at the mean.
+    """Return half the width, radians in [0, π], of the shortest arc that holds the mass: its centre is the mean.
 
-    Newton's method on the mass within or, above one half, on the logarithm of the mass outside, in a bracket that
-    bisection narrows where a step leaves it: at most ROUNDS rounds. Without gradient.
+    Newton's method works on the mass within or, above one half, on the logarithm of the mass outside. Bisection narrows
+    a bracket if a step leaves it; there are at most ROUNDS rounds. The result has no gradient.
 
     Raises:
         ValueError: a mass outside [0, 1].
@@ -68,7 +71,7 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
     inside = mass <= 0.5
     target = torch.where(inside, mass, 1 - mass) / 2  # of one side
     low, high = torch.zeros_like(mass), torch.full_like(mass, math.pi)
-    # the normal density of z = 2√κ sin(θ/2), and the uniform one where that is wider than the circle
+    # starting value: the normal density of z = 2√κ sin(θ/2), or the uniform one if that is wider than the circle
     normal = torch.special.ndtri((1 + mass) / 2).clamp(max=38) / (2 * kappa.sqrt())
     width = torch.minimum(2 * torch.asin(normal.clamp(max=1)), math.pi * (1 + 3 * kappa) * mass).nan_to_num()
     done = (mass == 0) | (mass == 1)
@@ -83,10 +86,10 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
         low, high = torch.where(too_wide, low, width), torch.where(too_wide, width, high)
         straight = (target - found) / torch.where(inside, slope, -slope)
         following = width + torch.where(inside, straight, found * torch.log(found / target) / slope)
-        # near π the mass outside falls like a line, not like an exponential
+        # near π the mass outside falls linearly, not exponentially
         following = torch.where((following > low) & (following < high), following, width + straight)
         following = torch.where((following > low) & (following < high), following, (low + high) / 2)
-        # so near the step leaves an error of its square
+        # this close, the error after a step is the square of the step
         near = 1e-10 * torch.minimum(width, math.pi - width) + 4e-16 * width
         settled = (straight.abs() <= near) | (high - low <= 4e-16 * high)
         following = torch.where(settled, (width + straight).clamp(0, math.pi), following)
@@ -96,21 +99,22 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
 
 
 def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Both ends, radians, of the shortest arc that holds the mass; the first is not wrapped: it is the lesser."""
+    """Return both ends, radians, of the shortest arc that holds the mass; the first is smaller and not wrapped."""
     width = half_width(mass, concentration)
     return mean - width, mean + width
 
 
 def _one_side(sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
-    """Mass on one side of the mean and its derivative in κ: where `within` between the mean and t, else from t to π.
+    """Return the mass on one side of the mean and its derivative in κ.
 
-    t ∈ [0, π] is given by sin(t/2) and cos(t/2). With the density at the arc's start b taken out, what is integrated
-    over s is exp(-2κ sin(s/2) sin(b+s/2)): from 1 down to exp(-CUT) at most.
+    The mass is that between the mean and t if `within`, else that from t to π. t ∈ [0, π] is given by sin(t/2) and
+    cos(t/2). With the density at the arc's start b factored out, the integrand over s is exp(-2κ sin(s/2) sin(b+s/2)):
+    it falls from 1 to exp(-CUT) at most.
     """
     height, deviation = height_and_deviation(concentration)
     reach = CUT / (2 * concentration)
     start_sine, start_cosine = torch.where(within, 0, sine), torch.where(within, 1, cosine)
-    # where 2κ sin²(θ/2) has risen by CUT, sin((θ-b)/2) = reach / sin((θ+b)/2), which cancels nowhere
+    # where 2κ sin²(θ/2) has risen by CUT, sin((θ-b)/2) = reach / sin((θ+b)/2), without cancellation
     square = start_sine * start_sine + reach
     end_sine, end_cosine = square.sqrt(), (start_cosine * start_cosine - reach).clamp(min=0).sqrt()
     cut = 2 * torch.asin((reach / (end_sine * start_cosine + end_cosine * start_sine)).clamp(max=1))
@@ -133,7 +137,7 @@ def _one_side(sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tenso
 
 
 def _cdf_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The distribution function and its derivatives in value and in κ."""
+    """Return the distribution function and its derivatives in value and in κ."""
     sine, cosine = half_angle(value, mean)
     ahead = sine * cosine >= 0
     sine, cosine = sine.abs(), cosine.abs()
@@ -148,7 +152,7 @@ def _cdf_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple
 
 
 class _Cdf(Function):
-    """Of float64 arguments of one shape."""
+    """The distribution function of float64 arguments of one shape."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
@@ -164,7 +168,7 @@ class _Cdf(Function):
 
 
 def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """log((κ₂+2)/(κ₁+2)), and whether it is so small that integrals from κ₁ to κ₂ are done by quadrature."""
+    """Return log((κ₂+2)/(κ₁+2)), and whether it is so small that integrals from κ₁ to κ₂ need quadrature."""
     quotient = torch.log((second + 2) / (first + 2))
     near = quotient.abs() <= 1
     exact = torch.log1p(torch.where(near, (second - first) / (first + 2), 0))
@@ -172,7 +176,7 @@ def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Bregman(Function):
-    """∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx: how far log I0 lies at κ₂ above its tangent at κ₁."""
+    """The integral ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx: the height of log I0 at κ₂ above its tangent at κ₁."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
@@ -181,7 +185,7 @@ class _Bregman(Function):
         step = torch.where(near, log, 0)
         v = 2 / (first + 2)
         total = torch.zeros_like(step)
-        for place, weight in NODES[14]:  # of log(x+2)
+        for place, weight in NODES[14]:  # quadrature in log(x+2)
             part = polynomial("ratio_slope", v * torch.exp(-place * step))
             total += weight * part * torch.expm1((1 - place) * step)
         rise = log / 2 - polynomial("log_peak", 2 / (second + 2)) + polynomial("log_peak", v)
@@ -198,7 +202,7 @@ class _Bregman(Function):
 
 
 class _RatioRise(Function):
-    """A(κ₂) - A(κ₁)."""
+    """The difference A(κ₂) - A(κ₁)."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:

@@ -20,14 +20,17 @@ OFFSETS = (0.0, 1e-8, 1e-3, 1.0, 3.0, -math.pi, 2 * math.pi, 1e6)
 
 
 def exact(offset: float, concentration: float) -> Any:
-    """κ cos d - log(2π I0(κ)) (eq. 3.3) in 50 digits."""
+    """Return κ cos d - log(2π I0(κ)) (eq. 3.3) in 50 digits."""
     with mpmath.workdps(50):
         kappa = mpmath.mpf(concentration)
         return kappa * mpmath.cos(mpmath.mpf(offset)) - mpmath.log(2 * mpmath.pi * mpmath.besseli(0, kappa))
 
 
 def predicted(head: DensityHead) -> Iterator[Case]:
-    """Pairs (κ, 0) with r = 0: mean 0 and concentration κ without rounding; the angles take turns in the offsets."""
+    """Yield cases with pairs (κ, 0) and r = 0: mean 0 and concentration κ without rounding.
+
+    The angles use the offsets in turn.
+    """
     angles = head.size // 3
     for concentration in CONCENTRATIONS:
         kappa = torch.tensor(concentration, dtype=torch.float32).item()
@@ -41,7 +44,7 @@ def predicted(head: DensityHead) -> Iterator[Case]:
 
 
 def fixed(head: DensityHead) -> Iterator[Case]:
-    """Untrained κ = 1; the length of the pair says nothing."""
+    """Yield cases with the untrained κ = 1, on which the length of the pair has no influence."""
     for length in (1e-10, 1.0, 1e10):
         raw = torch.tensor([[length, 0.0]], dtype=torch.float32).double().repeat(len(OFFSETS), 1)
         value = torch.tensor(OFFSETS, dtype=torch.float32).double()[:, None]
