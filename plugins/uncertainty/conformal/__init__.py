@@ -1,1 +1,1 @@
-"""Sets that cover as promised."""
+"""Conformal prediction sets with a stated coverage."""

@@ -1,4 +1,4 @@
-"""The density of one number on a line or circle: nodes that find it however narrow, its levels and their ends."""
+"""The density of one number on a line or circle: nodes that resolve it at any width, its level sets and their ends."""
 
 import math
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from framework.distributions.protocol import peaks
 FOLD = 12
 """Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
 NEAREST, FARTHEST = 1e-11, 1e11
-"""Distances from a peak that nodes cover, in the target's unit; of angles up to half a turn."""
+"""Smallest and largest distance of nodes from a peak, in the target's unit; for angles the largest is half a turn."""
 TURN = 720
-"""Further nodes all around a circle, for broad humps that are no peak's."""
+"""Number of further nodes all around a circle, for broad humps that have no peak of their own."""
 PEAKS, CANDIDATES = 8, 64
-"""Peaks that get nodes of their own, and among how many they are chosen."""
+"""Number of peaks that get nodes of their own, and number of candidates among which they are chosen."""
 PARTED = 0.1
-"""Nats by which a valley lies below both humps at least."""
+"""Smallest depth, nats, of a valley between two separate humps."""
 BISECTIONS = 52
-"""Halvings of a cell: its ends are as exact as the number type."""
+"""Number of halvings of a cell; the ends are then as exact as the dtype."""
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Where the parts of one number's range above a level begin and end.
+    """Ends of the parts of one number's range in which the density is above a level.
 
     Attributes:
-        length: of all parts of an item together, (item,), float64.
+        length: total length of all parts of an item, (item,), float64.
         intervals: (low, high) of each item's parts, ascending.
     """
 
@@ -41,9 +41,9 @@ class Ends:
 
 
 class Line:
-    """The density of one number at nodes about its peaks, whose distances run over all orders of magnitude.
+    """The density of one number at nodes around its peaks, with distances of all orders of magnitude.
 
-    They resolve a standard deviation of 1e-9 as well as one of 1e9. Between two nodes log p is taken as linear.
+    The nodes resolve a standard deviation of 1e-9 as well as one of 1e9. Between two nodes log p is linear.
 
     Args:
         density: event_shape (1,), of any batch_shape, whose items are numbered in order.
@@ -67,22 +67,25 @@ class Line:
         self._log_whole = self._log_less(torch.full_like(self.heights[0], math.inf))
 
     def at(self, places: Float[Tensor, "place item"]) -> Float[Tensor, "place item"]:
-        """log p, nats, float64."""
+        """Return log p, nats, float64."""
         return self.density.log_prob(places.to(self.dtype).unsqueeze(-1)).double()
 
     def score_of(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
-        """-log of the mass of what is less dense than a log-density, nats, at least 0; falls as the level rises."""
+        """Return -log of the probability of values that are less dense than a log-density, nats, at least 0.
+
+        The score falls as the level rises.
+        """
         return (self._log_whole - self._log_less(level)).clamp(min=0)
 
     def level_of(self, score: Float[Tensor, ""]) -> Float[Tensor, "item"]:
-        """The log-density whose `score_of` is `score` to 1e-12, by regula falsi (Illinois)."""
+        """Return the log-density whose `score_of` is `score` to 1e-12, by regula falsi (Illinois)."""
         high, reach = self.heights.amax(0), score.clamp(min=0) + 1
-        if score < 0:  # no score is
+        if score < 0:  # no score is negative
             return torch.full_like(high, math.inf)
         over_high = self.score_of(high) - score
         low = high - reach
         over_low = self.score_of(low) - score
-        while bool((over_low < 0).any()):  # ends: below every node the score is infinite
+        while bool((over_low < 0).any()):  # terminates: below every node the score is infinite
             reach = 2 * reach
             low = torch.where(over_low < 0, high - reach, low)
             over_low = self.score_of(low) - score
@@ -97,7 +100,7 @@ class Line:
             if not ((over.abs() > 1e-12 * (1 + score)) & (high - low > 1e-14 * (1 + high.abs()))).any():
                 return middle
             above = over > 0
-            # an end that stays twice counts half, so that the other comes nearer
+            # the value at an end that stays twice is halved, so that the other end comes nearer
             over_high = torch.where(above & (last > 0), over_high / 2, over_high)
             over_low = torch.where(~above & (last < 0), over_low / 2, over_low)
             low, over_low = torch.where(above, middle, low), torch.where(above, over, over_low)
@@ -106,7 +109,7 @@ class Line:
         return high
 
     def ends(self, level: Float[Tensor, "item"]) -> Ends:
-        """Where log p ≥ level; NaN lengths and no intervals where log p is NaN."""
+        """Return the ends of the parts with log p ≥ level; NaN lengths and no intervals if log p is NaN."""
         inside = self.heights >= level
         start, stop = self.nodes, self.nodes.roll(-1, 0)
         following = inside.roll(-1, 0)
@@ -131,12 +134,12 @@ class Line:
     def _crossings(
         self, change: Bool[Tensor, "cell item"], start: Tensor, stop: Tensor, before: Tensor, level: Tensor
     ) -> list[tuple[list[float], list[bool]]]:
-        """Of each item where log p crosses the level, ascending, and whether it rises there."""
+        """Return the positions of each item where log p crosses the level, ascending, and whether it rises there."""
         most = int(change.sum(0).amax()) if change.numel() else 0
         # the changed cells of each item first, in order
         order = change.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
         low, high, leaves = (each.gather(0, order) for each in (start, stop, before))
-        for _ in range(BISECTIONS if most else 0):  # torch's Independent refuses to be asked nothing
+        for _ in range(BISECTIONS if most else 0):  # torch's Independent refuses an empty tensor
             middle = (low + high) / 2
             same = (self.at(middle) >= level) == leaves
             low, high = torch.where(same, middle, low), torch.where(same, high, middle)
@@ -147,7 +150,7 @@ class Line:
     def _joined(
         self, places: list[float], rising: list[bool], first: bool, last: bool
     ) -> list[tuple[float, float]]:
-        """Crossings as intervals."""
+        """Return the crossings as intervals."""
         if not places:
             return [self.range] if first else []
         lows = [place for place, up in zip(places, rising, strict=True) if up]
@@ -182,11 +185,11 @@ class Line:
             around = torch.cat([around, ends])
             found = torch.cat([found, around.unsqueeze(-1).expand(-1, self.items)])
             found = wrap(found) if self.closed else found.clamp(low, high)
-        # as the density will read them; a closed circle has no second end
+        # rounded to the dtype in which the density reads them; a closed circle has no second end
         return found.to(self.dtype).double().sort(0).values
 
     def _peaks(self) -> Float[Tensor, "peak item"]:
-        """The highest humps, at most PEAKS; a candidate without a valley on the way to a chosen one is its hump's."""
+        """Return the highest humps, at most PEAKS; a candidate belongs to a chosen hump if no valley separates them."""
         places = self._candidates()  # (candidate, item), ascending; the last ones may repeat
         heights = self.at(places).nan_to_num(nan=-math.inf)
         tops = self._tops(places, heights)
@@ -207,7 +210,7 @@ class Line:
         return torch.cat(chosen)
 
     def _candidates(self) -> Float[Tensor, "candidate item"]:
-        """Of the density's `peaks` one in each quarter of their scale: hundreds may lie on one hump."""
+        """Return one of the density's `peaks` in each quarter of their scale, since hundreds may lie on one hump."""
         places = peaks(self.density).squeeze(-1).double()
         if self.closed:
             places = wrap(places)
@@ -216,7 +219,7 @@ class Line:
         new = first_in_cell(places, scale, 0.25)
         most = int(new.sum(0).amax())
         first = new.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
-        # an item that has fewer repeats its last
+        # an item that has fewer repeats its last candidate
         last = first.gather(0, new.sum(0, keepdim=True) - 1)
         first = torch.where(new.gather(0, first), first, last)
         return places.gather(0, first)
@@ -224,7 +227,7 @@ class Line:
     def _tops(
         self, places: Float[Tensor, "candidate item"], heights: Float[Tensor, "candidate item"]
     ) -> Bool[Tensor, "candidate item"]:
-        """Which ascending candidates are higher than both neighbours, or parted from a higher one by a valley."""
+        """Return which ascending candidates exceed both neighbours, or are separated by a valley from a higher one."""
         ahead = places.roll(-1, 0) - places
         ahead = wrap(ahead) if self.closed else ahead
         valley = self.at(places + ahead / 2)
@@ -237,7 +240,7 @@ class Line:
         return tops.scatter(0, heights.argmax(0, keepdim=True), True)
 
     def _cells(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The lower and the higher log p at each cell's ends, and the log of its width."""
+        """Return the lower and the higher log p at each cell's ends, and the log of its width."""
         ahead, heights = self.nodes.roll(-1, 0), self.heights.roll(-1, 0)
         width = ahead - self.nodes
         if self.closed:
@@ -250,8 +253,11 @@ class Line:
         return low, high, width.log()
 
     def _log_less(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
-        """Log of the mass below a level: of each cell ∫ exp(a + b x) dx over the part below it, which is its width
-        times (exp(c) - exp(low)) / (high - low) with c = min(level, high)."""
+        """Return the log of the probability below a level.
+
+        For each cell it is ∫ exp(a + b x) dx over the part below the level, which is the cell's width times
+        (exp(c) - exp(low)) / (high - low) with c = min(level, high).
+        """
         top = torch.minimum(level, self._high)
         rise, fall = top - self._low, self._high - self._low
         sloped = self._log_width + top + (-torch.expm1(-rise)).log() - fall.log()

@@ -1,4 +1,4 @@
-"""Densities that come with a set in which the target is said to lie: labels, arcs, intervals."""
+"""Densities with a prediction set for the target: labels, arcs, intervals."""
 
 import math
 from functools import cached_property
@@ -18,33 +18,37 @@ from plugins.uncertainty.conformal.highest_density import Ends, Line
 
 Score = Literal["density", "mass"]
 FEW = 8
-"""Values of each item for which their masses cost less than the level of one mass."""
+"""Number of values of each item up to which their scores cost less than the level of one score."""
 DRAWS = 1000
-"""Of each density over several numbers, whose sets have no ends to find."""
+"""Number of samples of each density over several numbers, whose sets have no ends to compute."""
 WIDENED = (1.0, 2.0, 4.0, 8.0)
-"""Times that a density of several reals is widened to cover its set: one that is too sure has draws in its midst."""
+"""Factors by which a density of several reals is widened to cover its set.
+
+An overconfident density has all its samples in the interior of the set.
+"""
 
 
 class PredictionSet(Mixture, ValueSet):
-    """A density, to the last bit, and the set of values whose score is at most a threshold.
+    """A density, unchanged to the last bit, and the set of values whose score is at most a threshold.
 
-    Scores grow as a value is less expected:
+    A score is larger for a less expected value:
 
     - "density": -log p(y), nats: the set is where the density is above one level, the same for every item
-      (of classes Sadinle, Lei & Wasserman 2019);
-    - "mass": -log of the mass of all that is less dense than y, nats: the set is each item's own smallest region of
-      one and the same mass (of classes Romano, Sesia & Candès 2020, of numbers a highest-density region). Of classes
-      p(y) itself counts with a share u(x) in (0, 1) that looks random and is a function of the density: without it
-      all wrong labels of two classes, and most right ones, would have equal scores.
+      (for classes Sadinle, Lei & Wasserman 2019);
+    - "mass": -log of the probability of all values that are less dense than y, nats: the set is each item's own
+      smallest region of one and the same probability (for classes Romano, Sesia & Candès 2020, for numbers a
+      highest-density region). For classes p(y) itself counts with a share u(x) in (0, 1), which looks random and is a
+      function of the density. Without it all wrong labels of two classes, and most correct ones, would have equal
+      scores.
 
-    Either is a function of the density and the value alone, which is all that split conformal prediction asks for: on
-    exchangeable data the set covers as promised whatever the density (Vovk, Gammerman & Shafer 2005, §4.1). Masses
-    over several numbers are shares of random draws, taken once.
+    Either is a function of the density and the value alone, which is all that split conformal prediction requires: on
+    exchangeable data the set has its stated coverage for any density (Vovk, Gammerman & Shafer 2005, §4.1).
+    Probabilities over several numbers are shares of random samples, drawn once.
 
     Args:
-        density: any.
-        threshold: the largest score in the set, a scalar; infinite for everything.
-        score: which.
+        density: any density.
+        threshold: the largest score in the set, a scalar; infinite for all values.
+        score: "density" or "mass".
         promised: as of `ValueSet`.
     """
 
@@ -61,7 +65,7 @@ class PredictionSet(Mixture, ValueSet):
         self.promised = promised
         self.threshold = threshold
         self.score: Score = score
-        # the number type of log_prob: of classes that of one label's, otherwise that of a sample of nothing
+        # The dtype of log_prob: for classes that of one label's, otherwise that of an empty sample.
         if density.has_enumerate_support:
             like = density.log_prob(density.enumerate_support()[0])
         else:
@@ -71,7 +75,7 @@ class PredictionSet(Mixture, ValueSet):
 
     @torch.no_grad()
     def scores(self, value: Tensor) -> Float[Tensor, "*shape"]:
-        """How unexpected each value (*sample, *batch, *event) is, nats, float64."""
+        """Return the score of each value (*sample, *batch, *event), nats, float64; larger is less expected."""
         log_prob = self.density.log_prob(value).double()
         if self.score == "density":
             return -log_prob
@@ -86,7 +90,7 @@ class PredictionSet(Mixture, ValueSet):
 
     @torch.no_grad()
     def contains(self, value: Tensor) -> Bool[Tensor, "*shape"]:
-        """Whether each value (*sample, *batch, *event) is in its item's set; of a density that is NaN nothing is."""
+        """Return whether each value (*sample, *batch, *event) is in its item's set; that of a NaN density is empty."""
         if self._everything:
             return ~self.density.log_prob(value).isnan()
         several = value.numel() > FEW * self.batch_shape.numel()
@@ -96,10 +100,11 @@ class PredictionSet(Mixture, ValueSet):
 
     @torch.no_grad()
     def size(self) -> Float[Tensor, "*batch"]:
-        """Of classes the number of labels; of one angle the length of the arcs, radians; of one real the length.
+        """Return the size of each set: number of labels, length of arcs, radians, length of intervals, or volume.
 
-        Of several numbers the volume: of a normal density that of the ellipsoid, otherwise an estimate with a
-        `size_error`. float64; infinite where the set is unbounded, NaN where the density is.
+        The volume is that of several numbers: exact for a normal density, whose set is an ellipsoid, otherwise an
+        estimate with a `size_error`. The result is float64; infinite if the set is unbounded, NaN if the density is
+        NaN.
         """
         if self._classes:
             return self.labels().sum(-1).double()
@@ -111,7 +116,7 @@ class PredictionSet(Mixture, ValueSet):
 
     @torch.no_grad()
     def size_error(self) -> Float[Tensor, "*batch"]:
-        """Standard error of `size`, float64: above 0 where it is estimated from draws."""
+        """Return the standard error of `size`, float64: above 0 if it is estimated from samples."""
         size = self.size()
         if self._classes or self._one or self._everything:
             return torch.zeros_like(size)
@@ -120,12 +125,12 @@ class PredictionSet(Mixture, ValueSet):
     @cached_property
     @torch.no_grad()
     def _volume(self) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Volume of a set of several numbers and its standard error."""
+        """Volume of a set of several numbers, and its standard error."""
         mode = self.density.mode
         if mahalanobis(self.density, mode) is not None:
             volume = self._ellipsoid(self.density.log_prob(mode).double())
             return volume, torch.zeros_like(volume)
-        # importance sampling from equal shares of the density widened about its mode, or of the uniform density of
+        # importance sampling from equal shares of the density widened around its mode, or of the uniform density of
         # angles: multiple proposals with the balance heuristic (Veach & Guibas 1995, eq. 9)
         draws, factors = self._draws, WIDENED
         if isinstance(self.support, Circular):
@@ -155,7 +160,7 @@ class PredictionSet(Mixture, ValueSet):
         return volume.masked_fill(broken, math.nan), variance.sqrt()
 
     def _ellipsoid(self, top: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Volume where a normal density, log p = `top` at its mode, is above the set's level, nats."""
+        """Return the volume in which a normal density, log p = `top` at its mode, is above the set's level, nats."""
         count = self.event_shape[0]
         level = -self.threshold.to(top) if self.score == "density" else self._level_of_share
         radius = (2 * (top - level)).clamp(min=0).sqrt()
@@ -165,9 +170,9 @@ class PredictionSet(Mixture, ValueSet):
 
     @property
     def _level_of_share(self) -> Float[Tensor, "*batch"]:
-        """The least log-density whose mass score, a share of draws (`_among`), is at most the threshold, nats."""
+        """Least log-density whose mass score, a share of samples (`_among`), is at most the threshold, nats."""
         drawn, threshold = self._log_draws, float(self.threshold)
-        if threshold < 0:  # no score is
+        if threshold < 0:  # no score is negative
             return torch.full_like(drawn[0], math.inf)
         beyond = threshold - math.log(len(drawn) + 1)
         if beyond > 0:
@@ -181,7 +186,7 @@ class PredictionSet(Mixture, ValueSet):
         return drawn[above - 1] + min(rank - above, 1.0) * (drawn[above] - drawn[above - 1])
 
     def empty(self) -> Bool[Tensor, "*batch"]:
-        """Whether nothing is in the set."""
+        """Return whether the set is empty."""
         if self._classes:
             return ~self.labels().any(-1)
         if self._one:
@@ -189,7 +194,7 @@ class PredictionSet(Mixture, ValueSet):
         return ~(self.contains(self._draws).any(0) | self.contains(self.density.mode))
 
     def labels(self) -> Bool[Tensor, "*batch label"]:
-        """Which classes are in the set.
+        """Return which classes are in the set.
 
         Raises:
             UserError: the density is not over classes.
@@ -201,14 +206,14 @@ class PredictionSet(Mixture, ValueSet):
         return self.contains(self.density.enumerate_support()).movedim(0, -1)
 
     def intervals(self) -> list[list[tuple[float, float]]]:
-        """The set of every item of the flattened batch as (low, high), ascending.
+        """Return the set of every item of the flattened batch as (low, high), ascending.
 
-        Of a real they may be infinite. Of an angle they are radians, from low in [-π, π) counter-clockwise to high,
-        which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). Their ends are as exact as the
-        density's number type. A hump of the density is found if one of its components has its mode there.
+        For a real they may be infinite. For an angle they are radians, from low in [-π, π) counter-clockwise to high,
+        which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). The ends are as exact as the
+        density's dtype. A hump of the density is found if one of its components has its mode there.
 
         Raises:
-            UserError: the density is not of one number.
+            UserError: the density is not over one number.
         """
         if not self._one:
             raise UserError(
@@ -237,7 +242,7 @@ class PredictionSet(Mixture, ValueSet):
 
     @property
     def _whole(self) -> float:
-        """The volume of everything."""
+        """Volume of the whole support."""
         support = self.support
         if not isinstance(support, Circular):
             return math.inf
@@ -267,7 +272,7 @@ class PredictionSet(Mixture, ValueSet):
     @cached_property
     @torch.no_grad()
     def _level(self) -> Float[Tensor, "item"]:
-        """The least log-density in the set, nats, of one number."""
+        """Least log-density in the set, nats, for one number."""
         threshold = self.threshold.double().to(self._line.heights.device)
         if self.score == "mass" and not self._everything:
             return self._line.level_of(threshold)
@@ -280,24 +285,29 @@ class PredictionSet(Mixture, ValueSet):
 
 
 def _of_labels(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Tensor:
-    """-log(Σ_j p_j of the less probable labels + (1 - u) p(y)): the complement of the sum from the top that Romano,
-    Sesia & Candès 2020 (eq. 5) take, which rounds to 1 where it matters."""
+    """Return -log(Σ_j p_j of the less probable labels + (1 - u) p(y)).
+
+    The sum is the complement of the sum from the top of Romano, Sesia & Candès 2020 (eq. 5), which rounds to 1 where
+    small differences matter.
+    """
     top = every.topk(min(2, len(every)), dim=0).values
     margin = top[0] - top[-1]
-    # digits of the margin that mean nothing: distinct for distinct inputs, the same for the same
+    # the insignificant digits of the margin: they differ for different inputs and agree for equal ones
     share = torch.frac(997 * margin.where(margin.isfinite(), 0.0)).clamp(1e-6, 1 - 1e-6)
     less = torch.where(_beside(every, log_prob) < log_prob, _beside(every, log_prob), -math.inf).logsumexp(0)
     return -torch.logaddexp(less, log_prob + torch.log1p(-share))
 
 
 def _beside(every: Tensor, values: Tensor) -> Tensor:
-    """(label, *batch) as (label, *1, *batch), against values (*sample, *batch)."""
+    """Return (label, *batch) reshaped to (label, *1, *batch), to broadcast with values (*sample, *batch)."""
     return every.reshape(len(every), *(1,) * (values.dim() - every.dim() + 1), *every.shape[1:])
 
 
 def _among(log_prob: Tensor, drawn: Float[Tensor, "draw *batch"]) -> Tensor:
-    """-log of the share of draws, ascending, that are less dense; linear between draws, and below the last of them in
-    log p, so that equal scores are rare."""
+    """Return -log of the share of samples, ascending, that are less dense.
+
+    It is linear between samples, and linear in log p below the last of them, so that equal scores are rare.
+    """
     edges = drawn.movedim(0, -1).contiguous()
     lead = log_prob.shape[: log_prob.dim() - edges.dim() + 1]
     flat = log_prob.reshape(lead.numel(), *edges.shape[:-1]).movedim(0, -1).contiguous()
@@ -317,5 +327,5 @@ def _(density: PredictionSet) -> PredictionSet:
 
 @marginal.register
 def _(density: PredictionSet, index: int) -> Distribution:
-    """Without a set: what was promised of all numbers together is not so of one."""
+    """Return the marginal without a set, since the coverage of all numbers together is not that of one number."""
     return density if tuple(density.event_shape) == (1,) and index == 0 else marginal(density.density, index)

@@ -1,4 +1,4 @@
-"""Split conformal prediction: sets that hold the target with a promised probability, whatever the model."""
+"""Split conformal prediction: sets that hold the target with a stated probability for any model."""
 
 import logging
 import math
@@ -20,29 +20,32 @@ from framework.uncertainty import Uncertainty
 from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
 SEED = 71
-"""Of the split into halves."""
+"""Seed of the split into halves."""
 NEAR = 0.03
-"""How far a coverage may be from the promised one without a word, and the rows that keep it there in 90 % of cases."""
+"""Largest deviation of a coverage from the stated one without a remark.
+
+The remark names the number of rows that keep it within this deviation in 90 % of cases.
+"""
 NINETY = 1.645
-"""Standard deviations that hold the middle 90 % of a normal density, to either side."""
+"""Number of standard deviations to either side that hold the middle 90 % of a normal density."""
 _log = logging.getLogger(__name__)
 
 
 class Conformal(Uncertainty):
-    """Densities as they are, each with a set (`prediction_set.py`) that holds the target with 1 - miscoverage.
+    """Unchanged densities, each with a set (`prediction_set.py`) that holds the target with probability 1 - α.
 
-    On data that is exchangeable with the validation set a new target lies in its set with a probability of at least
-    1 - α, and of at most 1 - α + 1/(n + 1) where no two of the n scores are equal, on average over both, however wrong
-    the model is (Vovk, Gammerman & Shafer 2005, §4.1). Not for each input apart. Put it last: what wraps it keeps the
-    densities and drops the sets.
+    On data that is exchangeable with the validation set, a new target lies in its set with a probability of at least 1
+    - α, and of at most 1 - α + 1/(n + 1) if no two of the n scores are equal. This is an average over targets and
+    validation sets, for any model, however wrong (Vovk, Gammerman & Shafer 2005, §4.1). It does not hold for each input
+    separately. Use it as the outermost wrapper: a wrapper around it keeps the densities and drops the sets.
 
-    What is wrapped is calibrated on a random half of the validation set, always the same, and the threshold on the
-    rest: on scores that a temperature was fitted to, nothing is promised. Before `calibrate` the set is everything.
+    The wrapped model is calibrated on a random half of the validation set, always the same, and the threshold is fitted
+    to the rest: scores to which a temperature was fitted have no guarantee. Before `calibrate` the set is everything.
 
     Args:
         miscoverage: α, the share of targets that may lie outside.
-        score: "density": one level of density for all inputs, the smallest sets on average; "mass": one mass for all
-            inputs, sets that grow where the model is unsure.
+        score: "density": one level of density for all inputs, which gives the smallest sets on average; "mass": one
+            probability for all inputs, which gives larger sets where the model is uncertain.
 
     Attributes:
         threshold: the largest score in a set, nats, a float64 buffer.
@@ -124,9 +127,10 @@ class Conformal(Uncertainty):
 
 
 def halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
-    """A random half of the samples, rounded up, and the rest, both in order and without empty batches.
+    """Return a random half of the samples, rounded up, and the rest, both in order and without empty batches.
 
-    Not every other one: in many data sets neighbours alternate, or belong together. The same of every set of one size.
+    Alternating samples would not do: in many data sets neighbours alternate, or belong together. The split is the same
+    for all sets of one size.
     """
     sizes = [len(batch["target"]) for batch in batches]
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(SEED))
@@ -142,10 +146,10 @@ def halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
 
 
 def remark(count: int, miscoverage: float) -> str:
-    """How far the sets from so many scores may cover more or less than promised, and how many rows would tell better.
+    """Return how far the coverage of sets from `count` scores may deviate, and how many rows would reduce that.
 
-    The share that sets from n distinct scores cover is itself random, Beta(k, n + 1 - k) with k as in `threshold`
-    (Vovk 2012, prop. 2a): on average over validation sets it is k / (n + 1).
+    The share that sets from n distinct scores cover is itself random, Beta(k, n + 1 - k) with k as in `threshold` (Vovk
+    2012, prop. 2a): on average over validation sets it is k / (n + 1).
     """
     left_out = _left_out(count, miscoverage)
     if not left_out:
@@ -165,13 +169,16 @@ def remark(count: int, miscoverage: float) -> str:
 
 
 def _left_out(count: int, miscoverage: float) -> int:
-    """How many of n scores are above the threshold or at it, ⌊(n + 1) α⌋."""
-    # from the other side, so that (n + 1) α is whole where it should be: α itself is rounded
+    """Return the number of scores at or above the threshold, ⌊(n + 1) α⌋."""
+    # α is rounded, so that (n + 1) α may fall just below an integer; the factor corrects that
     return min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
 
 
 def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
-    """The k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉ (Vovk, Gammerman & Shafer 2005, §4.1); infinite if k > n."""
+    """Return the k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉; infinite if k > n.
+
+    Source: Vovk, Gammerman & Shafer 2005, §4.1.
+    """
     count = len(scores)
     left_out = _left_out(count, miscoverage)  # k is at least 1
     return scores.sort().values[count - left_out].item() if left_out else math.inf

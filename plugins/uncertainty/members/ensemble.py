@@ -1,4 +1,4 @@
-"""Deep ensembles: several models trained from different starts, their densities mixed."""
+"""Deep ensembles: the mixture of the densities of several independently trained models."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any, cast
@@ -24,17 +24,17 @@ WORTH_TRYING = (1, 2, 3, 5, 10, 20, 50)
 class Ensemble(Uncertainty, Joining, Several):
     """T independently trained models; p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
 
-    They differ in initial weights and in the order of batches. Where every encoder vectorises (`Encoder.vectorises`),
-    their parameters lie side by side and one pass trains and evaluates all; otherwise they are computed one after the
-    other. Either way each member's gradient is its own, and is clipped by itself, so that it becomes what it would
-    become alone. One member is the wrapped model itself, to the last bit.
+    They differ in initial weights and in the order of batches. If every encoder vectorises (`Encoder.vectorises`),
+    their parameters are stacked and one pass trains and evaluates all; otherwise they are computed one after the other.
+    In both cases each member has its own gradient, which is clipped separately, so that it trains as it would alone. An
+    ensemble of one member equals the wrapped model, to the last bit.
 
     Attributes:
-        members: how many of the trained members are used, the first ones; may be lowered after training (a knob).
+        members: number of the trained members that are used, the first ones; may be lowered after training (a knob).
 
     Raises:
         ConfigError: more members are used than were trained.
-        UserError: a member's numbers are not finite; it is named and not averaged in.
+        UserError: a member's parameters of the density are not finite; it is named and not averaged in.
     """
 
     bibtex = """@inproceedings{lakshminarayanan2017simple,
@@ -92,7 +92,7 @@ class Ensemble(Uncertainty, Joining, Several):
         return each_alone(losses)
 
     def _own_losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Each member's of its own rows."""
+        """Return each member's losses of its own rows."""
         if self.together is None:
             parts = zip(self._apart(), self._parts(inputs), target.chunk(self.trained), strict=True)
             return torch.cat([member.loss(given, wanted) for member, given, wanted in parts])
@@ -103,7 +103,7 @@ class Ensemble(Uncertainty, Joining, Several):
         return torch.cat([self._head(index).loss(raw[index], wanted[index]) for index in range(self.trained)])
 
     def _parts(self, inputs: Tensor) -> Sequence[Tensor]:
-        """Each member's own rows: the same tensors as long as `one_pass` keeps what is computed of them."""
+        """Return each member's own rows: the same tensors as long as `one_pass` keeps results computed from them."""
         return self.kept.of(inputs, lambda given: given.chunk(self.trained))
 
     def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
@@ -157,11 +157,11 @@ class Ensemble(Uncertainty, Joining, Several):
     def _of(self, index: int, inputs: Tensor) -> Distribution:
         try:
             return self._apart()[index](inputs)
-        except ValueError as error:  # a head that was given NaN says in which row
+        except ValueError as error:  # the message of a head that was given NaN names the row
             raise UserError(f"member {index} of {self.trained} of the ensemble: {error} {REMEDY}") from error
 
     def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
-        """Batch_shape (batch, member)."""
+        """Return the members' densities, batch_shape (batch, member)."""
         bad = (~raw.isfinite()).any(-1).nonzero()
         if len(bad):
             row, index = bad[0].tolist()
@@ -189,21 +189,21 @@ REMEDY = (
 
 
 def vectorises(member: Predictor) -> bool:
-    """Whether members like this one can be computed side by side."""
+    """Return whether members like this one can be computed in one vectorised pass."""
     if not isinstance(member, Model) or isinstance(member.head, Fitted):
         return False
     if not any(
         True for _ in network(member).parameters()
-    ):  # the head learns all there is: nothing to lay out
+    ):  # only the head has parameters: there is nothing to stack
         return False
     return all(encoder.vectorises for encoder in member.encoders)
 
 
 def network(member: Model) -> nn.Sequential:
-    """From inputs to what the head reads."""
+    """Return the layers from the inputs to the head's raw parameters."""
     return nn.Sequential(member.encoders, member.projection)
 
 
 def has_state(head: nn.Module) -> bool:
-    """Whether heads of two members can differ."""
+    """Return whether the heads of two members can differ."""
     return bool(head.state_dict())

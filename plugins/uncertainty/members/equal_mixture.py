@@ -1,4 +1,4 @@
-"""What members and dropout masks have in common: their densities are mixed with equal weights."""
+"""The mixture with equal weights, shared by ensembles and Monte Carlo dropout."""
 
 import torch
 from torch import nn
@@ -8,8 +8,11 @@ from framework.distributions.density import Mixture
 
 
 def equal_mixture(components: Distribution, model: nn.Module, device: torch.device) -> Mixture:
-    """(1/S) Σ_s p_s over the last batch dimension of `components`; weights have the dtype of the model's parameters, as
-    densities have: float32 where those are of half precision, in which S weights would not sum to 1."""
+    """Return (1/S) Σ_s p_s over the last batch dimension of `components`.
+
+    Weights have the dtype of the model's parameters, as densities have. They are float32 for parameters of half
+    precision, in which S weights would not sum to 1.
+    """
     dtypes = (parameter.dtype for parameter in model.parameters())
     dtype = next(dtypes, torch.get_default_dtype())  # trees have no parameters
     dtype = dtype if dtype.itemsize >= 4 else torch.float32

@@ -22,15 +22,15 @@ from plugins.uncertainty.members.equal_mixture import equal_mixture
 
 DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 AT_ONCE = 2**24
-"""Numbers that may enter a dropout layer together (64 MiB in float32); more samples are taken in parts."""
+"""Largest number of values that enter a dropout layer together (64 MiB in float32); more samples are taken in parts."""
 
 
 class Layout(NamedTuple):
-    """How samples are computed.
+    """The way in which samples are computed.
 
     Attributes:
         vectorised: whether `torch.vmap` runs the network, and so everything before the first dropout only once.
-        widest: numbers of one input, or of what enters a dropout layer, whichever is repeated and more.
+        widest: number of values of one input, or of the input of a dropout layer; the largest that is repeated.
     """
 
     vectorised: bool
@@ -38,21 +38,21 @@ class Layout(NamedTuple):
 
 
 class MCDropout(Uncertainty):
-    """The mixture, with equal weights, of the densities under S dropout masks (thesis eq. 2.16; Gal & Ghahramani 2016).
+    """The equally weighted mixture of densities under S dropout masks (thesis eq. 2.16; Gal & Ghahramani 2016).
 
-    Training, and the validation loss, are those of what is wrapped. In evaluation its dropout layers (`DROPOUT`) stay
+    Training, and the validation loss, are those of the wrapped model. In evaluation its dropout layers (`DROPOUT`) stay
     active, and nothing else: batch norm normalises as in any evaluation. Every input of a batch has its own S masks,
-    drawn from torch's global generator. What is wrapped calibrates its own density without dropout.
+    drawn from torch's global generator. The wrapped model calibrates its own density without dropout.
 
-    Layers before the first dropout are computed once and not S times, where the network can be vectorised.
+    Layers before the first dropout are computed once and not S times, if the network can be vectorised.
 
     Args:
-        model: what is wrapped; needs a dropout layer of probability above 0.
+        model: the wrapped model; needs a dropout layer of probability above 0.
         samples: S, also a knob; 1 is one stochastic pass.
 
     Raises:
         ConfigError: there is no such dropout layer, or `samples` was set below 1.
-        UserError: the network's numbers are not finite under some mask; it is named and not averaged in.
+        UserError: the network's output is not finite under some mask; the mask is named and not averaged in.
     """
 
     knobs = {"samples": (1, 3, 10, 30, 100)}  # noqa: RUF012 - never written
@@ -70,7 +70,7 @@ class MCDropout(Uncertainty):
         super().__init__()
         self.model = model()
         self.samples = samples
-        self.layout: Layout | None = None  # found out at the first prediction
+        self.layout: Layout | None = None  # determined at the first prediction
         if not any(layer.p > 0 for layer in _dropouts(self.model)):
             raise ConfigError(
                 "uncertainty mc_dropout: the model has no dropout layer of probability above 0, so that every sample "
@@ -96,7 +96,7 @@ class MCDropout(Uncertainty):
         self.model.calibrate(batches)
 
     def _components(self, inputs: Tensor) -> Distribution:
-        """The densities under S masks each: batch_shape (batch, S)."""
+        """Return the densities under S masks each, batch_shape (batch, S)."""
         whole = (len(inputs), self.samples)
         if self.samples == 1 or len(inputs) == 0:
             one = self.model(inputs)
@@ -108,7 +108,7 @@ class MCDropout(Uncertainty):
         return Stacked([self.model(inputs) for _ in range(self.samples)])
 
     def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample size"]:
-        """What the head reads under each mask."""
+        """Return the raw parameters that the head reads under each mask."""
         self.layout = self.layout or layout_of(model, inputs)
         at_once = max(1, AT_ONCE // (len(inputs) * self.layout.widest))
         counts = [min(at_once, self.samples - start) for start in range(0, self.samples, at_once)]
@@ -117,10 +117,10 @@ class MCDropout(Uncertainty):
 
 
 def require_finite(raw: Float[Tensor, "batch sample size"]) -> Float[Tensor, "batch sample size"]:
-    """`raw` itself.
+    """Return `raw` unchanged.
 
     Raises:
-        UserError: a number is not finite; says under which mask of which input.
+        UserError: a number is not finite; the message names the mask and the input.
     """
     bad = (~raw.isfinite().all(-1)).nonzero()
     if len(bad):
@@ -138,21 +138,21 @@ def _dropouts(model: nn.Module) -> Iterator[Any]:
 
 
 def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
-    """`count` passes in one: torch.vmap repeats nothing until a dropout layer makes the samples differ."""
+    """Return `count` passes in one: torch.vmap repeats nothing until a dropout layer makes the samples differ."""
     sampled = torch.vmap(lambda _: model.raw(inputs), randomness="different", out_dims=1)
     return sampled(torch.empty(count, device=inputs.device))
 
 
 def _repeated(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
-    """The same in one pass over `count` copies of every input."""
+    """Return `count` passes, computed in one pass over `count` copies of every input."""
     return model.raw(inputs.repeat_interleave(count, 0)).unflatten(0, (len(inputs), count))
 
 
 def layout_of(model: Model, inputs: Tensor) -> Layout:
-    """How to compute samples of a model in whose dropout layers are active; tries two on one input.
+    """Return how to compute samples of a model with active dropout layers; it tries two samples on one input.
 
-    A network with operations that torch.vmap cannot run, or only slowly, which it warns of, is run on copies of the
-    inputs. The global generators are left as they were.
+    A network with operations that torch.vmap cannot run, or runs slowly with a warning, is run on copies of the inputs.
+    The state of the global generators is kept.
     """
     devices = [inputs.device] if inputs.device.type == "cuda" else []
     with torch.random.fork_rng(devices), torch.no_grad(), warnings.catch_warnings(), _widths(model) as widths:
@@ -168,7 +168,7 @@ def layout_of(model: Model, inputs: Tensor) -> Layout:
 
 @contextmanager
 def _widths(model: Model) -> Iterator[list[int]]:
-    """How many numbers enter each dropout layer in a pass."""
+    """Yield a list that records how many values enter each dropout layer in a pass."""
     widths: list[int] = [0]
     hooks = [
         layer.register_forward_pre_hook(lambda _, given: widths.append(given[0].numel()))

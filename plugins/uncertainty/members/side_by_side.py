@@ -1,4 +1,4 @@
-"""Networks of one architecture side by side: their parameters stacked, all computed in one pass."""
+"""Networks of one architecture with stacked parameters, all computed in one pass."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -11,9 +11,9 @@ from torch.func import functional_call, vmap
 
 
 class SideBySide(nn.Module):
-    """T networks as one: each parameter has the members as its first dimension, each layer is one batched product.
+    """T networks as one: the first dimension of each parameter is the members, and each layer is one batched product.
 
-    An optimiser that works element by element (SGD, Adam and their like) moves every member as it would alone.
+    An optimiser that works element by element (SGD, Adam and similar ones) updates every member as it would alone.
 
     Args:
         networks: of one architecture, without buffers; their parameters are copied.
@@ -28,22 +28,22 @@ class SideBySide(nn.Module):
         for name, parameter in self.stacked.named_parameters():
             parts = [network.get_parameter(name).detach() for network in networks]
             parameter.data = torch.stack(parts)
-        # not a submodule: it only says what to compute, and its own parameters are never read
+        # not a submodule: it only defines the computation, and its own parameters are never read
         self.__dict__["_template"] = copy.deepcopy(networks[0])
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Float[Tensor, "batch member size"]:
-        """What each of the first `used` members (all by default) makes of the inputs; each has dropout of its own."""
+        """Return the output of each of the first `used` members (all by default); each has its own dropout masks."""
         return self._computed(inputs, used, None).movedim(0, 1)
 
     def own(self, inputs: Float[Tensor, "member batch *input"]) -> Float[Tensor, "member batch size"]:
-        """What each member makes of inputs of its own."""
+        """Return the output of each member for its own inputs."""
         return self._computed(inputs, None, 0)
 
     def _computed(
         self, inputs: Tensor, used: int | None, members: int | None
     ) -> Float[Tensor, "member batch size"]:
         template = self._template
-        # module by module: dropout may be active where all else evaluates
+        # module by module: dropout may be active while all other modules evaluate
         for mine, shown in zip(template.modules(), self.stacked.modules(), strict=True):
             mine.training = shown.training
         parameters: dict[str, Tensor] = {**dict(self.stacked.named_parameters())}
@@ -56,10 +56,10 @@ class SideBySide(nn.Module):
         return vmap(one, in_dims=(0, members), randomness="different")(parameters, inputs)
 
     def clip_each(self, most: float, beside: Sequence[nn.Module]) -> None:
-        """Shorten each member's gradient to the norm `most`, as torch's clip_grad_norm_ does one network's.
+        """Shorten each member's gradient to the norm `most`, as torch's clip_grad_norm_ does for one network.
 
         Args:
-            beside: what else each member has.
+            beside: further modules of each member.
         """
         gradients = [one.grad for one in self.parameters() if one.grad is not None]
         others = [[one.grad for one in module.parameters() if one.grad is not None] for module in beside]
@@ -74,12 +74,12 @@ class SideBySide(nn.Module):
 
     @torch.no_grad()
     def write(self, index: int, parameters: Mapping[str, Tensor]) -> None:
-        """Give member `index` these parameters."""
+        """Replace the parameters of member `index`."""
         for name, parameter in self.stacked.named_parameters():
             parameter[index] = parameters[name]
 
     def read(self, index: int) -> dict[str, Tensor]:
-        """A copy of the parameters of member `index`."""
+        """Return a copy of the parameters of member `index`."""
         return {
             name: parameter[index].detach().clone() for name, parameter in self.stacked.named_parameters()
         }

@@ -1,1 +1,1 @@
-"""Least squares of each Z-spectrum that start from a trained model's answer."""
+"""Least-squares fits of each Z-spectrum that start from a trained model's prediction."""

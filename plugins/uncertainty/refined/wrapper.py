@@ -1,4 +1,4 @@
-"""Least squares that start from a network's answer, as an uncertainty wrapper."""
+"""Least-squares fits that start from a network's prediction, as an uncertainty wrapper."""
 
 from collections.abc import Callable, Iterable
 from typing import Annotated
@@ -19,22 +19,22 @@ from framework.spectra.spectrum import PRESETS
 from framework.uncertainty import Uncertainty
 
 DRAWS = 100
-"""For the point of a density that does not know it."""
+"""Number of samples from which a density without a known median is summarised."""
 
 
 class Refined(Uncertainty):
-    """Fits Lorentzian lines to each spectrum from where the wrapped model says they are (the neural start).
+    """Fits Lorentzian lines to each spectrum, starting from the wrapped model's prediction (the neural start).
 
-    The density is that of the fit (`framework.spectra.fit`), where the wrapped model's own only says where to begin. A
-    wrapper, since a network and a fit are both wanted in one experiment: it is trained, stored and compared as any
-    model, and wraps any, an ensemble too. With `steps=0` it is what it wraps.
+    The density is that of the fit (`framework.spectra.fit`); the density of the wrapped model only gives the start. It
+    is a wrapper, since one experiment needs both a network and a fit: it is trained, stored and compared as any model,
+    and wraps any model, also an ensemble. With `steps=0` it equals the wrapped model.
 
     Attributes:
-        steps: most steps of a fit (a knob).
+        steps: largest number of steps of a fit (a knob).
 
     Args:
-        steps: the same.
-        offsets: of the data, ppm.
+        steps: as the attribute.
+        offsets: frequency offsets of the data, ppm.
     """
 
     bibtex = """@article{levenberg1944method,

@@ -1,4 +1,4 @@
-"""The parameters of highest likelihood in a box, by SciPy's L-BFGS-B (Byrd, Lu, Nocedal & Zhu 1995)."""
+"""Maximum likelihood of parameters in a box, by SciPy's L-BFGS-B (Byrd, Lu, Nocedal & Zhu 1995)."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -15,16 +15,16 @@ Term = Callable[[Tensor], Tensor]
 
 RESTARTS = 20
 NEAREST = 1e-9
-"""Steps, in slopes, to a region that is not numbers."""
+"""Smallest step, in units of the gradient, towards a region without finite values."""
 
 
 class Minimum(NamedTuple):
-    """Where `minimise` ended.
+    """Result of `minimise`.
 
     Attributes:
-        point: within the box, float64.
-        value: there, never above that at the start.
-        active: -1 at a lower bound, 1 at an upper one beyond which the sum still falls, else 0.
+        point: the minimum, within the box, float64.
+        value: value there, never above the value at the start.
+        active: -1 at a lower bound, 1 at an upper bound, beyond which the sum still falls; else 0.
     """
 
     point: Float[Tensor, "n"]
@@ -40,14 +40,14 @@ def minimise(
     *,
     rounding: float = 2e-16,
 ) -> Minimum:
-    """A local minimum of Σ terms in the box lower ≤ point ≤ upper. Only one term's graph is held at a time.
+    """Return a local minimum of Σ terms in the box lower ≤ point ≤ upper; one term's graph is held at a time.
 
     Args:
-        rounding: of the values, relative to 1 + |value|; nothing below it is gained.
+        rounding: rounding error of the values, relative to 1 + |value|; smaller gains end the search.
     """
     low, high = lower.cpu().numpy(), upper.cpu().numpy()
     first, _ = value_and_slope(terms, start)
-    # a point where the sum is not finite is a step that failed: no trial may be better, and it points nowhere
+    # a point where the sum is not finite is a failed step: its value is the worst and its gradient 0
     worse = first + 1 + abs(first)
     walled: list[np.ndarray] = []
 
@@ -66,13 +66,13 @@ def minimise(
         gained = least - found.fun
         if gained >= 0:
             x, least = found.x, found.fun
-        # it takes one step that gains nothing for the end, also where the slope is steep: begun anew it goes on
+        # L-BFGS-B ends after one step without gain, also where the gradient is large; a restart continues
         if gained <= rounding * (1 + abs(least)):
             break
     step = 1.0 if walled else 0.0
     while (
         step > NEAREST
-    ):  # SciPy's line search stops short of a region that is not numbers: halve the steps to it
+    ):  # SciPy's line search stops before a region without finite values: approach it by halved steps
         value, slope = trial(x)
         ahead = np.clip(x - step * slope, low, high)
         further = trial(ahead)[0]
@@ -84,19 +84,19 @@ def minimise(
 
 
 def total(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Σ terms, float64, without gradient."""
+    """Return Σ terms, float64, without gradient."""
     with torch.no_grad():
         return torch.stack([term(point).double() for term in terms]).sum()
 
 
 def value_and_slope(terms: Sequence[Term], point: Float[Tensor, "n"]) -> tuple[float, np.ndarray]:
-    """Σ terms and its gradient, float64."""
+    """Return Σ terms and its gradient, float64."""
     value, slope = 0.0, torch.zeros_like(point)
     for term in terms:
         with torch.enable_grad():
             here = point.detach().clone().requires_grad_()
             part = term(here).double()
             value += part.item()
-            if part.requires_grad:  # no constant
+            if part.requires_grad:  # False for a constant
                 slope += torch.autograd.grad(part, here)[0]
     return value, slope.cpu().numpy()

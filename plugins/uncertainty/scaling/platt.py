@@ -20,25 +20,26 @@ from plugins.uncertainty.scaling.likelihood import minimise
 STEEPEST = 20.0
 """Largest slope; the smallest is 0."""
 LARGEST_BIAS = 50.0
-"""Of a class, nats, before their mean is taken off."""
+"""Largest bias of a class, nats, before the mean over classes is subtracted."""
 LEAST = -1e5
-"""Log-probabilities below it, -∞ among them, are read as it, nats."""
+"""Smallest log-probability, nats; smaller ones, and -∞, are replaced by it."""
 _log = logging.getLogger(__name__)
 
 
 class Platt(Uncertainty):
     """Class log-probabilities l become a·l + b, normalised (thesis eq. 2.18-2.19).
 
-    One slope a ≥ 0, and a bias for each class, of sum 0; of two classes this is a slope and a bias on the log-odds.
-    The thesis writes the network's output probability in the exponent; here as in Platt 1999 and Guo et al. 2017 it is
-    the log-odds, with which a = 1, b = 0 changes nothing: so it stands before `calibrate`. What is wrapped may be any
-    density over classes, also a mixture.
+    There is one slope a ≥ 0, and a bias for each class, with sum 0. For two classes this is a slope and a bias on the
+    log-odds. The thesis writes the network's output probability in the exponent. Here, as in Platt 1999 and Guo et al.
+    2017, it is the log-odds, for which a = 1, b = 0 changes nothing: these are the values before `calibrate`. The
+    wrapped model may return any density over classes, also a mixture.
 
-    A slope below 0 would turn what is wrapped upside down: labels that contradict it stop the slope at 0, where only
-    the classes' shares are left. Slope and biases have upper bounds too. Where one is reached the log says so.
+    A slope below 0 would reverse the order of the classes. Labels that contradict the wrapped model stop the slope at
+    0, where only the classes' shares remain. Slope and biases have upper bounds too. The log says if a bound is
+    reached.
 
     Args:
-        smoothing: towards labels of which one more of each class had been seen, (N₊+1)/(N₊+2) and 1/(N₋+2) of two
+        smoothing: fit to the labels that one more sample of each class would give, (N₊+1)/(N₊+2) and 1/(N₋+2) for two
             classes (Platt 1999, §2.2); the fit is then finite also on separable and one-class sets.
 
     Attributes:
@@ -101,12 +102,12 @@ class Platt(Uncertainty):
 def fit(
     log_prob: Float[Tensor, "sample label"], label: Int[Tensor, "sample"], *, smoothing: bool
 ) -> tuple[float, Float[Tensor, "label"]]:
-    """Slope and biases of least mean cross-entropy to (smoothed) labels (eq. 2.19); convex."""
+    """Return slope and biases of least mean cross-entropy to (smoothed) labels (eq. 2.19); the problem is convex."""
     classes = log_prob.shape[-1]
     wanted = targets(label, classes, smoothing=smoothing)
     heights = log_prob.clamp(min=LEAST)
     heights = heights - heights.mean(-1, keepdim=True)
-    # in units of their spread, so that slope and biases are of one size to the minimiser
+    # in units of their spread, so that slope and biases have similar magnitudes for the minimiser
     unit = heights.square().mean().sqrt().clamp(min=torch.finfo(torch.float64).eps)
     heights = heights / unit
 
@@ -137,8 +138,11 @@ def fit(
 
 
 def targets(label: Int[Tensor, "sample"], classes: int, *, smoothing: bool) -> Float[Tensor, "sample label"]:
-    """What the probabilities are fitted to: 1 for the label, or with N_k samples of it and K classes (N_k+1)/(N_k+K),
-    and 1/(N_k+K) for each other (of two classes Platt 1999, §2.2)."""
+    """Return the probabilities to fit: 1 for the label, or smoothed.
+
+    With N_k samples of the label and K classes, smoothed ones are (N_k+1)/(N_k+K) for the label, and 1/(N_k+K) for each
+    other class (for two classes Platt 1999, §2.2).
+    """
     exact = torch.nn.functional.one_hot(label, classes).double()
     if not smoothing:
         return exact

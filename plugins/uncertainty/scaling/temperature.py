@@ -1,4 +1,4 @@
-"""Temperature scaling: one number, fitted on the validation set, whose inverse all densities are raised to."""
+"""Temperature scaling: all densities are raised to the inverse of one number, fitted to the validation set."""
 
 import logging
 import math
@@ -20,20 +20,20 @@ from framework.uncertainty import Uncertainty
 from plugins.uncertainty.scaling.likelihood import Term, minimise, total
 
 GRID = 17
-"""Temperatures tried before the fit, which starts at the best: the likelihood of a mixture may have several maxima."""
+"""Number of temperatures tried before the fit, which starts at the best: mixtures may have several likelihood maxima."""
 _log = logging.getLogger(__name__)
 
 
 class Temperature(Uncertainty):
     """Every density p becomes p^(1/T), normalised, with the T of highest validation likelihood.
 
-    Of classes this divides logits by T (thesis eq. 2.19 with β = 0); it changes no mode. Before `calibrate` T is 1
-    and the densities are those of what is wrapped. T is never worse on the validation set than 1 is, and stays within
-    its bounds whatever the labels: on a perfectly separable set, where the likelihood rises without end, it stops at
-    the bound, and the log says so.
+    For classes this divides logits by T (thesis eq. 2.19 with β = 0); it changes no mode. Before `calibrate` T is 1 and
+    the densities are those of the wrapped model. On the validation set T is never worse than 1. It stays within its
+    bounds for any labels: on a perfectly separable set, where the likelihood rises without end, it stops at the bound,
+    and the log says so.
 
     Args:
-        lower, upper: of T.
+        lower, upper: bounds of T.
 
     Attributes:
         temperature: T, a float64 buffer.
@@ -86,9 +86,9 @@ class Temperature(Uncertainty):
 
 
 def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: float, upper: float) -> float:
-    """T in [lower, upper] with the least mean of -log p^(1/T)(y) + log Z (eq. 2.19); 1 where none is better.
+    """Return T in [lower, upper] with the least mean of -log p^(1/T)(y) + log Z (eq. 2.19); 1 if none is better.
 
-    Targets that a density rules out are ruled out at any T: they are counted in the log and left out.
+    Targets with probability 0 have it at any T: they are counted in the log and left out.
     """
     targets = [batch["target"] for batch in batches]
     with torch.no_grad():
@@ -136,8 +136,8 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
 
 
 def _term(density: Distribution, target: Tensor, possible: Tensor, count: int) -> Term:
-    """log T → this batch's part of the mean negative log-likelihood."""
-    # where the target is ruled out, the mode stands in: an infinite value would make the gradient of 0 · ∞
+    """Return the function of log T that gives this batch's part of the mean negative log-likelihood."""
+    # the mode replaces a target of probability 0: an infinite value would give a gradient of 0 · ∞
     mask = possible.reshape(*possible.shape, *(1,) * (target.dim() - possible.dim()))
     value = target if bool(possible.all()) else torch.where(mask, target, density.mode)
 
