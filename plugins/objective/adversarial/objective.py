@@ -15,19 +15,19 @@ from framework.objective import Objective
 
 
 class Adversarial(Objective):
-    """Asks for the loss to stay low within ±ε of every training input, where it grows fastest (thesis eq. 2.20).
+    """A penalty for losses that grow within ±ε of a training input, in the steepest direction (thesis eq. 2.20).
 
     The penalty is the weight times the mean loss on x' = x + ε sign(∇ₓ loss(x, y)), with the labels of x. It needs a
-    loss that is differentiable in the inputs and knows nothing of the density, so that it works for any head and any
+    loss that is differentiable in the inputs and does not use the density, so that it works for any head and any
     wrapper.
 
-    Images that come as uint8 are read as 0…1 and x' is kept within; floats are taken as they come, and x' may leave
-    their range by ε (images that the data plugin augments arrive as floats). Dropout draws another mask for the
-    gradient than for the loss at x'. Batch norm normalises x' by its own batch, and keeps no moments of it.
+    Images of type uint8 are read as 0…1, and x' is kept in that range. Floats are used unchanged, and x' may leave
+    their range by ε (images that the data plugin augments are floats). Dropout draws another mask for the gradient than
+    for the loss at x'. Batch norm normalises x' by its own batch, and does not update its moments.
 
     Args:
-        weight: of the penalty, against the loss on x itself.
-        epsilon: ε, in the units of the inputs; of images, 1 is from black to white.
+        weight: weight of the penalty, relative to the loss on x itself.
+        epsilon: ε, in the units of the inputs; for images, 1 is the range from black to white.
 
     Raises (in training):
         DataError: inputs of integers that are not bytes.
@@ -54,7 +54,7 @@ class Adversarial(Objective):
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         inputs = as_floats(batch["input"], predictor)
-        # x' belongs to the training distribution no more than it is in the batch: no running moments from it
+        # x' is not part of the training distribution, so that it must not enter the running moments
         with flagged(predictor, BATCH_NORM, "track_running_stats", False):
             moved = inputs + self.epsilon * self._direction(predictor, inputs, batch)
             if batch["input"].dtype == torch.uint8:
@@ -63,10 +63,10 @@ class Adversarial(Objective):
         return self.weight * losses.sum() / max(1, len(losses))  # no samples, no penalty
 
     def _direction(self, predictor: Predictor, inputs: Tensor, batch: Batch) -> Tensor:
-        """sign(∇ₓ[-log p(y | x)]), 0 where the loss is flat (eq. 2.20); leaves no gradient behind."""
+        """Return sign(∇ₓ[-log p(y | x)]), 0 where the loss is flat (eq. 2.20); no gradient is stored."""
         given = inputs.detach().requires_grad_()
         with torch.enable_grad():
-            # a sum, whose gradient in one input is that of its own loss
+            # the gradient of the sum in one input is that of its own loss
             loss = predictor.loss(given, batch["target"]).sum()
         (gradient,) = torch.autograd.grad(loss, given, allow_unused=True) if loss.requires_grad else (None,)
         if gradient is None:
@@ -87,7 +87,7 @@ class Adversarial(Objective):
 
 
 def as_floats(inputs: Tensor, predictor: Predictor) -> Tensor:
-    """The inputs as floating-point numbers, bytes as 0…1, in the type of the predictor's parameters.
+    """Return the inputs as floating-point numbers, bytes as 0…1, in the dtype of the predictor's parameters.
 
     Raises:
         DataError: integers that are not bytes.

@@ -1,1 +1,1 @@
-"""Losses of predicted images beside the distance of their numbers: features of networks, and discriminators."""
+"""Losses of predicted images other than the distance of their numbers: network features and discriminators."""

@@ -1,4 +1,4 @@
-"""Networks that judge patches of an image."""
+"""Discriminators of patches of an image."""
 
 from itertools import pairwise
 
@@ -12,11 +12,11 @@ STEEP = 0.2
 
 
 class PatchDiscriminator(nn.Module):
-    """Judges overlapping patches of an image, at one scale (Isola et al. 2017, §3.2.2; Wang et al. 2018, §3.2).
+    """A discriminator of overlapping patches at one scale (Isola et al. 2017, §3.2.2; Wang et al. 2018, §3.2).
 
     Args:
-        width: channels of the first layer; each further one has twice as many, eight times as many at most.
-        layers: of stride 2; with three a patch has 70 pixels a side.
+        width: channels of the first layer; each further layer has twice as many, at most eight times as many.
+        layers: number of layers of stride 2; with three a patch has sides of 70 pixels.
     """
 
     def __init__(self, width: int, layers: int) -> None:
@@ -29,7 +29,7 @@ class PatchDiscriminator(nn.Module):
         )
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
-        """What each layer gives, the last of which are the judgements: near 1 for a true patch."""
+        """Return the output of each layer; the last output is the judgement of each patch, near 1 for a true one."""
         found = []
         for number, layer in enumerate(self.layers):
             images = layer(images)
@@ -40,20 +40,20 @@ class PatchDiscriminator(nn.Module):
 
 
 def normalised(features: Float[Tensor, "image channel height width"]) -> Tensor:
-    """Each channel of each image, to mean 0 and variance 1 (Ulyanov et al. 2016)."""
+    """Return each channel of each image, normalised to mean 0 and variance 1 (Ulyanov et al. 2016)."""
     centred = features - features.mean((-2, -1), keepdim=True)
     return centred * (centred.square().mean((-2, -1), keepdim=True) + 1e-5).rsqrt()
 
 
 class Discriminators(nn.Module):
-    """The same at several scales, each half of the one before."""
+    """Patch discriminators at several scales, each half of the previous one."""
 
     def __init__(self, scales: int, width: int, layers: int) -> None:
         super().__init__()
         self.scales = nn.ModuleList(PatchDiscriminator(width, layers) for _ in range(scales))
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[list[Tensor]]:
-        """Of each scale, as `PatchDiscriminator`."""
+        """Return for each scale the outputs of `PatchDiscriminator`."""
         found = []
         for number, one in enumerate(self.scales):
             if number:
@@ -63,7 +63,7 @@ class Discriminators(nn.Module):
 
 
 def drawn(scales: int, width: int, layers: int, seed: int) -> Discriminators:
-    """With first weights that are a function of the seed."""
+    """Return discriminators whose initial weights are a function of the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return Discriminators(scales, width, layers)

@@ -16,19 +16,19 @@ from plugins.objective.images.predicted import predicted_images
 
 
 class PatchGAN(Objective):
-    """Discriminators learn to tell predicted images from true ones, and the predictor to be taken for true.
+    """Discriminators learn to tell predicted images from true ones, and the predictor learns to deceive them.
 
     The penalty is κ L_GAN + γ L_FM of thesis eq. 7.6, on patches, at several scales as in Wang et al. 2018, §3.2-3.3.
-    Judgements are compared by least squares (Mao et al. 2017, eq. 9): the discriminators minimise ½ E (D(y) - 1)² +
-    ½ E D(x)², the predictor E (D(x) - 1)², and L_FM is the mean L1 distance of the discriminators' features of x and y.
-    The discriminators are a `Rival`; what is logged as "discriminator" is theirs.
+    Judgements are compared by least squares (Mao et al. 2017, eq. 9): the discriminators minimise ½ E (D(y) - 1)² + ½ E
+    D(x)², the predictor E (D(x) - 1)², and L_FM is the mean L1 distance of the discriminators' features of x and y. The
+    discriminators are a `Rival`; their loss is logged as "discriminator".
 
     Args:
-        weight: κ, of which the discriminators' own loss is multiplied as well: their optimiser does not see it.
+        weight: κ; the discriminators' own loss is multiplied by it too, which does not affect their optimiser.
         feature_matching: γ, relative to the same weight.
         scales, width, layers: of the discriminators.
         learning_rate, schedule: of their optimiser.
-        seed: of their first weights.
+        seed: seed of their initial weights.
     """
 
     bibtex = """@inproceedings{wang2018high,
@@ -78,11 +78,11 @@ class PatchGAN(Objective):
             "feature_matching": alike.detach(),
             "discriminator": against.detach(),
         }
-        # of the discriminators' own loss the gradient alone: it is no part of what the predictor minimises
+        # The discriminators' own loss contributes only its gradient: the predictor does not minimise it.
         return self.weight * (taken + self.feature_matching * alike + against - against.detach())
 
     def _mean(self, judged: list[Tensor], lead: tuple[int, ...]) -> Float[Tensor, "*lead"]:
-        """Over patches, then scales."""
+        """Return the mean over patches, then over scales."""
         return torch.stack([one.mean((-3, -2, -1)) for one in judged]).mean(0).reshape(lead)
 
     def _matching(
@@ -92,7 +92,7 @@ class PatchGAN(Objective):
         lead: tuple[int, ...],
         of_true: tuple[int, ...],
     ) -> Float[Tensor, "*lead"]:
-        """Mean distance of features, over layers but the last and scales (Wang et al. 2018, eq. 4)."""
+        """Return the mean distance of features over all layers but the last and all scales (Wang et al. 2018, eq. 4)."""
         found = []
         for one, other in zip(false, true, strict=True):
             for ours, theirs in zip(one[:-1], other[:-1], strict=True):

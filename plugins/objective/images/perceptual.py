@@ -22,12 +22,12 @@ Cache = Annotated[int, Field(ge=0, le=2**20)]
 
 
 class FeatureDistance(Objective):
-    """The mean L1 distance of features at several depths, the deepest counting most.
+    """The mean L1 distance of features at several depths, with the largest weight on the deepest.
 
     It is Σ_l 2^(l - L) ‖φ_l(x) - φ_l(y)‖₁/n_l over the taps l = 1 … L (Wang et al. 2018, §3.4).
 
-    The features of true images are kept in memory as long as they fit, and found again by the image itself: it does
-    not matter whether the data vary.
+    The features of true images are kept in memory as long as they fit. They are looked up by the content of the image,
+    so that data which vary between epochs are handled correctly.
     """
 
     def __init__(self, weight: float, network: VGG, cache: int) -> None:
@@ -41,7 +41,7 @@ class FeatureDistance(Objective):
     @property
     @abstractmethod
     def term(self) -> str:
-        """What the distance is called in the journal."""
+        """Name of the distance in the journal."""
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         images, true = predicted_images(predictor, batch)
@@ -78,7 +78,7 @@ class FeatureDistance(Objective):
 
     def _keep(self, key: bytes, features: list[Tensor]) -> None:
         size = sum(level.nbytes for level in features)
-        # once full nothing goes: each image comes once an epoch, and the oldest would be the next to be asked
+        # A full cache replaces nothing: each image comes once an epoch, and the oldest entry is the next one needed.
         if self.bytes + size <= self.most:
             self.kept[key] = features
             self.bytes += size
@@ -89,14 +89,14 @@ class Perceptual(FeatureDistance):
 
     Args:
         weight: α.
-        weights: torchvision's file of the network; there is no stand-in for it: without one choose
-            objective=random_features, which is called so.
+        weights: torchvision's file of the network. Nothing replaces it: without a file choose
+            objective=random_features, whose name says what it is.
         layers: 16, with features of four depths, or 19, of five.
         cache: MiB of true images' features that are kept.
 
     Raises:
         ConfigError: no file, or one of another network.
-        CheckpointError: it is damaged.
+        CheckpointError: the file is damaged.
     """
 
     bibtex = """@inproceedings{johnson2016perceptual,
@@ -129,13 +129,13 @@ class Perceptual(FeatureDistance):
 class RandomFeatures(FeatureDistance):
     """Distance of features of a convolutional network with random weights: edges and textures of many scales.
 
-    Nothing in it was learned about images: it is no perceptual loss, and is never called one.
+    The network has learned nothing about images: the distance is no perceptual loss, and is never called one.
 
     Args:
         weight: factor.
         width: channels of the first block; VGG has 64.
-        depth: blocks, each of half the resolution of the one before.
-        seed: of the weights.
+        depth: number of blocks, each of half the resolution of the previous one.
+        seed: seed of the weights.
         cache: as of `Perceptual`.
     """
 

@@ -1,4 +1,4 @@
-"""The images that a predictor gives while it trains."""
+"""Predicted and true images of a batch during training."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -14,16 +14,17 @@ def predicted_images(
 ) -> tuple[
     Float[Tensor, "batch *member height width number"], Float[Tensor, "batch *_member height width number"]
 ]:
-    """Means of the densities of the batch's inputs, in numbers as files hold them; and what they should be.
+    """Return the means of the densities of the batch's inputs, in numbers as files hold them, and the true images.
 
-    The latter have one member where all members see the same rows, and as many where each has rows of its own.
+    The true images have one member if all members read the same rows, and as many as there are if each has its own
+    rows.
 
     Raises:
         ConfigError: the target is no image of red, green and blue.
     """
     with flagged(
         predictor, BATCH_NORM, "track_running_stats", False
-    ):  # the loss has told them of these inputs
+    ):  # the loss has already updated the moments with these inputs
         densities = predictor.training_densities(batch["input"])
     if len(densities.event_shape) != 3 or densities.event_shape[-1] != 3:
         raise ConfigError(
@@ -33,6 +34,6 @@ def predicted_images(
     images = densities.mean
     count, *members = images.shape[:-3]
     true = batch["target"].to(images.dtype)
-    if len(true) > count:  # those of the members one after the other
+    if len(true) > count:  # the rows of the members, concatenated
         return images, true.unflatten(0, (*members, count)).movedim(len(members), 0)
     return images, true.reshape(count, *[1] * len(members), *true.shape[1:])

@@ -12,11 +12,11 @@ from plugins.objective.images.vgg import TAPS, WIDTHS, Depth, layers_of
 FOLDER = TemporaryDirectory()
 IMAGES = Target("image", ("red", "green", "blue"), size=(20, 16))
 KINKS = {"gradient": 0.05}
-"""Differences step over where a unit is switched on."""
+"""Limits for finite differences that step over the kink of a ReLU."""
 
 
 def file_of(depth: Depth) -> str:
-    """Random weights in torchvision's names, for as many layers as are read."""
+    """Return a file of random weights in torchvision's names, for the layers that are read."""
     generator, channels, state = torch.Generator().manual_seed(depth), 3, {}
     for block, _, index in layers_of(depth, TAPS[depth][-1]):
         width = WIDTHS[block]

@@ -13,13 +13,13 @@ from plugins.objective.images.predicted import predicted_images
 
 
 class SquaredError(Objective):
-    """Mean squared distance of an image's numbers: of which the peak signal-to-noise ratio is a function.
+    """Mean squared distance of an image's numbers; the peak signal-to-noise ratio is a function of it.
 
-    Beside the absolute distance, whose slope is the same for every error and whose best answer is a median, it weighs
-    what is far off: a silhouette in the wrong place (Wang and Bovik 2009, §II).
+    The absolute distance has the same gradient for every error, and its optimum is a median. The squared distance gives
+    more weight to large errors, such as a silhouette in the wrong place (Wang and Bovik 2009, §II).
 
     Args:
-        weight: factor. An error d of the range [0, 1] counts more by its square than by |d| where d > 1 / weight.
+        weight: factor. An error d of the range [0, 1] counts more by its square than by |d| if d > 1 / weight.
     """
 
     bibtex = """@article{wang2009mean,

@@ -13,26 +13,29 @@ from framework.storage.weights import read_weights
 
 Depth = Literal[16, 19]
 CONVOLUTIONS: dict[Depth, tuple[int, ...]] = {16: (2, 2, 3, 3, 3), 19: (2, 2, 4, 4, 4)}
-"""Of each block, between poolings (Simonyan & Zisserman 2015, table 1, columns D and E)."""
+"""Number of convolutions of each block, between poolings (Simonyan & Zisserman 2015, table 1, columns D and E)."""
 WIDTHS = (64, 128, 256, 512, 512)
-"""Channels of each block."""
+"""Number of channels of each block."""
 TAPS: dict[Depth, tuple[tuple[int, int], ...]] = {
     16: ((0, 1), (1, 1), (2, 2), (3, 2)),
     19: ((0, 0), (1, 0), (2, 0), (3, 0), (4, 0)),
 }
-"""Whose outputs are features: block and convolution, from 0: relu1_2, 2_2, 3_3, 4_3 of 16 layers (Johnson et al. 2016),
-relu1_1, 2_1, 3_1, 4_1, 5_1 of 19 (Wang et al. 2018)."""
+"""Convolutions whose outputs are features, as block and convolution, counted from 0.
+
+They are relu1_2, 2_2, 3_3, 4_3 of 16 layers (Johnson et al. 2016), relu1_1, 2_1, 3_1, 4_1, 5_1 of 19 (Wang et al.
+2018).
+"""
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of red, green and blue over ImageNet, which torchvision's weights expect to be taken off and divided by."""
+"""Mean and standard deviation of red, green and blue over ImageNet; torchvision's weights expect normalised images."""
 
 
 class VGG(nn.Module):
-    """Features of images after some of the convolutions, in the images' own number type; nothing in it is trained.
+    """Features of images after some of the convolutions, in the images' own dtype; no parameter is trained.
 
     Args:
-        depth: layers of the whole network, of which only convolutions up to the last tap are kept.
+        depth: number of layers of the whole network; only the convolutions up to the last tap are kept.
         widths: channels of each block.
-        taps: after which convolutions features are taken, ascending.
+        taps: convolutions whose outputs are features, ascending.
     """
 
     def __init__(self, depth: Depth, widths: Sequence[int], taps: Sequence[tuple[int, int]]) -> None:
@@ -42,13 +45,13 @@ class VGG(nn.Module):
         channels = 3
         for block, place, _ in self.layers:
             shape = (widths[block], channels, 3, 3)
-            # not in a checkpoint: they come from a file, or from a seed
+            # not in a checkpoint: the weights come from a file, or from a seed
             self.register_buffer(f"weight_{block}_{place}", torch.zeros(shape), persistent=False)
             self.register_buffer(f"bias_{block}_{place}", torch.zeros(widths[block]), persistent=False)
             channels = widths[block]
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
-        """Of images in numbers as files hold them, (image, channel, height, width) of each tap."""
+        """Return (image, channel, height, width) of each tap, for images in numbers as files hold them."""
         mean, spread = (images.new_tensor(values)[:, None, None] for values in (MEAN, SPREAD))
         hidden, found, block_before = (images - mean) / spread, [], 0
         for block, place, _ in self.layers:
@@ -64,12 +67,12 @@ class VGG(nn.Module):
 
     @property
     def least_side(self) -> int:
-        """Pixels that an image needs for the last features to be there."""
+        """Smallest side, pixels, of an image that still has the last features."""
         return 2 ** self.taps[-1][0]
 
 
 def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]:
-    """Block, convolution and place in torchvision's `features` of every convolution up to the last one asked for."""
+    """Return block, convolution and index in torchvision's `features` of every convolution up to the last tap."""
     found, index = [], 0
     for block, count in enumerate(CONVOLUTIONS[depth]):
         for place in range(count):
@@ -82,11 +85,11 @@ def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]
 
 
 def trained(depth: Depth, file: str) -> VGG:
-    """With the weights of a file as torchvision writes it, the whole network or its `features` alone.
+    """Return the network with weights of a file as torchvision writes it, whole or its `features` alone.
 
     Raises:
         ConfigError: there is no such file, or it holds other weights.
-        CheckpointError: it is damaged.
+        CheckpointError: the file is damaged.
     """
     network = VGG(depth, WIDTHS, TAPS[depth])
     stored = read_weights(file)
@@ -106,10 +109,12 @@ def trained(depth: Depth, file: str) -> VGG:
 
 
 def drawn(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) -> VGG:
-    """With weights drawn from a seed, such that numbers keep their size from layer to layer (He et al. 2015, eq. 10).
+    """Return the network with weights drawn from a seed, which keep the scale from layer to layer.
+
+    Their variance is that of He et al. 2015, eq. 10.
 
     Args:
-        width: channels of the first block, of which the others have as many times more as VGG's.
+        width: channels of the first block; those of the others are in VGG's proportion.
     """
     network = VGG(depth, [width * channels // WIDTHS[0] for channels in WIDTHS], taps)
     generator = torch.Generator().manual_seed(seed)

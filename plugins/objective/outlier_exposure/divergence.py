@@ -1,4 +1,4 @@
-"""How far a density is from knowing nothing: divergences between it and a uniform one, for every kind of target."""
+"""Divergences between a density and a uniform one, for every kind of target."""
 
 import math
 
@@ -11,35 +11,35 @@ from framework.distributions.circular import Circular
 from framework.distributions.closed_forms import normal_quantile
 
 DRAWS = 16
-"""Targets that a divergence of a continuous density is estimated from, for each of the batch."""
+"""Number of targets from which a divergence of a continuous density is estimated, for each item of the batch."""
 
 
 def from_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
-    """KL(p ‖ u) = log K - H(p) over K classes, nats: the entropy of thesis eq. 2.21 up to a constant."""
+    """Return KL(p ‖ u) = log K - H(p) over K classes, nats: the entropy of thesis eq. 2.21 up to a constant."""
     log_prob = density.log_prob(density.enumerate_support())
-    # p log p → 0 as p → 0; cut off where p is 0 in any floating-point number, lest 0 × ∞
+    # p log p → 0 as p → 0; log p is clamped where p rounds to 0, which would give 0 × ∞
     return (log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) + math.log(len(log_prob))
 
 
 def to_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
-    """KL(u ‖ p) = -Σ_k log p_k / K - log K over K classes, nats (Hendrycks et al. 2019, §4)."""
+    """Return KL(u ‖ p) = -Σ_k log p_k / K - log K over K classes, nats (Hendrycks et al. 2019, §4)."""
     log_prob = density.log_prob(density.enumerate_support())
     return -log_prob.mean(0) - math.log(len(log_prob))
 
 
 def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]:
-    """KL(u ‖ p) = E_u[-log p] - H(u) of a continuous density, nats, from a few targets drawn from u; unbiased.
+    """Return an unbiased estimate of KL(u ‖ p) = E_u[-log p] - H(u) of a continuous density, nats.
 
-    u is uniform in every angle and N(0, scale²) in every real. Where the density's support has ranges, the angles are
-    those of a rotation, and u is uniform over rotations: sin e is uniform of an elevation e in [-π/2, π/2].
-    Places are a Latin hypercube: each of n equal shares of each number's mass holds one (McKay, Beckman & Conover
-    1979), so that the estimate of one number errs by O(n^-3/2) and not O(n^-1/2). All members of a batch of
-    (batch, member) see the same targets.
+    It is estimated from a few targets drawn from u, which is uniform in every angle and N(0, scale²) in every real. If
+    the density's support has ranges, the angles are those of a rotation, and u is uniform over rotations: sin e is
+    uniform for an elevation e in [-π/2, π/2]. The targets are a Latin hypercube: each of n equal shares of each
+    number's probability holds one (McKay, Beckman & Conover 1979), so that the estimate for one number has an error of
+    O(n^-3/2) instead of O(n^-1/2). All members of a batch of (batch, member) get the same targets.
     """
     support = density.support
     numbers = density.event_shape[0]
     members = (1,) * (len(density.batch_shape) - 1)
-    like = density.sample(torch.Size((0,)))  # of nothing: tells the density's type and device
+    like = density.sample(torch.Size((0,)))  # an empty sample shows the density's dtype and device
     place = latin_hypercube((*density.batch_shape[:1], *members, numbers), like.device)
     if isinstance(support, Circular):
         ranges = support.ranges or ((-math.pi, math.pi),) * numbers
@@ -50,7 +50,7 @@ def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]
         log_each = torch.where(elevation, (drawn.cos() / 2).log(), -(high - low).log())
         entropy = -log_each.sum(-1).mean(
             0
-        )  # at the targets drawn: of equal densities nothing is left to chance
+        )  # at the same targets, so that the estimate is exactly 0 for equal densities
     else:
         drawn = scale * normal_quantile(place)
         entropy = numbers * (0.5 + 0.5 * math.log(2 * math.pi) + math.log(scale))
@@ -59,6 +59,6 @@ def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]
 
 
 def latin_hypercube(shape: tuple[int, ...], device: torch.device) -> Float[Tensor, "draw *shape"]:
-    """DRAWS places in [0, 1) for each of `shape`, one in each DRAWS-th, in random order; float64."""
+    """Return DRAWS places in [0, 1) for each of `shape`, one in each DRAWS-th, in random order; float64."""
     order = torch.rand(DRAWS, *shape, dtype=torch.float64, device=device).argsort(0)
     return (order + torch.rand(DRAWS, *shape, dtype=torch.float64, device=device)) / DRAWS

@@ -1,4 +1,4 @@
-"""A penalty on densities of outliers that are far from knowing nothing."""
+"""A penalty on densities of outliers that differ from a uniform density."""
 
 from typing import Annotated, Literal
 
@@ -20,26 +20,26 @@ from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignor
 
 
 class OutlierExposure(Objective):
-    """Asks for densities of outliers to tell nothing (thesis eq. 2.21), for every kind of target.
+    """A penalty for densities of outliers that differ from a uniform one (thesis eq. 2.21), for every kind of target.
 
-    The penalty is the weight times the mean over outliers of a divergence, nats, that is 0 for a density that knows
-    nothing. For classes "entropy" is KL(p ‖ u) = log K - H(p): eq. 2.21 plus a constant, which no gradient sees; and
-    "cross_entropy" is KL(u ‖ p), whose gradient does not vanish where p is sure of a class. For angles and reals it is
+    The penalty is the weight times the mean over outliers of a divergence, nats, that is 0 for a density without
+    information. For classes "entropy" is KL(p ‖ u) = log K - H(p): eq. 2.21 plus a constant, which has no gradient.
+    "cross_entropy" is KL(u ‖ p), whose gradient does not vanish if p is certain of a class. For angles and reals it is
     KL(u ‖ p), estimated without bias from a few targets drawn from u. "auto" is the first for classes, and the second
     for others.
 
-    Outliers are either the training split of other data, with that data's augmentation, or uniform numbers; each step
-    draws its own, with replacement, from torch's global generator. Batch norm sees them as it would in a test: it
-    normalises them by the running moments of the training data, and learns none from them.
+    Outliers are either the training split of other data, with that data's augmentation, or uniform numbers. Each step
+    draws its own, with replacement, from torch's global generator. Batch norm treats them as in a test: it normalises
+    them by the running moments of the training data, and does not update these.
 
     Args:
         weight: λ.
         outliers: data to draw from; prepared at once.
-        low, high: the range of uniform numbers, in the units of the inputs; of images, 0 and 1.
-        count: outliers of a step; as many as the batch has samples for each model where not given.
+        low, high: the range of uniform numbers, in the units of the inputs; for images, 0 and 1.
+        count: number of outliers of a step; None: the number of samples that the batch has for each model.
         clearance: outliers nearer than this to an input of the batch (Euclidean, in its units) are left out: uniform
-            numbers also fall among the training data, where knowing nothing costs likelihood. 0 keeps all.
-        divergence: how far from knowing nothing.
+            numbers also fall among the training data, where a uniform density costs likelihood. 0 keeps all.
+        divergence: "auto", "entropy" or "cross_entropy".
         prior_scale: standard deviation of u for a real number, in the target's units.
 
     Raises:
@@ -96,7 +96,7 @@ class OutlierExposure(Objective):
         return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
 
     def _divergences(self, density: Distribution) -> Float[Tensor, "batch *member"]:
-        """Of each outlier and member, nats."""
+        """Return the divergence of each outlier and member, nats."""
         if density.has_enumerate_support:
             return to_uniform(density) if self.divergence == "cross_entropy" else from_uniform(density)
         if self.divergence == "entropy":
@@ -122,7 +122,7 @@ class OutlierExposure(Objective):
         if count == 0:
             return inputs
         index = torch.randint(len(self.split), (count,)).tolist()  # pyright: ignore[reportArgumentType]
-        # a loader of one batch: it knows which data sets fetch many items at once
+        # a loader of one batch: it handles data sets that fetch many items at once
         loader = DataLoader(
             self.split, batch_sampler=[index], collate_fn=as_batch, generator=torch.Generator()
         )
@@ -133,7 +133,7 @@ class OutlierExposure(Objective):
 def clear_of(
     outliers: Float[Tensor, "outlier *input"], inputs: Tensor, clearance: float
 ) -> Bool[Tensor, "outlier"]:
-    """Which outliers are at least `clearance` away from every input; bytes are read as 0 to 1."""
+    """Return which outliers are at least `clearance` away from every input; bytes are read as 0 to 1."""
     if len(inputs) == 0 or len(outliers) == 0:
         return torch.ones(len(outliers), dtype=torch.bool, device=outliers.device)
     some, others = (
@@ -144,7 +144,7 @@ def clear_of(
 
 
 def uniform_range(low: float | None, high: float | None, *, other: bool) -> tuple[float, float]:
-    """(low, high), or NaNs where there is another source of outliers.
+    """Return (low, high), or NaNs if there is another source of outliers.
 
     Raises:
         ConfigError: both sources or neither, or an empty range.

@@ -7,7 +7,7 @@ CLASSES = Target("class", ("a", "b", "c"))
 ANGLE = Target("angle", ("azimuth",))
 ANGLES = Target("angle", ("azimuth", "elevation"))
 REALS = Target("real", ("x", "y"))
-BOX = {"low": -4.0, "high": 4.0}  # that of the thesis's toy data
+BOX = {"low": -4.0, "high": 4.0}  # the range of the thesis's toy data
 
 ROWS = {
     "outlier_exposure": (
