@@ -1,1 +1,1 @@
-"""Frozen models: one CPU core, no gradient, nothing that only training needs."""
+"""Frozen models: one CPU core, no gradient, and no parts that only training needs."""

@@ -1,8 +1,9 @@
-"""The deployable form of a trained model: one CPU core, no gradient, nothing that only training needs.
+"""The deployable form of a trained model: one CPU core, no gradient, and no parts that only training needs.
 
-What a model computes from features to raw numbers is read off its own graph (torch.export), so that no encoder has to
-say what it is made of. Where that is fully connected layers, batch norm is folded into the weights beside it, dropout
-is gone, and what runs is NumPy and one compiled function. Anything else is run by torch as it is, without gradient.
+The computation from features to raw parameters is read from the model's own graph (torch.export), so that no encoder
+has to declare its layers. If the graph holds fully connected layers only, batch norm is folded into the neighbouring
+weights, dropout is removed, and NumPy and one compiled function compute the result. Torch runs any other model as it
+is, without gradient.
 """
 
 import copy
@@ -30,27 +31,30 @@ from framework.model import FrozenFrontEnd, Model, Predictor
 def freeze(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> "Frozen":
-    """The deployable form of a trained model.
+    """Return the deployable form of a trained model.
 
     Args:
-        run_or_checkpoint, uri, paths: as of `framework.load`.
+        run_or_checkpoint: run or checkpoint, as in `framework.load`.
+        uri: store, as in `framework.load`.
+        paths: paths, as in `framework.load`.
 
     Raises:
-        CheckpointError, ConfigError: as `framework.load`.
+        CheckpointError, ConfigError: as in `framework.load`.
     """
     predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
     return Frozen(predictor, description.input_shape, reader(description))
 
 
 def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "Frozen":
-    """The deployable form of a predictor, a copy: training it further does not change what was frozen.
+    """Return the deployable form of a predictor. It is a copy, so later training does not change it.
 
     Args:
-        input_shape: of one sample. Needed by a predictor without fixed encoders in front; where it is not given, the
-            first call tells, and takes seconds.
+        predictor: a predictor that was not loaded from a run.
+        input_shape: shape of one sample, for a predictor without fixed encoders in front. If it is not given, the first
+            call determines it and takes seconds.
 
     Raises:
-        ConfigError: it was loaded, and so takes raw input, which `freeze` makes ready in the frozen form too.
+        ConfigError: the predictor was loaded, so it takes raw input; `freeze` handles raw input.
     """
     if predictor.description is not None:
         raise ConfigError("This model was loaded from a run or checkpoint. Give that to framework.freeze.")
@@ -59,10 +63,10 @@ def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "F
 
 @final
 class Frozen:
-    """Inputs in, numbers out; the predictor's own to 1e-6, in the type of its parameters.
+    """Function from inputs to numbers that equal the predictor's own to 1e-6, in the type of its parameters.
 
     Attributes:
-        form: what computes them, in words.
+        form: description of what computes the numbers.
     """
 
     def __init__(
@@ -83,16 +87,19 @@ class Frozen:
             self._read(self.shape)
 
     def __call__(self, inputs: Any) -> np.ndarray:
-        """Of a model of classes their probabilities, (batch, class); of images their mean, (batch, height, width,
-        number), for no draws of a mixture of them show a picture; else the point prediction, (batch, number).
+        """Return the prediction for inputs.
+
+        It is the probabilities, (batch, class), of a model of classes, and the mean, (batch, height, width, number), of
+        a model of images, because draws of a mixture of images show no image. Otherwise it is the point prediction,
+        (batch, number).
 
         Args:
-            inputs: what `framework.load`'s model takes; of a predictor that was frozen by itself its inputs, with the
-                batch dimension first, in NumPy or on the CPU in torch.
+            inputs: inputs as the model of `framework.load` takes them. A predictor that was frozen by `frozen` takes
+                its own inputs, with the batch dimension first, in NumPy or in torch on the CPU.
 
         Raises:
             DataError: it is no input of this model.
-            ValueError: what is computed is not finite; names the first such batch row.
+            ValueError: a computed number is not finite; the message names the first such batch row.
         """
         features, network, frame = self._features(inputs)
         if network is not None and network.classes:
@@ -109,16 +116,18 @@ class Frozen:
             found = density.mean if len(density.event_shape) == 3 else median(density, 1000)
             return (found if frame is None else frame.location + frame.scale * found).numpy()
 
-    @torch.no_grad()  # not in inference mode: whoever asks the density later is outside of it
+    @torch.no_grad()  # not in inference mode, because the density is used outside of it later
     def density(self, inputs: Any) -> Distribution:
-        """The density over the target, with batch_shape (batch,); inputs as above."""
+        """Return the density over the target, with batch_shape (batch,); inputs are the same as for a call."""
         features, network, frame = self._features(inputs)
         density = self._density(features, network)
         return density if frame is None else Moved(density, *frame)
 
     def _features(self, inputs: Any) -> tuple[Any, Network | None, Frame | None]:
-        """What the inner predictor reads, in the form that the network reads, if there is one for it; and the frame of
-        the answers."""
+        """Return the features that the inner predictor reads, its network, and the frame of the predictions.
+
+        The features are in the form that the network reads. The network is None if torch computes the prediction.
+        """
         frame = None
         if self.data is not None:
             batch = self.data.asked(inputs)
@@ -141,6 +150,7 @@ class Frozen:
         return np.ascontiguousarray(flat, dtype=network.dtype), network, frame
 
     def _density(self, features: Any, network: Network | None) -> Distribution:
+        """Return the density for features."""
         if network is None:
             return self.inner(features)
         raw = torch.from_numpy(network(features))
@@ -150,6 +160,7 @@ class Frozen:
         return self.inner.head(raw)
 
     def _read(self, shape: tuple[int, ...]) -> None:
+        """Read the network of the model for features of this shape, if it has one."""
         if not isinstance(self.inner, Model):
             self.form = f"{type(self.inner).__name__} in torch, without gradient"
             return
@@ -164,7 +175,7 @@ class Frozen:
 
 
 def _tensor(inputs: np.ndarray | Tensor) -> Tensor:
-    # torch wants memory that it might write to
+    # torch accepts only memory that it may write to
     return (
         inputs
         if isinstance(inputs, Tensor)

@@ -1,6 +1,6 @@
-"""Reads the fully connected layers of a model off its own graph, and computes them in NumPy and compiled functions.
+"""Reads the fully connected layers of a model from its graph, and computes them in NumPy and compiled functions.
 
-`no_type_check` keeps the type checks that tests switch on from wrapping a kernel before it is compiled.
+`no_type_check` prevents the type checks that tests switch on from wrapping a kernel before it is compiled.
 """
 
 import copy
@@ -22,13 +22,16 @@ from framework.model import Model
 from framework.storage.kernels import compiler, kept_in
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
-"""What a network may be made of to be worth reading; exporting another one takes long and leads nowhere."""
-MOST_RAW = 2048  # raw numbers of a head that is asked whether it is a softmax of them
+"""Kinds of layers that a network may hold; the export of another one takes long and cannot succeed."""
+MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for a softmax
 
 
 @dataclass
 class Layer:
-    """A step: register `source` times `weight` (inputs, outputs) plus `bias`, negative numbers cut off on request."""
+    """Step of a fully connected layer: register `source` times `weight` (inputs, outputs) plus `bias`.
+
+    `rectified` sets negative results to 0.
+    """
 
     source: int
     weight: np.ndarray
@@ -36,35 +39,37 @@ class Layer:
     rectified: bool = False
 
     def __call__(self, registers: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the result of the layer, (batch, outputs)."""
         numbers = registers[self.source]
         if len(numbers) == 1:
             found = np.empty((1, len(self.bias)), self.bias.dtype)
             connected(numbers[0], self.weight, self.bias, self.rectified, found[0])
             return found
-        # from two samples on they share the reading of the weights (benchmarks/framework/frozen.md)
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused in the end
+        # Two or more samples share the reading of the weights (benchmarks/framework/frozen.md).
+        with np.errstate(invalid="ignore", over="ignore"):  # the caller refuses numbers that are not finite
             found = numbers @ self.weight
             found += self.bias
         return np.maximum(found, 0, out=found) if self.rectified else found
 
 
 class Joined(NamedTuple):
-    """A step: registers side by side."""
+    """Step that concatenates registers."""
 
     sources: tuple[int, ...]
 
     def __call__(self, registers: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the registers side by side, (batch, sum of lengths)."""
         return np.concatenate([registers[source] for source in self.sources], 1)
 
 
 @dataclass
 class Network:
-    """Steps from features (batch, length), register 0, to raw numbers; each step's result is the next register.
+    """Steps from features (batch, length), register 0, to raw parameters; the result of each step is the next register.
 
     Attributes:
-        result: register of the raw numbers.
-        dtype: of all numbers.
-        classes: whether the result is logits of classes and not what the head reads.
+        result: register of the raw parameters.
+        dtype: type of all numbers.
+        classes: True if the result is logits of classes instead of the head's raw parameters.
     """
 
     steps: list[Layer | Joined]
@@ -73,13 +78,14 @@ class Network:
     classes: bool = False
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
+        """Return the raw parameters or logits for features."""
         registers = [features]
         for step in self.steps:
             registers.append(step(registers))
         return registers[self.result]
 
     def cast(self, dtype: np.dtype) -> None:
-        """To the type of numbers it shall compute in."""
+        """Convert weights and biases to the type in which the network computes."""
         self.dtype = dtype
         for step in self.steps:
             if isinstance(step, Layer):
@@ -88,7 +94,10 @@ class Network:
 
 
 def read(model: Model, shape: tuple[int, ...]) -> Network | None:
-    """The network of a model's encoders and linear layer, and of its head if that is a softmax; None of any other."""
+    """Return the network of a model's encoders and linear layer; None if the model is of another kind.
+
+    The network includes the head if the head is a softmax.
+    """
     leaves = [part for part in model.encoders.modules() if not list(part.children())]
     first = next(model.parameters(), None)
     if (
@@ -103,7 +112,7 @@ def read(model: Model, shape: tuple[int, ...]) -> Network | None:
     disabled = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
-        with redirect_stderr(StringIO()):  # the exporter writes and logs pages on what it cannot do
+        with redirect_stderr(StringIO()):  # the exporter prints and logs pages about what it cannot do
             exported = torch.export.export(whole, (probe,), dynamic_shapes=({0: torch.export.Dim("batch")},))
         network = _Reader(exported).network()
         if not all(agree(network, whole, probe[:count]) for count in (1, 3)):
@@ -124,18 +133,18 @@ def read(model: Model, shape: tuple[int, ...]) -> Network | None:
 
 @torch.no_grad()
 def agree(network: "Network", whole: nn.Module, inputs: Tensor) -> bool:
-    """Whether both give the same raw numbers, but for rounding, which batch norm may have amplified."""
+    """Return whether network and module give the same raw parameters, up to rounding, which batch norm may amplify."""
     found, wanted = network(inputs.flatten(1).double().numpy()), whole(inputs).numpy()
     allowed = 1e4 * np.finfo(wanted.dtype).eps * max(1.0, float(np.abs(wanted).max()))
     return bool(np.abs(found - wanted).max() <= allowed)
 
 
 class Unread(Exception):
-    """A graph holds something else than fully connected layers."""
+    """Error for a graph that holds other parts than fully connected layers."""
 
 
 class Signal(NamedTuple):
-    """A node of the graph: scale * register + shift, number by number; both None where they are 1 and 0."""
+    """A node of the graph as scale * register + shift, element by element; both are None if they are 1 and 0."""
 
     register: int
     scale: np.ndarray | None = None
@@ -143,7 +152,7 @@ class Signal(NamedTuple):
 
 
 class _Reader:
-    """Turns an exported graph into a network of float64."""
+    """Converter of an exported graph into a network of float64."""
 
     def __init__(self, exported: torch.export.ExportedProgram) -> None:
         self.graph = exported.graph
@@ -157,7 +166,11 @@ class _Reader:
         self.signals: dict[Node, Signal] = {}
 
     def network(self) -> Network:
-        """Raises Unread where it is anything else."""
+        """Return the network.
+
+        Raises:
+            Unread: the graph holds other parts.
+        """
         result = None
         for node in self.graph.nodes:
             if node.op == "placeholder":
@@ -172,6 +185,7 @@ class _Reader:
         return Network(self.steps, result.register, np.dtype(np.float64))
 
     def _signal(self, node: Node, name: str) -> Signal:
+        """Return the signal of a node, and add the step that computes it if there is one."""
         arguments: Any = node.args
         if name == "cat":
             return self._joined(arguments[0], arguments[1:])
@@ -194,6 +208,7 @@ class _Reader:
         raise Unread
 
     def _connected(self, source: Signal, arguments: Any) -> Signal:
+        """Add a fully connected layer."""
         weight = self.numbers[arguments[1].name].T
         bias = self._number(arguments, 2, np.zeros(weight.shape[1]))
         if source.scale is not None:
@@ -203,7 +218,10 @@ class _Reader:
         return Signal(len(self.steps))
 
     def _normalised(self, source: Signal, arguments: Any) -> Signal:
-        """(x - mean) / √(variance + ε) * weight + bias: into the layer before it, else into the one after it."""
+        """Fold batch norm, (x - mean) / √(variance + ε) * weight + bias, into a neighbouring layer.
+
+        It is the layer before it if possible, or else the layer after it.
+        """
         mean, variance = (self.numbers[arguments[index].name] for index in (3, 4))
         scale = self._number(arguments, 1, np.ones_like(mean)) / np.sqrt(variance + arguments[7])
         shift = self._number(arguments, 2, np.zeros_like(mean)) - mean * scale
@@ -215,6 +233,7 @@ class _Reader:
         return Signal(source.register, source.scale * scale, source.shift * scale + shift)
 
     def _joined(self, nodes: Sequence[Node], axis: Sequence[int]) -> Signal:
+        """Add a concatenation."""
         if any(node.meta["val"].dim() != 2 for node in nodes) or list(axis) not in ([1], [-1]):
             raise Unread
         signals = [self.signals[node] for node in nodes]
@@ -228,7 +247,7 @@ class _Reader:
         return Signal(len(self.steps), np.concatenate(scale), np.concatenate(shift))
 
     def _open(self, node: Node) -> Layer | None:
-        """The layer a node is the result of, if nobody else reads it as it is now."""
+        """Return the layer whose result a node is, if no other node reads this result; else None."""
         register = self.signals[node].register
         step = self.steps[register - 1] if register else None
         readers = [other for other, signal in self.signals.items() if signal.register == register]
@@ -236,16 +255,18 @@ class _Reader:
         return step if isinstance(step, Layer) and not step.rectified and alone else None
 
     def _number(self, arguments: Any, index: int, otherwise: np.ndarray) -> np.ndarray:
+        """Return the parameter at `index` of a node's arguments, or `otherwise` if it is missing."""
         given = len(arguments) > index and arguments[index] is not None
         return self.numbers[arguments[index].name] if given else otherwise
 
 
 @torch.no_grad()
 def affine_logits(head: DensityHead) -> tuple[np.ndarray, np.ndarray] | None:
-    """Matrix (size, class) and constant (class,) with which a head's density is the softmax of raw @ matrix + constant.
+    """Return a matrix (size, class) and a constant (class,) of a head whose density is a softmax; None for other heads.
 
-    Found by asking the head at 0, at each unit vector and at random raw numbers of several sizes, in float64: so no
-    head has to declare it, and whatever is not affine there is left to torch. None of any other head.
+    The density is the softmax of raw @ matrix + constant. They are found from the head's density at 0, at each unit
+    vector and at random raw parameters of several sizes, in float64. So no head has to declare them, and torch handles
+    every head that is not affine at these points.
     """
     if head.size > MOST_RAW:
         return None
@@ -271,10 +292,10 @@ compiled = compiler(kept_in("frozen_network", [Path(__file__)]))
 @compiled
 @no_type_check
 def connected(numbers, weight, bias, rectified, outputs):
-    """outputs = numbers @ weight + bias of one sample; weights of inputs that are 0 are not read.
+    """Compute outputs = numbers @ weight + bias of one sample; the weights of inputs that are 0 are not read.
 
-    After a ReLU about half of them are, and to read the weights is what a batch of one costs. Eight inputs at a time,
-    so that the outputs are read and written an eighth as often.
+    After a ReLU about half of the inputs are 0, and reading the weights is the cost of a batch of one. Eight inputs are
+    added at a time, so that the outputs are read and written an eighth as often.
     """
     length, width = weight.shape
     alive = np.empty(length, np.int64)
@@ -309,7 +330,7 @@ def connected(numbers, weight, bias, rectified, outputs):
 @compiled
 @no_type_check
 def softmax(logits):
-    """Of each row, in place; a row with a number that is not finite becomes NaN."""
+    """Replace each row of logits by its softmax; a row with a number that is not finite becomes NaN."""
     for row in range(logits.shape[0]):
         largest = logits[row, 0]
         for j in range(logits.shape[1]):

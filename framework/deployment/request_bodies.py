@@ -1,6 +1,6 @@
 """Requests that MLflow can parse in bounded memory: content types, and bodies of JSON or CSV, checked without parsing.
 
-Parquet is not read: a file of a few kilobytes can unfold to any size, and only the library that unfolds it can tell.
+Parquet is not read. A file of a few kilobytes can expand to any size, and only the library that expands it can tell.
 """
 
 import json
@@ -12,28 +12,28 @@ import numpy as np
 from framework.errors import quoted, shown
 
 MOST_BODY = 2**26
-"""Bytes of the body of a request."""
+"""Largest size of the body of a request, bytes."""
 MOST_CONTENT = 2**25
-"""Bytes of one file in a request."""
+"""Largest size of one file in a request, bytes."""
 MOST_FILES = 64
-"""Files in a request."""
+"""Largest number of files in a request."""
 MOST_ROWS = 2**17
-"""Rows of a request, and samples that its files may hold."""
+"""Largest number of rows of a request, and of samples in its files."""
 MOST_VALUES = 2**20
-"""Values in a body, JSON or CSV; a list, a dictionary and an empty cell count as one."""
+"""Largest number of values in a body, JSON or CSV; a list, a dictionary and an empty cell count as one value."""
 MOST_DEPTH = 32
-"""Lists and dictionaries of JSON within each other."""
+"""Largest depth of nested lists and dictionaries in JSON."""
 MOST_INPUTS = 2**25
-"""Numbers of all inputs that a request is turned into."""
+"""Largest number of numbers in all inputs that a request becomes."""
 AT_ONCE = 2**28
-"""Bytes of the bodies that the server holds at the same time; at least one request is always answered."""
+"""Largest size, in bytes, of the bodies that the server holds at a time; one request at least is always answered."""
 
 FORMS = ("dataframe_split", "dataframe_records", "instances", "inputs")
 """Keys of JSON under which MLflow takes rows."""
 
 
 class Refused(Exception):
-    """A request that is not answered: the HTTP status, and the sentence for the client."""
+    """Refusal of a request: the HTTP status, and the sentence for the client."""
 
     def __init__(self, status: int, sentence: str) -> None:
         super().__init__(sentence)
@@ -44,7 +44,7 @@ def content_type(headers: Mapping[bytes, bytes]) -> str:
     """Return the media type of a body, "application/json" or "text/csv".
 
     Raises:
-        Refused: it is another one, or in another encoding than UTF-8.
+        Refused: the media type is another one, or the encoding is not UTF-8.
     """
     said = headers.get(b"content-type", b"").decode("latin-1")
     kind, *parameters = (part.strip() for part in said.split(";"))
@@ -63,7 +63,7 @@ def require_bounded(body: bytes, kind: str) -> None:
     """Refuse a body that is too large, deep or malformed for MLflow to parse.
 
     Raises:
-        Refused: says what came, what was wanted, what to do.
+        Refused: the message says what came, what was wanted and what to do.
     """
     try:
         text = body.decode("utf-8")
@@ -83,8 +83,8 @@ def require_bounded(body: bytes, kind: str) -> None:
 
 
 def _require_few(body: bytes) -> None:
-    """Count values and depth of JSON that may be damaged, without parsing it, in bounded memory."""
-    # of pairs from left to right what remains is a backslash before a letter that ends no text
+    """Check the number of values and the depth of JSON, which may be damaged, in bounded memory and without parsing."""
+    # Escaped backslashes and quotation marks are removed; a remaining backslash precedes a letter that ends no text.
     plain = body.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, _OTHERS)
     if plain.count(b'"') > 4 * MOST_VALUES:
         raise Refused(413, _too_many(f"more than {2 * MOST_VALUES} texts"))
@@ -110,7 +110,7 @@ def _require_table(text: str) -> None:
     lines = text.splitlines()
     if len(lines) > MOST_ROWS:
         raise Refused(413, _too_many(f"{len(lines)} lines"))
-    # pandas fills short lines up to the length of the longest
+    # pandas pads short lines to the length of the longest one.
     columns = 1 + max(line.count(",") for line in lines)
     if columns * len(lines) > MOST_VALUES:
         raise Refused(413, _too_many(f"{len(lines)} lines of up to {columns} cells"))
@@ -167,7 +167,7 @@ def _require_split(given: object) -> None:
 
 
 def _require_records(given: object, form: str) -> None:
-    """Refuse records of unlike keys: 1000 of 1000 keys each would make a table of 10⁹ cells."""
+    """Refuse records with different keys: 1000 records of 1000 keys each would make a table of 10⁹ cells."""
     if not isinstance(given, list) or not given:
         raise Refused(400, f"{form!r} is {_name(given)}; wanted a list of rows, {{column: value}}.")
     if len(given) > MOST_ROWS:

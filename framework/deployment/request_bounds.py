@@ -1,7 +1,8 @@
-"""Bounds on the requests that `mlflow models serve` answers: they hold before MLflow parses a body.
+"""Limits on the requests that `mlflow models serve` answers; they apply before MLflow parses a body.
 
-This is code of our own because MLflow's server reads bodies of any size, parses JSON of any depth, and answers errors
-with stack traces; it has no setting for any of these, and calls the model only after it has parsed the request.
+The project has its own code for this because MLflow's server reads bodies of any size, parses JSON of any depth, and
+answers errors with stack traces. It has no setting for any of these, and calls the model only after it has parsed the
+request.
 """
 
 import asyncio
@@ -29,7 +30,7 @@ from framework.errors import DataError, printable, shown
 
 INVOCATIONS = "/invocations"
 MOST_PASSED_OVER = 2**28
-"""Bytes that are received of a refused body, and not kept."""
+"""Number of bytes of a refused body that are received and discarded."""
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -41,13 +42,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Ticket:
-    """What the server and the model say to each other about one request.
+    """Data that the server and the model exchange about one request.
 
     Attributes:
-        seconds: what the request may take.
-        deadline: when it ends, by `time.monotonic`.
+        seconds: time limit of the request.
+        deadline: end of that time, by `time.monotonic`.
         sentence: why the model refused the request.
-        remarks: what an answer says beside its table.
+        remarks: remarks of the model, sent beside the answer's table.
     """
 
     seconds: float
@@ -67,19 +68,19 @@ class Ticket:
 
 
 REMARK = b"x-model-remark"
-"""Header of an answer with what a wrapper of the model found when it was calibrated."""
+"""Header of an answer with a remark that a wrapper of the model made when it was calibrated."""
 
 
 @dataclass
 class Received:
-    """What has come of a body: bytes, and whether that is all."""
+    """State of a body that is being received: its bytes so far, and whether it is complete."""
 
     size: int = 0
     complete: bool = False
 
 
 TICKET: ContextVar[Ticket | None] = ContextVar("ticket", default=None)
-"""The request that is being answered; None in a process that is no server."""
+"""Ticket of the request that is being answered; None in a process that is not a server."""
 
 
 def too_long(seconds: float) -> str:
@@ -92,13 +93,13 @@ def too_long(seconds: float) -> str:
 
 @final
 class Bounded:
-    """An ASGI application that answers requests within bounds by another one, MLflow's.
+    """ASGI application that answers requests with another application, MLflow's, within limits.
 
     Args:
         app: MLflow's application.
-        seconds: what a request may take, from its first byte to its answer.
-        samples: bodies of JSON, answered once before the server listens, so that no client waits for imports and
-            compilation.
+        seconds: time limit of a request, from its first byte to its answer.
+        samples: bodies of JSON that are answered once before the server listens, so that no client waits for imports
+            and compilation.
     """
 
     def __init__(self, app: App, seconds: float, samples: Iterable[bytes] = ()) -> None:
@@ -106,7 +107,7 @@ class Bounded:
         self.held = 0  # bytes of bodies
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """Answer a request, or hand on what is none for the model."""
+        """Answer a request, or pass on a request that is not for the model."""
         if scope["type"] == "lifespan":
             await self._warm_up()
         if scope["type"] != "http" or scope["path"] != INVOCATIONS or scope["method"] != "POST":
@@ -123,6 +124,11 @@ class Bounded:
     async def _answer(
         self, scope: MutableMapping[str, Any], receive: Receive, send: Send, received: Received
     ) -> None:
+        """Answer a request to the model.
+
+        Raises:
+            Refused: the request exceeds a limit, or the model refuses it.
+        """
         ticket = Ticket(self.seconds, time.monotonic() + self.seconds)
         headers = dict(scope["headers"])
         kind, body = content_type(headers), None
@@ -142,7 +148,7 @@ class Bounded:
     async def _body(
         self, headers: Mapping[bytes, bytes], receive: Receive, received: Received
     ) -> bytes | None:
-        """Return the body; None where the client has gone away."""
+        """Return the body; None if the client has disconnected."""
         said = headers.get(b"content-length", b"")
         if said.isdigit() and int(said[:20]) > MOST_BODY:
             raise Refused(413, too_large(f"{int(said[:20])} bytes"))
@@ -167,7 +173,7 @@ class Bounded:
         self, scope: MutableMapping[str, Any], receive: Receive, body: bytes, kind: str, ticket: Ticket
     ) -> tuple[int, bytes, bytes]:
         """Return status, content and media type of MLflow's answer."""
-        # what MLflow does not know of the content type (an upper-case name, a charset in quotes) is left out
+        # The content type is rewritten without what MLflow does not know (an upper-case name, a charset in quotes).
         kept = [pair for pair in scope["headers"] if pair[0] not in (b"content-type", b"content-length")]
         kept += [(b"content-type", kind.encode()), (b"content-length", str(len(body)).encode())]
         waiting = [{"type": "http.request", "body": body, "more_body": False}]
@@ -189,14 +195,14 @@ class Bounded:
             await self.app({**scope, "headers": kept}, read, keep)
         except TimeoutError:
             raise
-        except Exception:  # Starlette answers 500, and raises for the log
+        except Exception:  # Starlette answers 500, and raises the error for the log
             _log.exception("MLflow could not answer a request.")
         finally:
             TICKET.reset(token)
         return status, b"".join(content), media
 
     async def _warm_up(self) -> None:
-        """Answer the made-up requests; what comes of them is of no interest."""
+        """Answer the sample requests and discard the answers."""
         headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
         scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST"}
         scope |= {
@@ -216,17 +222,17 @@ class Bounded:
             async def read(waiting: list[Message] = waiting) -> Message:
                 if waiting:
                     return waiting.pop()
-                return await asyncio.Future()  # the client stays
+                return await asyncio.Future()  # the client stays connected
 
             await self({**scope, "headers": headers}, read, drop)
 
 
 def bound_server(samples: Iterable[bytes]) -> None:
-    """Bound the server of MLflow in this process, if it is one that is being started; otherwise do nothing.
+    """Put limits on the MLflow server that is being started in this process; otherwise do nothing.
 
     `mlflow models serve` runs uvicorn with `mlflow.pyfunc.scoring_server.app`. That module loads the model and then
-    makes its application, a FastAPI: this is the only place where the application can be reached from the model. The
-    class is put back when the application is made.
+    makes its application, a FastAPI. The model can reach the application at this point only. The class is restored when
+    the application has been made.
     """
     module = sys.modules.get("mlflow.pyfunc.scoring_server.app")
     if module is None or hasattr(module, "app"):
@@ -250,12 +256,15 @@ def bound_server(samples: Iterable[bytes]) -> None:
 
 
 def _status(status: int) -> int:
-    """What a body leads MLflow to is the client's to mend, whatever MLflow says; 504 is its limit of time."""
+    """Return the status for the client.
+
+    A body that makes MLflow fail is an error of the client, whatever status MLflow gives; 504 is MLflow's time limit.
+    """
     return {504: 413}.get(status, status if status < 500 else 400)
 
 
 def _sentence(content: bytes, kind: str) -> str:
-    """Return what MLflow says of a request that it cannot parse, without its stack trace."""
+    """Return MLflow's message about a request that it cannot parse, without its stack trace."""
     try:
         said = str(json.loads(content)["message"])
     except (ValueError, KeyError, TypeError):
@@ -265,11 +274,14 @@ def _sentence(content: bytes, kind: str) -> str:
 
 
 async def _refuse(receive: Receive | None, send: Send, refusal: Refused) -> None:
-    """Send the sentence, and pass over the rest of the body: many clients read nothing before they have sent all."""
+    """Send the refusal, and discard the rest of the body.
+
+    Many clients read nothing before they have sent everything.
+    """
     name = "TEMPORARILY_UNAVAILABLE" if refusal.status == 503 else "INVALID_PARAMETER_VALUE"
     content = json.dumps({"error_code": name, "message": str(refusal)}).encode()
     await _send(send, refusal.status, content, b"application/json", close=receive is not None)
-    if receive is None:  # all has come
+    if receive is None:  # the body is complete
         return
     left, end = MOST_PASSED_OVER, time.monotonic() + 10
     with contextlib.suppress(TimeoutError):
@@ -290,9 +302,9 @@ async def _send(
     remarks: Iterable[str] = (),
     close: bool = False,
 ) -> None:
-    """Send an answer; where the connection is to `close`, its end is left to the caller.
+    """Send an answer; with `close` the caller ends the connection.
 
-    Each of `remarks` is a header of its own: a table of predictions has no place for them.
+    Each of `remarks` is a header of its own, because a table of predictions has no place for them.
     """
     headers = [(b"content-type", media), (b"content-length", str(len(content)).encode())]
     headers += [

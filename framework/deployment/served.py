@@ -1,6 +1,7 @@
-"""A run's checkpoint as a model of MLflow: `mlflow.pyfunc.load_model` and `mlflow models serve` load it by this module.
+"""A checkpoint of a run as a model of MLflow.
 
-A request comes from anywhere: text in it is the content of a file, base64, and never the name of one on this machine.
+`mlflow.pyfunc.load_model` and `mlflow models serve` load it by this module. A request may come from anyone. Text in it
+is always the content of a file in base64, never the name of a file on this machine.
 """
 
 import base64
@@ -33,27 +34,30 @@ from framework.model import Predictor
 from framework.prediction import answers, named
 
 CONTENT, NAME = "base64", "name"
-"""Columns of a request with files: their bytes, and (if their kind hangs on that) their names."""
+"""Columns of a request with files: the files' bytes, and their names, if the kind of file depends on the name."""
 
 _log = logging.getLogger(__name__)
 
 
 @final
 class Served:
-    """Raw input in, a table of predictions out: the numbers of `mode=predict`, and the modes."""
+    """Function from raw input to a table of predictions: the numbers of `mode=predict`, and the modes."""
 
     def __init__(self, predictor: Predictor, description: Description, data: Data) -> None:
         self.predictor, self.description, self.data = predictor, description, data
 
     def predict(self, given: Any, params: object = None) -> pd.DataFrame:
-        """As `answer`; MLflow calls it, and its server tells a client the sentence of an MlflowException alone."""
+        """Return the same as `answer`; MLflow calls it.
+
+        An error becomes an MlflowException, because MLflow's server sends a client only the sentence of such an error.
+        """
         ticket = TICKET.get()
         if ticket is not None:
             ticket.remarks = self.description.remarks
         try:
             return self.answer(given)
         except UserError as error:
-            # the checkpoint lies on the server's machine
+            # The client must not see the path of the checkpoint on the server.
             sentence = shown(str(error).replace(self.description.path, "the served model"), 1000)
             reason: Exception = error
         except Exception as error:
@@ -70,16 +74,18 @@ class Served:
 
     @torch.no_grad()
     def answer(self, given: Any) -> pd.DataFrame:
-        """A row a sample, with the set that the model promises (`promised`); an image is a PNG in base64.
+        """Return a table with one row per sample, and with the set that the model predicts (`promised`).
 
-        What `mode=predict` prints of these sets stands in `attrs["remarks"]` of the table.
+        An image is a PNG in base64. The remarks that `mode=predict` prints about the sets are in `attrs["remarks"]` of
+        the table.
 
         Args:
-            given: what `framework.load`'s model takes, but files only as `pathlib.Path`; or the content of files: a
-                DataFrame with the column "base64" (and "name", whose ending tells the kind), or texts in base64.
+            given: inputs as the model of `framework.load` takes them, but files only as `pathlib.Path`; or the content
+                of files: a DataFrame with the column "base64" (and "name", whose suffix tells the kind of file), or
+                texts in base64.
 
         Raises:
-            DataError: it is none of these.
+            DataError: `given` is none of these.
         """
         asked = self._asked(given)
         require_few(len(asked["input"]), asked["input"].numel())
@@ -112,11 +118,11 @@ class Served:
         return table
 
     def warm_up(self) -> None:
-        """Predict once for made-up samples, so that no later prediction waits for imports and compilation."""
+        """Predict once for generated samples, so that no later prediction waits for imports and compilation."""
         for sample in self.made_up():
             try:
                 self.answer(sample)
-            except Exception as error:  # a sample that this data set does not take
+            except Exception as error:  # this data set does not take the sample
                 _log.debug("A made-up sample was refused: %s", shown(error))
 
     def made_up(self) -> Iterator[Any]:
@@ -130,6 +136,7 @@ class Served:
                 yield pd.DataFrame({CONTENT: [base64.b64encode(content).decode()], NAME: [f"sample{suffix}"]})
 
     def _asked(self, given: Any) -> Batch:
+        """Return the batch of a request."""
         if isinstance(given, pd.DataFrame) and CONTENT in given.columns and CONTENT not in self.data.columns:
             if not given.columns.is_unique:
                 raise DataError("A column comes twice. Give each once.")
@@ -145,6 +152,7 @@ class Served:
         return asked_of(self.predictor, self.data, given)
 
     def _of_contents(self, texts: Sequence[Any], names: Sequence[str]) -> Batch:
+        """Return the batch of files given as texts in base64."""
         if not texts or (TICKET.get() is not None and len(texts) > MOST_FILES):
             raise DataError(
                 f"{len(texts)} files came; wanted 1 to {MOST_FILES} in one request. Send them in several requests."
@@ -153,7 +161,7 @@ class Served:
             files: list[Path] = []
             for row, (text, name) in enumerate(zip(texts, names, strict=True)):
                 content = _decoded(row, text)
-                # the ending tells the kind of file, and what is drawn of a cloud depends on its name
+                # The suffix tells the kind of file, and the points that are drawn from a cloud depend on its name.
                 files.append(Path(folder) / str(row) / (_file_name(name) or "file"))
                 files[-1].parent.mkdir()
                 files[-1].write_bytes(content)
@@ -163,7 +171,7 @@ class Served:
                 raise type(error)(_of_rows(str(error), Path(folder), names)) from error
 
     def _of_files(self, files: Sequence[Path]) -> Batch:
-        """Read files one by one, so that together they unfold to no more than one request may hold."""
+        """Read files one by one, so that together they expand to no more than one request may hold."""
         ticket = TICKET.get()
         parts: list[Batch] = []
         numbers = 0
@@ -176,7 +184,7 @@ class Served:
         if len({part["input"].shape[1:] for part in parts}) == 1:
             found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             return {**found, **({"index": torch.arange(len(found["input"]))} if "index" in found else {})}
-        # clouds of different sizes are padded, which is for the data set to do
+        # The data set pads clouds of different sizes.
         rows = sum(len(part["input"]) for part in parts)
         require_few(rows, rows * max(part["input"][0].numel() for part in parts))
         parts.clear()
@@ -184,7 +192,7 @@ class Served:
 
 
 def require_few(rows: int, numbers: int) -> None:
-    """Refuse what takes more memory and time than one request may; what a notebook gives is its user's own.
+    """Refuse a request that needs more memory and time than one request may; calls outside a server have no limit.
 
     Raises:
         DataError: there are too many rows, or numbers in them.
@@ -201,7 +209,7 @@ def require_few(rows: int, numbers: int) -> None:
 
 
 def made_up_file(suffix: str, columns: Sequence[str]) -> bytes | None:
-    """Return the content of a small file of a kind, by its suffix; None where the kind is not known here."""
+    """Return the content of a small file of a kind, by its suffix; None if the kind is not known here."""
     if suffix == ".csv":
         return "\n".join([",".join(columns), *[",".join("0" for _ in columns)] * 2, ""]).encode()
     if suffix in (".png", ".jpg", ".jpeg"):
@@ -230,6 +238,7 @@ def made_up_file(suffix: str, columns: Sequence[str]) -> bytes | None:
 
 
 def _decoded(row: int, text: Any) -> bytes:
+    """Return the bytes of a text in base64."""
     if isinstance(text, str) and len(text) > MOST_CONTENT // 3 * 4 + 4:
         raise DataError(
             f"row {row}: a file of about {len(text) // 4 * 3} bytes came; wanted at most {MOST_CONTENT}. "
@@ -244,7 +253,7 @@ def _decoded(row: int, text: Any) -> bytes:
 
 
 def _file_name(name: str) -> str:
-    """Return the end of a name, with letters that stand in every file system, and no longer than one takes."""
+    """Return the end of a name, with letters that every file system allows, and no longer than a file system allows."""
     name = re.sub(r"[^\w.-]|^\.+", "_", name)[-100:]
     while len(name.encode()) > 240:
         name = name[1:]
@@ -252,7 +261,7 @@ def _file_name(name: str) -> str:
 
 
 def _of_rows(said: str, folder: Path, names: Sequence[str]) -> str:
-    """Return what is said of temporary files, with row numbers and the client's names in place of their paths."""
+    """Return a message about temporary files, with row numbers and the client's names in place of their paths."""
 
     def row(found: re.Match[str]) -> str:
         number = found[1]
@@ -262,21 +271,22 @@ def _of_rows(said: str, folder: Path, names: Sequence[str]) -> str:
         return f"row {number}" + (f" ({quoted(name)})" if name else "")
 
     said = re.sub(rf"{re.escape(str(folder))}(?:/(\d+)(?:/[\w.…-]*[\w…-])?)?", row, said)
-    # a message may have been cut within a path
+    # A message may have been shortened within a path.
     return re.sub(rf"{re.escape(str(folder.parent))}[^\s'\"]*…", "…", said)
 
 
 _DEFAULTS = {"seed": 0, "samples": 1000}
-"""Of checkpoints of version 0.1, which do not say with what their run predicted."""
+"""Settings of checkpoints of version 0.1, which do not hold the settings of their run's predictions."""
 
 
 def _texts(given: Sequence[Any] | np.ndarray) -> bool:
+    """Return whether `given` is a list of texts."""
     flat = isinstance(given, list) or (isinstance(given, np.ndarray) and given.ndim == 1)
     return flat and len(given) > 0 and all(isinstance(item, str) for item in given)
 
 
 def _load_pyfunc(path: str) -> Served:
-    """Return the model that MLflow asks for with the path of its checkpoint; errors as `framework.load`."""
+    """Return the model that MLflow loads from the path of its checkpoint; errors are those of `framework.load`."""
     predictor, description = load_with_description(path)
     served = Served(predictor, description, reader(description))
     for remark in description.remarks:
