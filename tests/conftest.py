@@ -25,6 +25,8 @@ from framework.storage.cache import folder as cache_folder
 
 Once = Callable[[str, Callable[[Path], None]], Path]
 STRANGER = Path(__file__).parent / "stranger"
+PATIENCE = 900.0
+"""Seconds after which a command hangs: on a machine with six neighbours some take five minutes."""
 TINY = [
     "data=dial",
     "density_head=wrapped_cauchy",
@@ -124,7 +126,7 @@ def stranger_site(once: Once) -> Path:
     def install(site: Path) -> None:
         arguments = ["install", "--quiet", "--no-deps", "--no-build-isolation", "--target", site, STRANGER]
         done = subprocess.run(
-            [sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, timeout=300
+            [sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, timeout=PATIENCE
         )
         assert done.returncode == 0, done.stderr
 
@@ -160,7 +162,7 @@ def listed(*arguments: str, folder: Path, site: Path | None = None) -> Listed:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=PATIENCE,
     )
     lines = [line for line in done.stdout.splitlines() if line.startswith("MODULES ")]
     return Listed(done.returncode, done.stdout + done.stderr, set(lines[-1].split()[1:]) if lines else set())
@@ -181,7 +183,7 @@ class Forks:
             start_new_session=True,
         )
 
-    def __call__(self, seconds: int = 300, **command: object) -> int:
+    def __call__(self, seconds: float = PATIENCE, **command: object) -> int:
         """Exit code of a command, below 0 the signal that killed it; `command` is what the server reads."""
         assert self.server.stdin is not None
         assert self.server.stdout is not None

@@ -458,7 +458,7 @@ def forked(folder: Path, case: dict[str, Any], resume: Path | None) -> None:
 def trainings(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     def trained(folder: Path) -> None:
         command = [sys.executable, "-W", "ignore", __file__, str(folder)]
-        subprocess.run(command, check=True, capture_output=True, timeout=300)
+        subprocess.run(command, check=True, capture_output=True, timeout=900)
 
     return once("trainings", trained)
 
