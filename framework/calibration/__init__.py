@@ -1,1 +1,1 @@
-"""What uncertainty wrappers and objectives of several families share."""
+"""Code that uncertainty wrappers and objectives of several families share."""

@@ -1,4 +1,4 @@
-"""Temporarily sets one flag on selected modules (dropout active in evaluation, say)."""
+"""A temporary value of a flag on selected modules, such as dropout that is active in evaluation."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,14 +9,14 @@ BATCH_NORM = (
     *(nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm),
     *(nn.LazyBatchNorm1d, nn.LazyBatchNorm2d, nn.LazyBatchNorm3d),
 )
-"""Every batch norm that torch has."""
+"""All batch-norm classes of torch."""
 
 
 @contextmanager
 def flagged(
     model: nn.Module, kinds: type[nn.Module] | tuple[type[nn.Module], ...], flag: str, value: bool
 ) -> Iterator[None]:
-    """Sets `flag` ("training", say) to `value` on the model's modules of these kinds while the block runs.
+    """Set `flag`, for example "training", to `value` on the model's modules of these kinds while the block runs.
 
     Afterwards, also after an error, each module has its own value again.
     """

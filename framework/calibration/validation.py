@@ -1,4 +1,4 @@
-"""The validation set as wrappers see it after training: more than once, and as densities without gradient."""
+"""The validation split for wrappers after training: it can be read repeatedly, and gives densities without gradient."""
 
 from collections.abc import Iterable, Sequence
 
@@ -13,10 +13,14 @@ from framework.model import Predictor
 
 
 def repeatable(batches: Iterable[Batch], by: str) -> list[Batch]:
-    """Batches that may come only once, held so that what is wrapped and the wrapper itself can both read them.
+    """Return batches that can be read repeatedly, both by the wrapped predictor and by the wrapper.
+
+    Args:
+        batches: batches that may be iterated only once.
+        by: name of the wrapper, for the message.
 
     Raises:
-        UserError: no sample in any of them.
+        UserError: there is no sample in any batch.
     """
     held = [batch for batch in batches if len(batch["target"])]
     if not held:
@@ -29,7 +33,7 @@ def repeatable(batches: Iterable[Batch], by: str) -> list[Batch]:
 
 @torch.no_grad()
 def densities(model: Predictor, batches: Sequence[Batch]) -> list[Distribution]:
-    """Of each batch, in evaluation mode, without a graph to the weights."""
+    """Return the density of each batch, in evaluation mode and without a graph to the weights."""
     training = model.training
     try:
         return [model.eval()(batch["input"]) for batch in batches]
@@ -38,18 +42,19 @@ def densities(model: Predictor, batches: Sequence[Batch]) -> list[Distribution]:
 
 
 def require_numbers(found: Float[Tensor, "sample"], batches: Sequence[Batch], what: str) -> None:
-    """Refuse NaN, whose mean says nothing of anybody.
+    """Refuse NaN, because the mean of numbers with NaN has no meaning.
 
     Args:
-        found: one number a sample of all batches, in order.
-        what: they are.
+        found: one number per sample of all batches, in order.
+        batches: the batches.
+        what: name of the numbers, for the message.
 
     Raises:
-        UserError: names the samples.
+        UserError: a number is NaN; the message names the samples.
     """
     bad = found.isnan().nonzero().flatten().tolist()
     if bad:
-        # a batch that numbers its samples says which they are in their split
+        # "index" is the number of a sample in its split, if batches have it
         numbered = all("index" in batch for batch in batches)
         names = torch.cat([batch["index"] for batch in batches])[bad].tolist() if numbered else bad
         more = f" and {len(names) - 10} more" if len(names) > 10 else ""

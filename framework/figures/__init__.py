@@ -1,1 +1,1 @@
-"""What pictures share, wherever they are drawn: by metrics, by data sets, by reports."""
+"""Style that all figures share, drawn by metrics, data sets or reports."""

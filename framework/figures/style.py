@@ -1,4 +1,4 @@
-"""Colours, markers, titles and file formats of every figure."""
+"""Colours, markers, titles and file formats of all figures."""
 
 import textwrap
 from pathlib import Path
@@ -10,7 +10,7 @@ from matplotlib.text import Text
 
 from framework.errors import encodable
 
-# Okabe & Ito 2008, told apart by colour-blind people; without the yellow, too pale for lines on white.
+# Okabe & Ito 2008, distinguishable by colour-blind people; without yellow, which is too pale for lines on white.
 BLUE, RED, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 COLOURS = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY, "black")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
@@ -18,7 +18,7 @@ GREY = "0.4"
 
 
 def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Figure:
-    """Empty, `size` in inches; the title says where data are synthetic."""
+    """Return an empty figure of `size` in inches; its title says if the data are synthetic."""
     figure = Figure(figsize=size, dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     if synthetic and "synthetic" not in title.lower():
@@ -28,9 +28,10 @@ def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Fig
 
 
 def saved(figure: Figure, path: Path, pictures: bool | str) -> Path:
-    """Write the figure to `path` with the suffix of its format: what the setting `pictures` names, or else PNG.
+    """Write the figure to `path` with the suffix of its format, and return the path.
 
-    The same figure gives the same bytes; text of a PDF stays text (TrueType), of an SVG becomes outlines.
+    The format is the one that the setting `pictures` names, or else PNG. The same figure gives the same bytes. Text in
+    a PDF stays text (TrueType), text in an SVG becomes outlines.
     """
     kind = pictures if isinstance(pictures, str) else "png"
     path = path.with_name(f"{path.name}.{kind}")

@@ -1,1 +1,1 @@
-"""What density heads of several families share."""
+"""Code that density heads of several families share."""

@@ -1,4 +1,4 @@
-"""What every density head does with the raw numbers it reads: checks them, and refuses components it cannot use."""
+"""Checks of the raw parameters that a density head reads, and of a mixture's component."""
 
 import math
 
@@ -10,15 +10,16 @@ from framework.errors import ConfigError, NonFiniteAnswer
 
 
 def require_finite(raw: Tensor, size: int) -> Tensor:
-    """`raw` (*batch, size) itself, half precision upcast to float32.
+    """Return `raw` (*batch, size) if it is finite, half precision upcast to float32.
 
     Raises:
-        ValueError: another last dimension.
-        NonFiniteAnswer: a number that is not finite, also a ValueError; names the first such batch row.
+        ValueError: the last dimension is not `size`.
+        NonFiniteAnswer: a number is not finite; it is also a ValueError, and its message names the first such batch
+            row.
     """
     if raw.shape[-1] != size:
         raise ValueError(f"raw numbers of shape {tuple(raw.shape)}; wanted {size} in the last dimension.")
-    # a finite sum has no summand that is not; one pass, where heads of very many numbers notice a second
+    # If the sum is finite, so is every number. This takes one pass; heads of very many numbers notice a second one.
     if not math.isfinite(float(raw.detach().sum())) and not raw.isfinite().all():
         row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
         raise NonFiniteAnswer(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
@@ -26,11 +27,11 @@ def require_finite(raw: Tensor, size: int) -> Tensor:
 
 
 def require_trained(component: DensityHead) -> DensityHead:
-    """The component itself, if all it has is trained by gradient.
+    """Return the component itself if all its parameters are trained by gradient.
 
     Raises:
-        ConfigError: it fits something after training, for which it would have to know which data belong to it; or it
-            wants backbones, which only the head of a model has.
+        ConfigError: the component fits something after training, for which it would have to know which data belong to
+            it; or it requires backbones, which only the head of a model has.
     """
     if component.backbones:
         raise ConfigError(

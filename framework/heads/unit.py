@@ -1,4 +1,4 @@
-"""The unit of a target of reals, in which a density is given back; a head computes in standard deviations."""
+"""The unit of a target of reals: a head computes in standard deviations and returns a density in the target's unit."""
 
 from typing import NamedTuple
 
@@ -9,13 +9,17 @@ from framework.target import Target
 
 
 class Unit(NamedTuple):
-    """Location and scale, (number,) each in double precision; None where the target's own unit is the head's."""
+    """Location and scale of a target, (number,) each in double precision.
+
+    Both are None if the head computes in the target's own unit.
+    """
 
     location: Tensor | None
     scale: Tensor | None
 
     @classmethod
     def of(cls, target: Target) -> "Unit":
+        """Return the unit of a target."""
         if not target.scale:
             return cls(None, None)
         return cls(
@@ -25,10 +29,11 @@ class Unit(NamedTuple):
 
     @property
     def log_volume(self) -> float:
-        """log |det| of the map from the head's numbers to the target's, nats."""
+        """Logarithm of |det| of the map from the head's numbers to the target's, nats."""
         return 0.0 if self.scale is None else float(self.scale.log().sum())
 
     def standardised(self, target: Tensor) -> Tensor:
+        """Return a target in standard deviations, as the head computes."""
         if self.location is None or self.scale is None:
             return target
         return (target.double() - self.location.to(target.device)) / self.scale.to(target.device)
@@ -36,7 +41,7 @@ class Unit(NamedTuple):
     def given_back(
         self, mean: Tensor, scale: Tensor, coefficients: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """A Gaussian's parameters in the target's own unit; x → l + s x takes φ_ij to s_i φ_ij / s_j."""
+        """Return the parameters of a Gaussian in the target's own unit; x → l + s x maps φ_ij to s_i φ_ij / s_j."""
         if self.location is None or self.scale is None:
             return mean, scale, coefficients
         location, unit = self.location.to(mean.device), self.scale.to(mean.device)

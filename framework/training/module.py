@@ -298,7 +298,7 @@ class KeepCheckpoints(pl.Callback):
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save best.ckpt if the validation loss is the lowest so far."""
+        """Record the loss of the weights to keep, and save best.ckpt if it is the lowest so far."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         loss = float(trainer.callback_metrics["validation/loss"])
