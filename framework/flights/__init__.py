@@ -1,1 +1,1 @@
-"""Flights of a ball: the frames in which it is seen, its physics, many trajectories at once, states from frames."""
+"""Flights of a ball: observed frames, physics, simulation of many trajectories at once, and estimation of states."""

@@ -1,4 +1,4 @@
-"""Where a ball was, how fast and with what spin, from the frames in which it was seen: robust, many flights at once."""
+"""Estimation of a ball's position, velocity and spin from observed frames: robust, and for many flights at once."""
 
 from typing import NamedTuple
 
@@ -11,22 +11,25 @@ from framework.flights.trajectories import flown_with_slopes
 from framework.least_squares.solver import least_squares
 
 BELIEVED = 50.0
-"""Metres from the origin; a frame beyond them counts as missing."""
+"""Distance from the origin, metres, beyond which a frame counts as missing."""
 CAUCHY = 3.0
-"""Standard deviations of the noise beyond which a frame counts less and less, so that an outlier counts for nothing."""
+"""Scale c of Cauchy's loss, in standard deviations of the noise.
+
+Residuals beyond it count less and less, so that an outlier has almost no influence.
+"""
 FIRST = 8
-"""Seen frames from which the start of the search comes."""
+"""Number of observed frames from which the start of the search is computed."""
 MOST = torch.tensor([BELIEVED] * 3 + [50.0] * 3 + [1000.0] * 3, dtype=torch.float64)
-"""Largest state: m, m/s, rad/s."""
+"""Largest absolute values of a state: m, m/s, rad/s."""
 
 
 class Seen(NamedTuple):
-    """Frames of flights.
+    """Observed frames of flights.
 
     Attributes:
-        times: (flight, frame), s, not decreasing. A frame that is missing has the time at which it should have been;
-            before the first that is there all have that one's time.
-        places: (flight, frame, 3), m, NaN where the frame is missing.
+        times: (flight, frame), s, not decreasing. A missing frame has the time at which it should have been observed.
+            All frames before the first observed one have the time of that one.
+        places: (flight, frame, 3), m, NaN if the frame is missing.
     """
 
     times: Tensor
@@ -34,11 +37,12 @@ class Seen(NamedTuple):
 
     @property
     def there(self) -> Bool[Tensor, "flight frame"]:
+        """True for each frame that is not missing, (flight, frame)."""
         return ~self.places.isnan().any(-1)
 
 
 class Estimate(NamedTuple):
-    """A state at the first frame, its covariance, and half the sum of squared residuals that was left."""
+    """State at the first frame, its covariance, and half the sum of squared residuals at the end of the search."""
 
     state: Float[Tensor, "flight 9"]
     covariance: Float[Tensor, "flight 9 9"]
@@ -46,7 +50,7 @@ class Estimate(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What is believed of a state before anything is seen: normal about 0, standard deviations of m, m/s and rad/s."""
+    """Prior density of a state: normal about 0, with standard deviations in m, m/s and rad/s."""
 
     place: float = 10.0
     speed: float = 10.0
@@ -54,11 +58,17 @@ class Prior(NamedTuple):
 
     @property
     def scale(self) -> Float[Tensor, "9"]:
+        """Standard deviations of the nine numbers of a state."""
         return torch.tensor([self.place] * 3 + [self.speed] * 3 + [self.spin] * 3, dtype=torch.float64)
 
 
 def seen_of(frames: Float[Tensor, "flight frame 5"], step: float) -> Seen:
-    """From what a model reads (framework.flights.frames.PARTS), in double precision."""
+    """Return the observed frames in double precision.
+
+    Args:
+        frames: numbers that a model reads (framework.flights.frames.PARTS).
+        step: seconds between frames.
+    """
     frames = frames.double()
     count = frames.shape[1]
     slots = step * (torch.arange(count, dtype=torch.float64, device=frames.device) - (count - 1))
@@ -77,14 +87,18 @@ def estimated(
     start: Float[Tensor, "flight 9"] | None = None,
     most: int = 40,
 ) -> Estimate:
-    """The likeliest state of each flight: least squares with Cauchy's loss, and the prior as further residuals.
+    """Return the most likely state of each flight.
 
-    Cauchy's loss c²/2 log(1 + (r/c)²) of a residual r is half the square of c √log(1 + (r/c)²) (Holland & Welsch 1977).
+    It is found by least squares with Cauchy's loss, and with the prior as further residuals. Cauchy's loss c²/2 log(1 +
+    (r/c)²) of a residual r is half the square of c √log(1 + (r/c)²) (Holland & Welsch 1977).
 
     Args:
+        seen: the observed frames.
+        constants: constants of the physics.
         noise: standard deviation of each coordinate, m.
-        start: of the search; None: straight lines through the first frames say.
-        most: steps of the search.
+        prior: prior density of a state.
+        start: start of the search; None: `guessed`.
+        most: largest number of steps of the search.
     """
     scale = prior.scale.to(seen.times.device)
 
@@ -98,19 +112,17 @@ def estimated(
 
     begin = guessed(seen, constants.gravity) if start is None else start
     bound = MOST.to(seen.times.device)
-    # of a tenth of a per cent of a standard deviation nothing follows
+    # An error of a tenth of a per cent of a standard deviation does not matter.
     found = least_squares(model, begin, -bound, bound, most=most, decrease=1e-7, step=1e-9)
     residuals, jacobian = model(found.parameters, torch.arange(len(begin)))
     jacobian = torch.where(residuals.isnan().unsqueeze(-1), 0.0, jacobian)
-    precision = (
-        jacobian.mT @ jacobian * scale * scale.unsqueeze(-1)
-    )  # of the order of 1 and more: the prior's part is 1
+    precision = jacobian.mT @ jacobian * scale * scale.unsqueeze(-1)  # scaled so that the prior's part is 1
     covariance = torch.linalg.inv(precision) * scale * scale.unsqueeze(-1)
     return Estimate(found.parameters, (covariance + covariance.mT) / 2, found.cost)
 
 
 def cauchy(apart: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """c √log(1 + (r/c)²) with r's sign, and its derivative."""
+    """Return c √log(1 + (r/c)²) with the sign of the residual r, and its derivative."""
     square = (apart / CAUCHY).square()
     root = CAUCHY * torch.log1p(square).sqrt()
     steep = torch.where(apart.abs() < 1e-6, 1.0, apart.abs() / (root * (1 + square)))
@@ -118,8 +130,11 @@ def cauchy(apart: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], Flo
 
 
 def guessed(seen: Seen, gravity: float) -> Float[Tensor, "flight 9"]:
-    """A state at the first frame by medians of slopes between pairs of the first frames (Theil 1950, Sen 1968), which a
-    third of outliers does not move; without spin, and 0 where fewer than two frames are there."""
+    """Return a state at the first frame from medians of slopes between pairs of the first frames.
+
+    These are the medians of Theil (1950) and Sen (1968); a third of outliers does not move them. The state has no spin,
+    and is 0 if fewer than two frames are observed.
+    """
     there = seen.there & (seen.there.cumsum(-1) <= FIRST)
     since = seen.times - seen.times[:, :1]
     straight = torch.where(there.unsqueeze(-1), seen.places, torch.nan)
@@ -135,6 +150,9 @@ def guessed(seen: Seen, gravity: float) -> Float[Tensor, "flight 9"]:
 
 
 def root(covariance: Float[Tensor, "flight 9 9"]) -> Float[Tensor, "flight 9 9"]:
-    """R with R Rᵀ the covariance; of one that rounding has made indefinite the nearest there is."""
+    """Return R with R Rᵀ equal to the covariance.
+
+    If rounding has made the covariance indefinite, R Rᵀ is the nearest positive semi-definite matrix.
+    """
     values, vectors = torch.linalg.eigh(covariance)
     return vectors * values.clamp(min=0).sqrt().unsqueeze(-2)

@@ -1,13 +1,17 @@
-"""What models read of a flight, frame by frame, and what they predict: x, y and z at one time after the other."""
+"""Numbers that models read of a flight, frame by frame, and numbers they predict: x, y and z at later times."""
 
 from framework.errors import ConfigError
 
 PARTS = ("time", "x", "y", "z", "seen")
-"""Numbers that are read of each frame: seconds from now (not above 0), metres, and 1 where there is a frame, 0 where it
-is missing; the other numbers of a missing frame are 0."""
+"""Numbers that are read of each frame.
+
+They are the time in seconds from now (not above 0), three coordinates in metres, and 1 if the frame exists or 0 if it
+is missing. The other numbers of a missing frame are 0.
+"""
 GRAVITY = 9.81
-"""Acceleration of a parabola between or behind frames, m/s²."""
+"""Acceleration of a parabola between frames or after the last one, m/s²."""
 AXES = "xyz"
+"""Names of the coordinates."""
 MOST_NAMES = 10
 """Number of names that the message about a wrong target lists."""
 
@@ -16,18 +20,18 @@ def future_names(frames: int, step: float) -> tuple[str, ...]:
     """Return the names of the numbers that are predicted, frame by frame: "x_16ms", in metres.
 
     Args:
-        frames: how many are predicted.
-        step: seconds from frame to frame.
+        frames: number of predicted frames.
+        step: seconds between frames.
     """
     moments = [f"{1000 * step * frame:g}ms" for frame in range(1, frames + 1)]
     return tuple(f"{axis}_{moment}" for moment in moments for axis in AXES)
 
 
 def future_frames(names: tuple[str, ...], by: str) -> int:
-    """Return how many frames are to be predicted.
+    """Return the number of predicted frames.
 
     Args:
-        names: of the target's numbers, such as "x_16ms".
+        names: names of the target's numbers, such as "x_16ms".
         by: plugin that predicts them, for the message.
 
     Raises:

@@ -1,8 +1,8 @@
 """The physics of a table-tennis ball: flight with drag, Magnus force and spin decay, and its bounce.
 
-Formulas are written over single components with arithmetic alone, so that they serve plain floats (SciPy's solvers
-call them a hundred thousand times, too often for the type checks that tests switch on) and batches of tensors (the
-estimation) alike. Units: metres, seconds, rad/s; z is up; y runs along the table.
+Formulas are written over single components with arithmetic only, so that they serve both plain floats and batches of
+tensors. SciPy's solvers call them with floats a hundred thousand times, which is too often for the type checks that
+tests switch on. The estimation calls them with tensors. Units: metres, seconds, rad/s; z is up; y runs along the table.
 """
 
 from dataclasses import dataclass
@@ -19,18 +19,19 @@ Vector = tuple[Any, Any, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Constants:
-    """What a ball and a table are like; the values are those of the WAM laboratory's simulator where it has them.
+    """Constants of a ball and a table; the values are those of the WAM laboratory's simulator if it has them.
 
     Attributes:
         gravity: m/s².
         drag: k of the deceleration k |v| v, 1/m (Mülling et al. 2011, eq. 1).
         lift: m of the Magnus acceleration m ω × v, dimensionless: 1/2 ρ A r c / mass with a lift coefficient of 0.6.
         spin_decay: share of the spin that the air takes, 1/s.
-        restitution: speed upwards after the bounce, by that downwards before it.
+        restitution: upward speed after the bounce divided by downward speed before it.
         friction: Coulomb's coefficient of ball and table.
-        radius: of the ball, m.
+        radius: radius of the ball, m.
         surface: height of the table, m, in the frame of the recordings.
-        near, far: y where the table begins and ends, m. Beyond them the ball falls on.
+        near: y at which the table begins, m. Outside the table the ball falls on.
+        far: y at which the table ends, m.
     """
 
     gravity: Positive = 9.802
@@ -52,9 +53,9 @@ class Constants:
 
 @no_type_check
 def acceleration(velocity: Vector, spin: Vector, constants: Constants) -> Vector:
-    """v' = g - k |v| v + m ω × v, m/s² (Mülling, Kober & Peters 2011, eq. 1, with Magnus's term)."""
+    """Return v' = g - k |v| v + m ω × v, m/s² (Mülling, Kober & Peters 2011, eq. 1, with Magnus's term)."""
     (u, v, w), (a, b, c) = velocity, spin
-    # the least square keeps the root differentiable where the ball rests
+    # The small constant keeps the root differentiable where the ball rests.
     drag = constants.drag * (u * u + v * v + w * w + 1e-24) ** 0.5
     lift = constants.lift
     return (
@@ -66,23 +67,24 @@ def acceleration(velocity: Vector, spin: Vector, constants: Constants) -> Vector
 
 @no_type_check
 def slip(velocity: Vector, spin: Vector, radius: float) -> tuple[Any, Any]:
-    """Velocity of the ball's lowest point along the table, v + ω × (-r ẑ), m/s."""
+    """Return the velocity of the ball's lowest point along the table, v + ω × (-r ẑ), m/s."""
     return velocity[0] - radius * spin[1], velocity[1] + radius * spin[0]
 
 
 @no_type_check
 def bounced(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vector, Vector]:
-    """Velocity and spin after a bounce in no time (Nakashima et al. 2010, for a hollow sphere, I = 2/3 m r²).
+    """Return velocity and spin after an instantaneous bounce.
 
-    The table's friction stops the slip where it can: an impulse of 2/5 of the slip a unit of mass does. It can give no
-    more than μ times the impulse upwards, (1 + e) |w|; then the ball goes on sliding.
+    The model is that of Nakashima et al. (2010), for a hollow sphere, I = 2/3 m r². The table's friction stops the slip
+    if it can: this takes an impulse of 2/5 of the slip per unit of mass. Friction can give at most μ times the upward
+    impulse, (1 + e) |w|; if this is not enough, the ball goes on sliding.
     """
     u, v, w = velocity
     along, across = slip(velocity, spin, constants.radius)
     speed = (along * along + across * across + 1e-24) ** 0.5
     up = (1 + constants.restitution) * abs(w)
     most = constants.friction * up / speed
-    share = (most + 0.4 - abs(most - 0.4)) / 2  # the smaller of the two, of floats and tensors alike
+    share = (most + 0.4 - abs(most - 0.4)) / 2  # min(most, 0.4), for floats and tensors alike
     push, pull = -share * along, -share * across
     turn = 1.5 / constants.radius
     after = (u + push, v + pull, constants.restitution * abs(w))

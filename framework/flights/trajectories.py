@@ -1,4 +1,4 @@
-"""Many flights at once, in torch: Runge-Kutta steps, and bounces that are found inside them."""
+"""Simulation of many flights at once, in torch: Runge-Kutta steps, and bounces that are found within a step."""
 
 from typing import no_type_check
 
@@ -9,18 +9,21 @@ from torch import Tensor
 from framework.flights.physics import Constants, bounced
 
 NEWTON = 4
-"""Steps to the time of a bounce; from a parabola's root the error falls below rounding in three."""
+"""Number of Newton steps to the time of a bounce.
+
+Started at a parabola's root, the error falls below rounding in three.
+"""
 
 
 @no_type_check  # called for every step
 def free(
     state: Float[Tensor, "flight 9"], time: Float[Tensor, "flight"], constants: Constants
 ) -> Float[Tensor, "flight 9"]:
-    """The state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
+    """Return the state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
 
-    Of 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). Spin decays whatever the ball does, so
-    only the velocity has stages: those of the place are the velocity's own, and those of the spin are powers of the
-    decay.
+    For 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). Spin decays independently of the
+    motion, so only the velocity has stages. The stages of the position are the velocity's, and those of the spin are
+    powers of the decay.
     """
     h = time.unsqueeze(-1)
     place, velocity, spin = state[:, :3], state[:, 3:6], state[:, 6:]
@@ -47,8 +50,10 @@ def free(
 def step(
     state: Float[Tensor, "flight 9"], time: Float[Tensor, "flight"], constants: Constants
 ) -> Float[Tensor, "flight 9"]:
-    """The state after `time` seconds, with at most one bounce on the way; one that follows at once lays the ball on
-    the table, so that no number of bounces can go on for ever."""
+    """Return the state after `time` seconds, with at most one bounce within them.
+
+    If a second bounce follows at once, the ball is laid on the table, so that bounces cannot go on without end.
+    """
     after = free(state, time, constants)
     touching = constants.touching
     hits = (after[:, 2] < touching) & (state[:, 2] >= touching - 1e-9)
@@ -56,7 +61,7 @@ def step(
     if not len(rows):
         return after
     before, whole = state[rows], time[rows]
-    # of the parabola the later root, then Newton's steps along the flight itself
+    # Start at the later root of the parabola, then take Newton's steps along the flight itself.
     height, climb = before[:, 2] - touching, before[:, 5]
     root = (climb.square() + 2 * constants.gravity * height.clamp(min=0) + 1e-18).sqrt()
     until = torch.minimum(((climb + root) / constants.gravity).clamp(min=0), whole)
@@ -80,9 +85,9 @@ def step(
 def flown(
     start: Float[Tensor, "flight 9"], times: Float[Tensor, "flight time"], constants: Constants
 ) -> Float[Tensor, "flight time 9"]:
-    """The states of flights at `times`, seconds, not decreasing, of which the first is that of `start`.
+    """Return the states of flights at `times`, seconds, not decreasing; `start` is the state at the first time.
 
-    One step leads from each time to the next: they should be no more than some 20 ms apart.
+    One step leads from each time to the next, so times should be at most about 20 ms apart.
     """
     states = [start]
     for number in range(1, times.shape[1]):
@@ -93,11 +98,11 @@ def flown(
 def flown_with_slopes(
     start: Float[Tensor, "flight 9"], times: Float[Tensor, "flight time"], constants: Constants
 ) -> tuple[Float[Tensor, "flight time 3"], Float[Tensor, "flight time 3 9"]]:
-    """Positions, and their derivatives by the state at the start.
+    """Return positions, and their derivatives with respect to the state at the start.
 
-    By central differences, all states at once: of float64 they have nine digits (tests/test_flight_physics.py), and
-    take a hundredth of the time that torch's forward mode takes to interpret each of some ten thousand small
-    operations.
+    The derivatives are central differences, computed for all states at once. In float64 they have nine correct digits
+    (tests/test_flight_physics.py). They take a hundredth of the time of torch's forward mode, which interprets each of
+    about ten thousand small operations.
     """
     flights, time = times.shape
     shift = torch.diag(start.new_tensor([1e-5] * 6 + [1e-3] * 3))
