@@ -1,1 +1,1 @@
-"""Z-spectra of CEST imaging: sums of Lorentzian lines, their fit to measured spectra, the offsets that models read."""
+"""Z-spectra of CEST imaging: sums of Lorentzian lines, their fit to measured spectra, and the offsets of models."""

@@ -1,9 +1,9 @@
-"""Lorentzian lines' misfit to many Z-spectra, summed up on one CPU core; compiled functions on NumPy arrays.
+"""Residuals of Lorentzian lines for many Z-spectra, summed on one CPU core; compiled functions on NumPy arrays.
 
-Formulas and the parameters' order are those of spectrum.py. Arrays:
+Formulas and the order of the parameters are those of spectrum.py. Arrays:
     parameters: (spectrum, p) float64, of either preset.
-    rows: (spectrum,) int64, of `measured`.
-    measured: (whatever, offset) float64, NaN where nothing was measured.
+    rows: (spectrum,) int64, the rows of `measured`.
+    measured: (row, offset) float64, NaN where nothing was measured.
     offsets: (offset,) float64, ppm.
     centres: (pool,) float64, ppm from water.
 """
@@ -15,15 +15,17 @@ import numpy as np
 
 from framework.storage.kernels import compiler, kept_in
 
-# sums in any order, in which several numbers are added at once
+# Sums may be reordered, so that several numbers are added at once.
 compiled = compiler(kept_in("spectra", [Path(__file__)]), fastmath={"reassoc", "contract", "arcp"})
 
 
 @compiled
 @no_type_check
 def lines(parameters, measured, offsets, centres, jacobian, residuals):
-    """Fill `jacobian` (p, offset) and `residuals` (offset,) of one spectrum, 0 where nothing was measured; how many
-    were."""
+    """Fill `jacobian` (p, offset) and `residuals` (offset,) of one spectrum, and return how many offsets were measured.
+
+    Both are 0 where nothing was measured.
+    """
     pools, size, count = centres.shape[0], parameters.shape[0], offsets.shape[0]
     shift = 2 * pools
     there = 0
@@ -61,8 +63,11 @@ def lines(parameters, measured, offsets, centres, jacobian, residuals):
 @compiled
 @no_type_check
 def summed(parameters, rows, measured, offsets, centres, cost, gradient, gram, there):
-    """Fill half the sum of squared residuals r (spectrum,), Jᵀr (spectrum, p), JᵀJ (spectrum, p, p) and how many
-    offsets were measured (spectrum,)."""
+    """Fill the sums over offsets of many spectra, with residuals r and their Jacobian J.
+
+    They are half the sum of squared residuals (spectrum,), Jᵀr (spectrum, p), JᵀJ (spectrum, p, p), and the number of
+    measured offsets (spectrum,).
+    """
     size = parameters.shape[1]
     jacobian, residuals = np.empty((size, offsets.shape[0])), np.empty(offsets.shape[0])
     for one in range(parameters.shape[0]):
@@ -86,7 +91,7 @@ def summed(parameters, rows, measured, offsets, centres, cost, gradient, gram, t
 @compiled
 @no_type_check
 def curved(parameters, rows, measured, offsets, centres, curvature):
-    """Fill Σ residual ∇²Z (spectrum, p, p)."""
+    """Fill `curvature` with Σ residual ∇²Z (spectrum, p, p)."""
     pools, size, count = centres.shape[0], parameters.shape[1], offsets.shape[0]
     shift = 2 * pools
     jacobian, residuals = np.empty((size, count)), np.empty(count)
@@ -101,7 +106,7 @@ def curved(parameters, rows, measured, offsets, centres, curvature):
             elif pool > 0:
                 centre += parameters[one, shift + pool]
             square = half * half
-            # sums of the residuals times powers of the distance d and of e = 1 / (h² + d²)
+            # Sums of the residuals times powers of the distance d and of e = 1 / (h² + d²).
             e2 = de2 = dde2 = de3 = dde3 = 0.0
             for index in range(count):
                 distance = offsets[index] - centre
@@ -121,7 +126,7 @@ def curved(parameters, rows, measured, offsets, centres, curvature):
             width = pools + pool
             curvature[one, pool, width] = curvature[one, width, pool] = both
             curvature[one, width, width] = bent
-            # the shift of water moves every centre, a pool's own its own
+            # The shift of water moves every centre; the centre of another pool moves that pool only.
             for place in (shift, shift + pool):
                 if place < size and (place == shift or size > shift + 1):
                     curvature[one, pool, place] = curvature[one, place, pool] = apart

@@ -1,4 +1,4 @@
-"""Fits Lorentzian lines to many Z-spectra at once, and says how sure of each parameter it is."""
+"""Fits Lorentzian lines to many Z-spectra at once, with the uncertainty of each parameter."""
 
 from typing import NamedTuple
 
@@ -13,23 +13,28 @@ from framework.least_squares.solver import least_squares
 from framework.spectra.spectrum import COUNT, Misfit, Parameters
 
 CUT = 10.0
-"""Beyond this a measured number is no Z, which lies between 0 and about 1, and is cut off."""
+"""Limit on the absolute value of a measured number; Z lies between 0 and about 1, so larger numbers are clipped."""
 DECREASE = 1e-10
-"""Newton's last step leaves the square of the share of the cost that it gains."""
+"""Share of the cost below which the gain of a step ends the search.
+
+After Newton's last step, the remaining gain is about the square of this share.
+"""
 CAREFUL, BOLD = 1e-1, 1e-3
-"""Damping at the first step from the preset's start, and from one that is near."""
+"""Damping at the first step from the preset's start, and from a start that is near the minimum."""
 DOUBTFUL = 1e-4
-"""Least pivot of a scaled inverse covariance from which its factor has eight right digits."""
+"""Smallest pivot of a scaled inverse covariance whose factor has eight correct digits."""
 LEAST_SHARE = 1e-9
-"""The least standard error, in sides of the box: of a spectrum without noise."""
+"""Smallest standard error, in sides of the box, for a spectrum without noise."""
 
 
 class Fit(NamedTuple):
-    """Attributes:
-    parameters: (spectrum, p), all that were fitted.
-    root: (spectrum, p, p), lower Cholesky factor of their covariance.
-    cost: (spectrum,), half the sum of squared residuals.
-    status: (spectrum,), of framework.least_squares.solution.Status.
+    """Parameters fitted to spectra, with their covariance.
+
+    Attributes:
+        parameters: (spectrum, p), all fitted parameters.
+        root: (spectrum, p, p), lower Cholesky factor of their covariance.
+        cost: (spectrum,), half the sum of squared residuals.
+        status: (spectrum,), values of framework.least_squares.solution.Status.
     """
 
     parameters: Float[Tensor, "spectrum p"]
@@ -45,21 +50,24 @@ def fit(
     start: Float[Tensor, "spectrum p"] | None = None,
     most: int = 300,
 ) -> Fit:
-    """Least squares of each spectrum, from the preset's start or a given one.
+    """Fit each spectrum by least squares, from the preset's start or a given one.
 
-    The covariance is that of the Jacobian J with the residuals' variance s², and of a box whose sides u - l say no more
-    than a uniform density does: (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. Where the data determine a parameter the second term
-    is nothing; where they do not (a pool without amplitude has no width) the first is, and the parameter may be
-    anywhere in its box.
+    The covariance comes from the Jacobian J with the residuals' variance s², and from a box whose sides u - l say no
+    more than a uniform density does: (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. If the data determine a parameter, the second
+    term is negligible. If they do not (a pool without amplitude has no width), the first term is, and the parameter may
+    be anywhere in its box.
 
-    Where a pool has vanished (amplitude 0), it has no width that could lead it back: such spectra are fitted once more
-    from another start, and the better fit is kept. So are all where centres are free, unless a start is given: the line
-    of amide may be the sharp or the broad one of two (benchmarks/spectra/cest.md counts how often that matters).
+    If a pool has vanished (amplitude 0), it has no width that could lead the search back. Such spectra are fitted once
+    more from another start, and the better fit is kept. The same is done for all spectra if centres are free and no
+    start is given: the line of amide may be the sharp or the broad one of two (benchmarks/spectra/cest.md counts how
+    often that matters).
 
     Args:
-        measured: NaN where nothing was measured.
-        start: (spectrum, p), or without the parameters that are no target.
-        most: steps tried.
+        measured: measured Z; NaN where nothing was measured.
+        offsets: ppm.
+        wanted: the parameters to fit.
+        start: (spectrum, p), or without the parameters that are not targets.
+        most: largest number of steps tried.
     """
     device = measured.device
     measured = measured.detach().cpu().double().clamp(-CUT, CUT)
@@ -103,12 +111,15 @@ def fit(
 
 
 def _root(misfit: Misfit, parameters: Tensor, sides: Tensor) -> Tensor:
-    """The covariance's Cholesky factor; of sides of the box, in which numbers are of one size."""
+    """Return the Cholesky factor of the covariance.
+
+    It is computed for parameters in sides of the box, whose values have similar sizes.
+    """
     size = parameters.shape[1]
     rows = torch.arange(len(parameters))
     cost, _, gram, there = misfit.normal(parameters, rows)
     variance = (2 * cost / (there - size).clamp(min=1)).clamp(min=LEAST_SHARE**2)
-    # of the inverse covariance A = Uᵀ U with a lower triangle U, so that U⁻¹ is the lower factor of A⁻¹
+    # The inverse covariance is A = Uᵀ U with a lower triangle U, so that U⁻¹ is the lower factor of A⁻¹.
     precision = gram * (sides.unsqueeze(-1) * sides) / variance[:, None, None]
     precision.diagonal(dim1=-2, dim2=-1).add_(12)
     length = precision.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -130,11 +141,11 @@ def _root(misfit: Misfit, parameters: Tensor, sides: Tensor) -> Tensor:
 def _careful_root(
     misfit: Misfit, parameters: Tensor, rows: Tensor, variance: Tensor, sides: Tensor
 ) -> Tensor:
-    """The same with the Jacobian itself, whose square has lost digits."""
+    """Return the factor as `_root` does, from the Jacobian itself, because JᵀJ has lost digits."""
     size = parameters.shape[1]
     residuals, jacobian = misfit(parameters, rows)
     jacobian = jacobian.where(~residuals.isnan().unsqueeze(-1), 0.0) * sides
-    # triangle R with RᵀR = JᵀJ + 12 s²; the covariance is s² R⁻¹ R⁻ᵀ, whose factor follows from another triangle
+    # Triangle R with RᵀR = JᵀJ + 12 s². The covariance is s² R⁻¹ R⁻ᵀ; its factor follows from a second QR.
     identity = torch.eye(size, dtype=parameters.dtype)
     prior = (12 * variance).sqrt()[:, None, None] * identity
     triangle = torch.linalg.qr(torch.cat((jacobian, prior), 1), mode="r").R
@@ -144,7 +155,10 @@ def _careful_root(
 
 
 def density(found: Fit, told: int, shape: torch.Size | tuple[int, ...], zero: Tensor) -> Distribution:
-    """The Gaussian over the first `told` parameters, of the type of `zero` (*shape, 1), which is added to its mean: of
-    a lower Cholesky factor the first rows are their marginal's."""
+    """Return the Gaussian over the first `told` parameters.
+
+    It has the type of `zero` (*shape, 1), which is added to its mean. The first rows of a lower Cholesky factor are the
+    factor of the marginal.
+    """
     mean = found.parameters[:, :told].reshape(*shape, told).to(zero) + zero
     return JointNormal(mean, found.root[:, :told, :told].reshape(*shape, told, told).to(zero))

@@ -17,14 +17,14 @@ OFFSETS = (
     4.7984, 4.8984, 4.9985, 5.0986, 5.1987, 5.2987, 6.2494, 7.9981, 11.9985, 19.9991, 29.9986, 39.9982,
 )
 # fmt: on
-"""ppm; of the human brain at 7 T that is published with CESTEval (V. Khlebnikov, MIT)."""
+"""Offsets in ppm, those of the spectra of the human brain at 7 T published with CESTEval (V. Khlebnikov, MIT)."""
 
 
 def offsets_of(wanted: Sequence[float] | None) -> tuple[float, ...]:
-    """A list from a config; None: OFFSETS.
+    """Return the offsets of a config; None means OFFSETS.
 
     Raises:
-        DataError: they do not ascend.
+        DataError: there are fewer than two offsets, or they do not ascend.
     """
     found = OFFSETS if wanted is None else tuple(map(float, wanted))
     if len(found) < 2 or not np.all(np.diff(found) > 0):

@@ -1,8 +1,8 @@
 """Z-spectra as one minus a sum of Lorentzian lines, one for each pool of protons, with first and second derivatives.
 
 Z(Δω) = 1 - Σ_i A_i (w_i/2)² / ((w_i/2)² + (Δω - δ_i)²), offsets Δω, widths w (at half maximum) and centres δ in ppm
-(Zaiss et al. 2011; Windschuh et al. 2015). The centre of water is the shift of the static field B0, and the others'
-centres are counted from it.
+(Zaiss et al. 2011; Windschuh et al. 2015). The centre of water is the shift of the static field B0, and the centres of
+the other pools are counted from it.
 """
 
 from typing import Literal, NamedTuple
@@ -17,16 +17,20 @@ from framework.spectra import compiled
 POOLS = ("water", "amide", "noe", "mt", "amine")
 COUNT = len(POOLS)
 CENTRES = (0.0, 3.5, -3.5, -2.5, 2.0)
-"""Of the pools, ppm from water."""
+"""Centres of the pools, ppm from water."""
 Preset = Literal["ten", "fifteen"]
+"""Names of the sets of fitted parameters."""
 
 
 class Parameters(NamedTuple):
-    """What is fitted: the parameters' names, their box and where the search starts; and how many are a target.
+    """The fitted parameters: names, box and start of the search, and how many of them are the target.
 
     Attributes:
         names: with units; amplitudes are shares of the unsaturated signal.
-        told: the first so many are the target, whatever follows is fitted beside them.
+        lower: lower bounds.
+        upper: upper bounds.
+        start: start of the search.
+        told: number of parameters that are the target; the parameters after them are fitted too.
     """
 
     names: tuple[str, ...]
@@ -37,21 +41,26 @@ class Parameters(NamedTuple):
 
     @classmethod
     def of(cls, preset: Preset) -> "Parameters":
-        """Of five pools: ten amplitudes and widths beside the shift of water, with the others' centres fixed
-        (thesis §4.1); or with these fifteen numbers and nothing fixed."""
+        """Return the parameters of five pools.
+
+        "ten": ten amplitudes and widths are the target; the shift of water is fitted too, and the centres of the other
+        pools are fixed (thesis §4.1). "fifteen": amplitudes, widths and centres are the target, and nothing is fixed.
+        """
         return PRESETS[preset]
 
     @property
     def elsewhere(self) -> tuple[float, ...]:
-        """Another start."""
+        """Second start of the search."""
         return tuple(ELSEWHERE.get(name, at) for name, at in zip(self.names, self.start, strict=True))
 
     @property
     def target(self) -> tuple[str, ...]:
+        """Names of the target's numbers."""
         return self.names[: self.told]
 
 
 def _parameters(free: bool) -> Parameters:
+    """Return the parameters with fixed or free centres."""
     columns = (
         *((f"{pool}_amplitude", 0.0, 1.0, start) for pool, start in zip(POOLS, AMPLITUDES, strict=True)),
         *((f"{pool}_width_ppm", *box) for pool, box in zip(POOLS, WIDTHS, strict=True)),
@@ -63,16 +72,18 @@ def _parameters(free: bool) -> Parameters:
 
 
 AMPLITUDES = (0.75, 0.02, 0.1, 0.15, 0.1)
+"""Starts of the amplitudes."""
 WIDTHS = ((0.2, 8.0, 1.0), (0.3, 8.0, 0.6), (0.5, 12.0, 4.0), (8.0, 200.0, 50.0), (0.3, 8.0, 6.0))
+"""Lower bound, upper bound and start of each width, ppm; wide, so that few fits end at a bound."""
 PLACES = ((-1.0, 1.0, 0.0), (3.0, 4.0, 3.5), (-4.5, -2.5, -3.5), (-4.5, 0.5, -2.5), (1.2, 2.8, 2.0))
-"""Least, most and start, ppm; wide, so that few fits end at a bound."""
+"""Lower bound, upper bound and start of each centre, ppm; wide, so that few fits end at a bound."""
 ELSEWHERE = {"amide_amplitude": 0.03, "amide_width_ppm": 1.2, "amine_amplitude": 0.05, "amine_width_ppm": 2.0}
-"""A second start: the sharper of the two lines that overlap is the other one."""
+"""Values of a second start, in which the sharper of the two overlapping lines is the other one."""
 PRESETS: dict[Preset, Parameters] = {"ten": _parameters(False), "fifteen": _parameters(True)}
 
 
 def centres(parameters: Float[Tensor, "batch p"]) -> Float[Tensor, "batch pool"]:
-    """Where the lines lie, ppm."""
+    """Return the centres of the lines, ppm."""
     shift = parameters[:, 2 * COUNT : 2 * COUNT + 1]
     fixed = parameters.new_tensor(CENTRES)
     if parameters.shape[1] == 2 * COUNT + 1:
@@ -83,7 +94,7 @@ def centres(parameters: Float[Tensor, "batch p"]) -> Float[Tensor, "batch pool"]
 def spectrum(
     parameters: Float[Tensor, "batch p"], offsets: Float[Tensor, "offset"]
 ) -> Float[Tensor, "batch offset"]:
-    """Z, of either preset's parameters."""
+    """Return Z for the parameters of either preset."""
     amplitude, width = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None]
     square = (width / 2).square()
     lines = amplitude * square / (square + (offsets - centres(parameters).unsqueeze(-1)).square())
@@ -103,9 +114,12 @@ class Misfit:
         self.offsets = offsets
 
     def __call__(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (batch, offset) and their Jacobian (batch, offset, p), written in few passes over the numbers."""
+        """Return residuals (batch, offset) and their Jacobian (batch, offset, p).
+
+        They are computed in few passes over the numbers.
+        """
         amplitude, half = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None] / 2
-        # with e = 1 / (h² + d²): ∂Z/∂A = -h² e, ∂Z/∂w = -A h d² e², ∂Z/∂δ = -2 A h² d e²
+        # With e = 1 / (h² + d²): ∂Z/∂A = -h² e, ∂Z/∂w = -A h d² e², ∂Z/∂δ = -2 A h² d e².
         distance = self.offsets - centres(parameters).unsqueeze(-1)
         square = distance.square()
         inverse = (square + half.square()).reciprocal_()
@@ -122,8 +136,11 @@ class Misfit:
         return residuals, jacobian.mT
 
     def normal(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Half the sum of squared residuals (batch,), the gradient (batch, p) and normal matrix (batch, p, p) of their
-        Jacobian, and how many offsets were measured (batch,); on the processor."""
+        """Return the cost, its gradient, the normal matrix and the number of measured offsets, on the processor.
+
+        The cost (batch,) is half the sum of squared residuals. The gradient (batch, p) and the normal matrix (batch, p,
+        p) are those of the residuals' Jacobian. The number of measured offsets is (batch,).
+        """
         gram = parameters.new_empty(*parameters.shape, parameters.shape[1])
         cost, gradient, there = (
             gram.new_empty(len(gram)),
@@ -136,7 +153,7 @@ class Misfit:
         return cost, gradient, gram, there
 
     def curvature(self, parameters: Tensor, rows: Tensor) -> Tensor:
-        """Σ residual ∇²Z, (batch, p, p), on the processor."""
+        """Return Σ residual ∇²Z, (batch, p, p), on the processor."""
         found = parameters.new_empty(*parameters.shape, parameters.shape[1])
         compiled.curved(*self._arrays(parameters, rows), found.numpy())
         return found
