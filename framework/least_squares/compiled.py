@@ -1,7 +1,7 @@
-"""One step of many small least-squares problems, on one CPU core; compiled functions on NumPy arrays.
+"""One step of many small least-squares problems on one CPU core; compiled functions on NumPy arrays.
 
-What numbers mean is said in framework.least_squares.solver, whose rules these are. Arrays' first dimension is the
-problem; those of a few names are shared by all functions:
+framework.least_squares.solver explains the quantities and the rules. The first dimension of arrays is the problem. All
+functions share these names:
     at, lower, upper, gradient, scale, move: (problem, p) float64.
     gram, curve: (problem, p, p) float64.
     cost, damping, gain, slope, least: (problem,) float64.
@@ -19,25 +19,31 @@ from framework.storage.kernels import compiler, kept_in
 compiled = compiler(kept_in("least_squares", [Path(__file__)]))
 EPSILON = float(np.finfo(np.float64).eps)
 LEAST_DAMPING, MOST_DAMPING = 1e-30, 1e20
+"""Smallest and largest damping."""
 SLIGHT = 1e-2
-"""Damping, in squares of the least pivot of the factor, below which a step is as good as undamped: what it gains is all
-there is to gain, and more damping would change nothing."""
+"""Damping, in squares of the smallest pivot of the factor, below which a step is as good as an undamped step.
+
+Such a step gains all that can be gained, and more damping would change nothing.
+"""
 QUIET = 4
-"""So many steps in a row without gain, or less than rounding hides, end a problem."""
+"""Number of successive steps that end a problem if their gain is negligible or less than rounding hides."""
 SINGULAR = 1e-7
-"""Least pivot of a scaled normal matrix at which its Cholesky factor still gives a step of two right digits."""
+"""Smallest pivot of a scaled normal matrix whose Cholesky factor still gives a step with two correct digits."""
 CLIPS = 3
-"""How often a step that leaves the bounds is solved again with what it leaves through held there."""
+"""Number of times that a step that leaves the bounds is solved again, with the parameters beyond a bound held there."""
 NEAR = 0.1
-"""Share of the cost that a step may save at most where the minimum is near."""
+"""Largest share of the cost that a step saves when the minimum is near."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
-"""In place of a status, and some of framework.least_squares.solution.Status."""
+"""Mark of a problem that goes on, and some values of framework.least_squares.solution.Status."""
 
 
 @compiled
 @no_type_check
 def factored(normal, held, damping, factor):
-    """Fill `factor` with Cholesky's of the damped matrix of what is not held; its least pivot, NaN without a factor."""
+    """Fill `factor` with the Cholesky factor of the damped matrix of the parameters that are not held.
+
+    It returns the factor's smallest pivot, NaN if there is no factor.
+    """
     size = normal.shape[0]
     least = np.inf
     for row in range(size):
@@ -84,9 +90,13 @@ def solved(factor, right):
 def stepped(
     at, lower, upper, cost, gradient, gram, curve, scale, damping, move, gain, slope, least, cut, careful
 ):
-    """Fill `move` with the damped step within the box, `gain` with what it is expected to save, `slope` with the
-    cosine of gradient and residuals, `least` with the square of the factor's least pivot, `cut` with whether the box
-    cut it; or `careful` alone with whether the matrix has lost what the Jacobian knows."""
+    """Fill the arrays of the damped step within the box.
+
+    `move` is the step. `gain` is the expected decrease of the cost. `slope` is the largest cosine between the residuals
+    and a column of the Jacobian. `least` is the square of the factor's smallest pivot. `cut` says whether the box cut
+    the step. `careful` says whether the matrix has lost what the Jacobian knows, so that the step must be computed from
+    the Jacobian.
+    """
     count, size = at.shape
     normal, factor = np.empty((size, size)), np.empty((size, size))
     pull, scaled, known, solution = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
@@ -99,7 +109,7 @@ def stepped(
             held[i] = (
                 (at[one, i] <= lower[one, i] and gradient[one, i] >= 0)
                 or (at[one, i] >= upper[one, i] and gradient[one, i] <= 0)
-                or column <= EPSILON * scale[one, i]  # nothing is known of it here
+                or column <= EPSILON * scale[one, i]  # the residuals do not depend on it here
             )
             if not held[i]:
                 cosine = abs(gradient[one, i] / (column * length))
@@ -113,7 +123,7 @@ def stepped(
             for j in range(size):
                 normal[i, j] = (gram[one, i, j] + curve[one, i, j]) / (scaled[i] * scaled[j])
         pivot = factored(normal, held, damping[one], factor)
-        if not pivot >= SINGULAR:  # the Hessian is not positive there
+        if not pivot >= SINGULAR:  # the Hessian is not positive definite there
             for i in range(size):
                 for j in range(size):
                     normal[i, j] = gram[one, i, j] / (scaled[i] * scaled[j])
@@ -151,7 +161,9 @@ def stepped(
             for j in range(size):
                 push += normal[i, j] * solution[j]
             expected -= solution[i] * (pull[i] + push / 2)
-            told += solution[i] * (damping[one] * solution[i] - pull[i]) / 2  # the same, were the step exact
+            told += (
+                solution[i] * (damping[one] * solution[i] - pull[i]) / 2
+            )  # equals `expected` if the step is exact
             move[one, i] = solution[i] / scaled[i]
         gain[one] = expected
         if not cut[one] and abs(expected - told) > told / 10:
@@ -165,7 +177,7 @@ def judged(
     move, gain, slope, least, cut, tried, new_cost, new_gradient, new_gram,
     most, decrease, shortest, ended, near,
 ):  # fmt: skip
-    """Take each step or refuse it, in place; fill `ended`, and `near` with where second derivatives are wanted."""
+    """Accept or reject each step, in place; fill `ended`, and `near` with whether second derivatives are needed."""
     count, size = at.shape
     for one in range(count):
         moved, reached, finite = 0.0, 0.0, 0.0
@@ -176,12 +188,12 @@ def judged(
             for j in range(size):
                 finite += new_gram[one, i, j] - new_gram[one, i, j]
         short = np.sqrt(moved) <= shortest * np.sqrt(reached)
-        stuck = short and cut[one]  # in a corner of the box, which steps of more damping leave
-        gained = cost[one] - new_cost[one]  # NaN where the model is not finite there
+        stuck = short and cut[one]  # in a corner of the box, which a more damped step can leave
+        gained = cost[one] - new_cost[one]  # NaN if the model is not finite there
         ratio = gained / gain[one]
         negligible = abs(gain[one]) <= decrease * cost[one] and not stuck
         good = (ratio > 1e-4 and gain[one] > 0) or (negligible and gained >= -8 * EPSILON * cost[one])
-        # rounding of the residuals hides what a weak direction gains, unless it is damped less
+        # Rounding of the residuals hides the gain of a weakly determined direction, unless it is damped less.
         rounding = 8 * EPSILON * np.sqrt(2 * cost[one]) * np.sqrt(reached)
         hidden = abs(gain[one]) <= rounding and not stuck
         good = good or (hidden and gain[one] > 0 and gained >= -rounding)
@@ -189,7 +201,7 @@ def judged(
         settled = negligible and damping[one] <= SLIGHT * least[one]
         quiet[one] = quiet[one] + 1 if negligible or hidden else 0
         steps[one] += 1
-        # damping is divided by 10, 100, 10⁴, ... in a row, or multiplied by 4, 8, 16, ...
+        # Successive steps divide damping by 10, 100, 10⁴, ..., or multiply it by 4, 8, 16, ...
         if not good:
             streak[one] = min(streak[one], 0) - 1
             damping[one] = max(damping[one], SLIGHT * least[one]) * 2.0 ** (1 - streak[one])
@@ -222,8 +234,10 @@ def judged(
 @compiled
 @no_type_check
 def inverted(gram, inverse, trace):
-    """Fill `inverse` with that of each matrix, and `trace` with that of the inverse once its diagonal is scaled to 1:
-    NaN where there is none."""
+    """Fill `inverse` with the inverse of each matrix, and `trace` with the trace of the inverse of the scaled matrix.
+
+    The scaled matrix has a diagonal of 1. The trace is NaN if the matrix has no inverse.
+    """
     count, size = gram.shape[0], gram.shape[1]
     normal, factor = np.empty((size, size)), np.empty((size, size))
     scaled, column = np.empty(size), np.empty(size)

@@ -1,4 +1,4 @@
-"""What framework.least_squares.solver answers."""
+"""The result of framework.least_squares.solver."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -8,34 +8,35 @@ from torch import Tensor
 
 
 class Status(IntEnum):
-    """How a problem ended. Above 0: a minimum that the data determine."""
+    """End of the search for a problem; a value above 0 means a minimum that the data determine."""
 
     GRADIENT = 1
-    """The residuals are orthogonal to the Jacobian, but for what bounds hold."""
+    """The residuals are orthogonal to the Jacobian, except for parameters held at bounds."""
     COST = 2
     """No step would lower the cost by more than a share `decrease` of it."""
     STEP = 3
     """No step would move the parameters by more than a share `step` of them."""
     LIMIT = 0
-    """`most` steps were not enough; the parameters are the best found."""
+    """The search did not end within `most` steps; the parameters are the best found."""
     ILL_POSED = -1
-    """A minimum, but the Jacobian there is rank-deficient: the data do not determine every parameter."""
+    """The search ended at a minimum with a rank-deficient Jacobian: the data do not determine every parameter."""
     NOT_FINITE = -2
-    """No residual is there, or one is infinite, or the Jacobian is not finite, at the start; which is returned."""
+    """The start, which is returned, has no residual, an infinite residual, or a Jacobian that is not finite."""
 
 
 class Solution(NamedTuple):
-    """What was found for each problem; no number is NaN.
+    """Results of each problem; no number is NaN.
 
     Attributes:
         parameters: (problem, p), within the bounds.
-        cost: (problem,), half the sum of squared residuals, as SciPy's.
+        cost: (problem,), half the sum of squared residuals, as in SciPy.
         covariance: (problem, p, p): s² (JᵀJ)⁻¹ with s² the mean squared residual, 2 cost / (residuals - p), and J as if
-            there were no bounds. The pseudo-inverse where the rank is less than p: directions that the data do not
-            determine have variance 0 there. Infinite on the diagonal where the status is NOT_FINITE.
-        rank: (problem,), of the Jacobian with its columns scaled to unit length; p where all is determined.
-        status: (problem,), of `Status`.
-        steps: (problem,), how many were tried.
+            there were no bounds. The pseudo-inverse if the rank is less than p: directions that the data do not
+            determine then have variance 0. Infinite on the diagonal if the status is NOT_FINITE.
+        rank: (problem,), rank of the Jacobian with its columns scaled to unit length; p if all parameters are
+            determined.
+        status: (problem,), values of `Status`.
+        steps: (problem,), number of steps tried.
     """
 
     parameters: Float[Tensor, "problem p"]
@@ -47,4 +48,5 @@ class Solution(NamedTuple):
 
     @property
     def well_posed(self) -> Bool[Tensor, "problem"]:
+        """True for each problem that ended at a minimum that the data determine, (problem,)."""
         return self.status > 0

@@ -13,25 +13,36 @@ from framework.least_squares.compiled import CLIPS, EPSILON, GOES_ON, SINGULAR
 from framework.least_squares.solution import Solution, Status
 
 ILL_CONDITIONED = EPSILON**0.5
-"""Least singular value, columns of the Jacobian scaled to unit length, that counts towards its rank."""
+"""Smallest singular value that counts towards the rank, for a Jacobian with columns scaled to unit length."""
 DOUBTFUL = 1e10
-"""Trace of the inverse of a scaled normal matrix from which on the rank is counted, and not taken for full."""
+"""Trace of the inverse of a scaled normal matrix from which on the rank is computed instead of assumed to be full."""
 
 Model = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""`model(parameters (active, p), rows (active,)) -> (residuals (active, r), jacobian (active, r, p))`; `rows` says
-which problems these are. NaN residuals at the start are missing, and are left out for good."""
+"""`model(parameters (active, p), rows (active,)) -> (residuals (active, r), jacobian (active, r, p))`.
+
+`rows` are the numbers of the problems. Residuals that are NaN at the start are missing, and are left out for the whole
+search.
+"""
 Normal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
-"""`normal(parameters, rows) -> (cost (active,), gradient Jᵀr (active, p), gram JᵀJ (active, p, p), how many residuals
-are there (active,))`: what the model says, for who can sum it faster than write it down."""
+"""The sums of a model: `normal(parameters, rows) -> (cost, gradient Jᵀr, gram JᵀJ, number of residuals)`.
+
+Their shapes are (active,), (active, p), (active, p, p) and (active,). It is for models whose sums can be computed
+faster than their residuals and Jacobian can be stored.
+"""
 Curvature = Callable[[Tensor, Tensor], Tensor]
-"""`curvature(parameters, rows) -> (active, p, p)`: Σ_i residual_i ∇²residual_i over the residuals that are there, which
-JᵀJ lacks of the Hessian of the cost."""
+"""`curvature(parameters, rows) -> (active, p, p)`: Σ_i residual_i ∇²residual_i over the residuals that are not missing.
+
+It is the difference between the Hessian of the cost and JᵀJ.
+"""
 
 
 class _Active(NamedTuple):
-    """The problems at work, first dimension the problem. `gram` is JᵀJ; `curve` what it lacks of the Hessian, 0 far
-    from the minimum; `scale` the greatest length of each column of the Jacobian so far; `damping` in its square;
-    `streak` counts steps accepted (above 0) or refused (below) in a row, `quiet` those without gain."""
+    """The problems that are being solved, first dimension the problem.
+
+    `gram` is JᵀJ. `curve` is the difference between the Hessian and JᵀJ, 0 far from the minimum. `scale` is the largest
+    length of each column of the Jacobian so far. `damping` is in units of its square. `streak` counts successive steps
+    that were accepted (above 0) or rejected (below 0). `quiet` counts successive steps without gain.
+    """
 
     rows: Tensor
     at: Tensor
@@ -48,15 +59,16 @@ class _Active(NamedTuple):
     steps: Tensor
 
     def only(self, which: Tensor) -> "_Active":
+        """Return the problems at these rows."""
         return _Active(*(part[which] for part in self))
 
     def arrays(self, *names: str) -> list[np.ndarray]:
+        """Return fields as NumPy arrays that share memory with them."""
         return [getattr(self, name).numpy() for name in names]
 
 
 class _Step(NamedTuple):
-    """Of each problem: how far, what it is expected to gain, the cosine of gradient and residuals, the square of the
-    factor's least pivot, and whether the box cut it."""
+    """Steps of all problems; framework.least_squares.compiled.stepped describes the fields."""
 
     move: Tensor
     gain: Tensor
@@ -66,11 +78,11 @@ class _Step(NamedTuple):
 
 
 class _Problems:
-    """What is to be made small, evaluated where its numbers lie; what comes back lies on the processor, in double.
+    """The functions to minimise, evaluated on the device of the start; results are in double on the processor.
 
     Attributes:
-        curved: whether second derivatives can be had.
-        there: (problem,), how many residuals are not missing.
+        curved: True if second derivatives are available.
+        there: (problem,), number of residuals that are not missing.
     """
 
     def __init__(
@@ -83,7 +95,7 @@ class _Problems:
         self._present: Tensor | None = None
 
     def written(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor]:
-        """Residuals and Jacobian with 0 for what is missing."""
+        """Return residuals and Jacobian, with 0 for missing residuals."""
         residuals, jacobian = self._moved(self._model, at, rows)
         if self._normal is not None:
             present = ~residuals.isnan()
@@ -101,7 +113,7 @@ class _Problems:
         return residuals, jacobian
 
     def normal(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost, gradient and normal matrix JᵀJ."""
+        """Return cost, gradient and normal matrix JᵀJ."""
         if self._normal is None:
             residuals, jacobian = self.written(at, rows, first)
             gradient = torch.bmm(jacobian.mT, residuals.unsqueeze(-1)).squeeze(-1)
@@ -112,17 +124,19 @@ class _Problems:
         return cost, gradient, gram
 
     def curve(self, at: Tensor, rows: Tensor) -> Tensor:
+        """Return the second derivatives, see `Curvature`."""
         assert self._curvature is not None
         curvature = self._curvature
         return self._moved(lambda *given: (curvature(*given),), at, rows)[0]
 
     def _moved(self, function: Callable[..., tuple[Tensor, ...]], *given: Tensor) -> tuple[Tensor, ...]:
+        """Call a function on the device of the start, and return its results in double on the processor."""
         found = function(*(part.to(self._device) for part in given))
         return tuple(part.to("cpu", torch.float64) for part in found)
 
 
 class _Rules(NamedTuple):
-    """What does not change from step to step."""
+    """Settings that do not change from step to step."""
 
     most: int
     decrease: float
@@ -146,29 +160,31 @@ def least_squares(
 ) -> Solution:
     """Minimise half the sum of squared residuals of each problem over a box.
 
-    Levenberg and Marquardt's method with Marquardt's scaling, which makes it independent of the parameters' units, and
-    a damping for each problem, lowered ever faster while steps succeed and raised ever faster while they fail (Nielsen
-    1999). Parameters at a bound that the gradient pushes against are held (Kanzow, Yamashita & Fukushima 2004); a step
-    that leaves the box is solved again with what it leaves through held at the bound. Steps come from the Cholesky
-    factor of the scaled normal matrix, or, where that is too close to singular, from the singular values of the
-    Jacobian. Where `curvature` is given, steps near the minimum are Newton's: errors are squared, not divided. Problems
-    that have converged leave the batch and others take their place.
+    The method is Levenberg and Marquardt's with Marquardt's scaling, which makes it independent of the parameters'
+    units. Each problem has its own damping, which is lowered ever faster while steps succeed and raised ever faster
+    while they fail (Nielsen 1999). Parameters at a bound that the gradient pushes against are held (Kanzow, Yamashita &
+    Fukushima 2004). A step that leaves the box is solved again with the parameters beyond a bound held there. Steps
+    come from the Cholesky factor of the scaled normal matrix or, if that is too close to singular, from the singular
+    values of the Jacobian. If `curvature` is given, steps near the minimum are Newton's, which square the error instead
+    of dividing it. Problems that have converged leave the batch, and others take their place.
 
-    The model is evaluated where `start` lies; the small matrices are solved on the processor.
+    The model is evaluated on the device of `start`; the small matrices are solved on the processor.
 
     Args:
         model: residuals and their Jacobian, see `Model`.
-        start: (problem, p); moved into the box.
-        lower, upper: broadcast to `start`; may be infinite.
-        normal: the same, summed up, see `Normal`; the model is then asked only where a matrix is close to singular.
+        start: (problem, p); clipped to the box.
+        lower: lower bounds, broadcast to `start`; may be infinite.
+        upper: upper bounds, broadcast to `start`; may be infinite.
+        normal: the sums of the model, see `Normal`; the model is then evaluated only if a matrix is close to singular.
         curvature: the second derivatives, see `Curvature`.
-        most: steps tried for each problem.
-        decrease, step: see `Status`.
-        damping: at the first step, in squared lengths of the Jacobian's columns.
-        together: how many problems are at work at once.
+        most: largest number of steps tried for each problem.
+        decrease: smallest relative decrease of the cost, see `Status`.
+        step: smallest relative step, see `Status`.
+        damping: damping at the first step, in squared lengths of the Jacobian's columns.
+        together: number of problems that are solved at once.
 
     Raises:
-        ValueError: a start or bound that is NaN, or a lower bound above the upper one.
+        ValueError: a start is not finite, a bound is NaN, or a lower bound is above the upper one.
     """
     start = start.double()
     lower, upper = (bound.to(start).expand_as(start) for bound in (lower, upper))
@@ -216,6 +232,7 @@ def _require_box(start: Tensor, lower: Tensor, upper: Tensor) -> None:
 def _begin(
     problems: _Problems, rows: Tensor, found: Solution, lower: Tensor, upper: Tensor, damping: float
 ) -> _Active:
+    """Return the problems at these rows at their start, without those that cannot be evaluated there."""
     at = found.parameters[rows]
     cost, gradient, gram = problems.normal(at, rows, first=True)
     active = _Active(
@@ -223,7 +240,7 @@ def _begin(
         at=at,
         lower=lower[rows],
         upper=upper[rows],
-        # steps are taken in place, and these may be the model's own
+        # Copies, because steps change them in place and the model may keep them.
         cost=cost.clone(),
         gradient=gradient.clone(memory_format=torch.contiguous_format),
         gram=gram.clone(memory_format=torch.contiguous_format),
@@ -241,7 +258,7 @@ def _begin(
 
 
 def _advance(problems: _Problems, rules: _Rules, active: _Active) -> Tensor:
-    """Bring every problem one step further, in place; of each its status, or GOES_ON."""
+    """Advance every problem by one step, in place, and return the status of each, or GOES_ON."""
     step = _step(problems, active)
     tried = torch.minimum(torch.maximum(active.at + step.move, active.lower), active.upper)
     cost, gradient, gram = problems.normal(tried, active.rows)
@@ -260,7 +277,7 @@ def _advance(problems: _Problems, rules: _Rules, active: _Active) -> Tensor:
 
 
 def _step(problems: _Problems, active: _Active) -> _Step:
-    """The damped step within the box."""
+    """Return the damped step within the box."""
     gain, slope, least = (torch.empty_like(active.cost) for _ in range(3))
     cut, careful = (torch.empty(len(gain), dtype=torch.bool) for _ in range(2))
     step = _Step(torch.empty_like(active.at), gain, slope, least, cut)
@@ -274,7 +291,7 @@ def _step(problems: _Problems, active: _Active) -> _Step:
 
 
 def _careful_step(problems: _Problems, active: _Active, step: _Step) -> _Step:
-    """The same from the singular values of the Jacobian, where its square has lost what it knows."""
+    """Return the damped step from the singular values of the Jacobian, because JᵀJ has lost digits."""
     held = (active.at <= active.lower) & (active.gradient >= 0)
     held |= (active.at >= active.upper) & (active.gradient <= 0)
     held |= active.gram.diagonal(dim1=-2, dim2=-1).sqrt() <= EPSILON * active.scale
@@ -301,7 +318,7 @@ def _careful_step(problems: _Problems, active: _Active, step: _Step) -> _Step:
 
 
 def _solved(jacobian: Tensor, residuals: Tensor, held: Tensor, known: Tensor, damping: Tensor) -> Tensor:
-    """The scaled step m of least |J m + r|² + damping |m|², which moves what is held as far as is known."""
+    """Return the scaled step m that minimises |J m + r|² + damping |m|²; parameters in `held` move by `known`."""
     residuals = residuals + torch.bmm(jacobian, known.unsqueeze(-1)).squeeze(-1)
     left, values, right = torch.linalg.svd(jacobian * ~held.unsqueeze(-2), full_matrices=False)
     values = values.where(values > EPSILON * values.amax(-1, keepdim=True), 0.0)
@@ -311,12 +328,12 @@ def _solved(jacobian: Tensor, residuals: Tensor, held: Tensor, known: Tensor, da
 
 
 def _finish(problems: _Problems, active: _Active, status: Tensor, found: Solution) -> None:
-    """Write down problems that have ended, with their covariance and rank."""
+    """Store the results of problems that have ended, with their covariance and rank."""
     size = active.at.shape[-1]
     inverse, trace = torch.empty_like(active.gram), torch.empty_like(active.cost)
     compiled.inverted(active.gram.numpy(), inverse.numpy(), trace.numpy())
     rank = torch.full_like(active.rows, size)
-    # the trace is 1/σ² of the least singular value σ, or up to p times as much
+    # The trace is between 1/σ² and p/σ², with the smallest singular value σ.
     doubtful = (~(trace < DOUBTFUL)).nonzero().squeeze(1)
     if len(doubtful):
         one = active.only(doubtful)
