@@ -21,6 +21,7 @@ def test_a_strangers_head_passes_by_name(framework: Framework) -> None:
     assert sum("log_prob, float32" in line for line in findings) == 1  # only one row has a reference
 
 
+@pytest.mark.slow  # its sampler hangs, for 20 s
 def test_torchs_von_mises_fails_and_the_table_says_where(framework: Framework) -> None:
     done = framework("mode=check", "density_head=torch_von_mises", "threads=1")
     assert done.code == 1, done.out

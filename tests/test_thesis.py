@@ -140,8 +140,11 @@ def test_a_preset_is_what_the_thesis_says(experiment: str) -> None:
     "experiment",
     [
         "modelnet40/bps_mlp_400",
-        "modelnet40/bps_conv3d",
-        "pascal3d/von_mises data.image_size=75 data.images=60 batch_size=2 encoder.inception_resnet_v2.weights=null",
+        pytest.param("modelnet40/bps_conv3d", marks=pytest.mark.slow),
+        pytest.param(
+            "pascal3d/von_mises data.image_size=75 data.images=60 batch_size=2 encoder.inception_resnet_v2.weights=null",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_preset_trains(experiment: str, framework: Framework) -> None:
