@@ -159,11 +159,12 @@ class Needles(Data):
         if self.fault == "a field is lost":
             return {name: value for name, value in batch.items() if name != "group"}
         inputs = batch["input"]
-        noise = torch.randn(inputs.shape)
+        noise = torch.randn(inputs.shape, device=inputs.device)
         if self.fault == "noise of numpy's":
             noise = torch.from_numpy(np.random.randn(*inputs.shape)).float()  # noqa: NPY002
+            noise = noise.to(inputs.device)
         if self.fault == "noise of one type alone":
-            noise = inputs.lerp(noise, torch.rand(len(inputs), 1, dtype=torch.float32))
+            noise = inputs.lerp(noise, torch.rand(len(inputs), 1, dtype=torch.float32, device=inputs.device))
         return {**batch, "input": inputs + 0.01 * noise}
 
     def fingerprint(self):
@@ -215,7 +216,7 @@ def failed(row, fault=""):
 
 def test_a_sound_data_set_passes_generated_or_from_a_root() -> None:
     names = [finding.name for finding in findings(ROW)]
-    assert len(names) == 22
+    assert len(names) == 23
     require(*findings(ROW))
     real = findings(REAL)
     assert {"missing root", "damaged files are named"} <= {finding.name for finding in real}
