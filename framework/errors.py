@@ -85,7 +85,7 @@ def shown(damage: object, most: int = 200) -> str:
 
 
 def quoted(damage: object) -> str:
-    """Return the same as `shown`, in quotation marks."""
+    """Return the result of `shown` in quotation marks."""
     return shown(repr(damage))
 
 

@@ -256,8 +256,8 @@ def learns(predictor: Predictor) -> bool:
 def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
     """Return a penalty per sample, (batch,), from the penalties of its members, so that each member trains as if alone.
 
-    Its value is the mean over members, which compares with the penalty of one model. Its gradient is the gradient of
-    the sum. So the gradient of each member is neither divided by the number of members nor changed by the others.
+    The value is the mean over members, so it is comparable with the penalty of a single model. The gradient is that of
+    the sum, so the gradient of each member is neither divided by the number of members nor changed by the others.
 
     Args:
         values: (batch,), returned as they are, or (batch, member).

@@ -21,9 +21,11 @@ class Rival:
     """Optimiser of Adam's family for an adversary's parameters, which are trained against the predictor's.
 
     Its step is taken together with the predictor's step, from gradients at the same weights. This equals two optimisers
-    whose losses are both computed before either has stepped. Its gradients are clipped separately.
+    whose losses are both computed before either of them steps. Its gradients are clipped separately.
 
     Attributes:
+        learning_rate: factor on its steps.
+        schedule: change of the learning rate: none, or half a cosine to 0.
         betas: decay rates of the moments.
     """
 

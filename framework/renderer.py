@@ -191,7 +191,8 @@ class Renderer(ABC):
     """Names of the scene's parts in which "color" has a gradient.
 
     The names are "vertices", "colors", "texture" (its images), "uv", "rotation", "translation", "focal" and
-    "principal". The gradient is that of pixels as areas, not as single points.
+    "principal". The gradient is that of an image whose pixels are averages over their areas, not samples at single
+    points.
     """
 
     report: Report | None = None

@@ -553,7 +553,7 @@ def blurred(
     down = _smoothing(height, deviation).to(exact)
     across = _smoothing(width, deviation).to(exact)
     # Separable: G(x, y) = g(x) g(y). Two products of matrices cost the same whatever the deviation; kornia's
-    # gaussian_blur2d takes 2 to 70 times as long, has not this border, and refuses kernels larger than the image.
+    # gaussian_blur2d takes 2 to 70 times as long, lacks this border, and refuses kernels larger than the image.
     smooth = down @ exact @ across.mT
     return smooth if images.is_floating_point() else smooth.round_().to(images.dtype)
 
@@ -563,7 +563,7 @@ def _smoothing(length: int, deviation: float) -> Float[Tensor, "length length"]:
     reach = int(4 * deviation + 0.5)
     offsets = torch.arange(-reach, reach + 1)
     weights = (-0.5 * (offsets.double() / deviation).square()).exp()
-    # Mirrored about its edges again and again, a line repeats after twice its length.
+    # A line that is mirrored repeatedly about its edges has a period of twice its length.
     source = (torch.arange(length)[:, None] + offsets) % (2 * length)
     source = torch.minimum(source, 2 * length - 1 - source)
     matrix = torch.zeros(length, length, dtype=torch.float64)

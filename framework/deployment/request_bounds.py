@@ -104,7 +104,7 @@ class Bounded:
 
     def __init__(self, app: App, seconds: float, samples: Iterable[bytes] = ()) -> None:
         self.app, self.seconds, self.samples = app, seconds, samples
-        self.held = 0  # bytes of bodies
+        self.held = 0  # bytes of all bodies that are held now
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Answer a request, or pass on a request that is not for the model."""

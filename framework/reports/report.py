@@ -77,8 +77,8 @@ def _logged(run: Run) -> set[str]:
 def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) -> None:
     """Save the figures of predictions and of metrics.
 
-    If a density lacks a function that the figures of predictions need, only these are left out, because nobody
-    requested them and the numbers exist.
+    If the figures of predictions need a function that the density lacks, only these figures are left out. The run does
+    not fail, because nobody requested them and its numbers exist.
     """
     from framework.reports.prediction_pictures import prediction_pictures
 

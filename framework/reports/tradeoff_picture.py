@@ -138,7 +138,7 @@ def _series(rows: Sequence[Row], group: str | None) -> list[_Series]:
 def _panel(
     axes: Axes, series: Sequence[_Series], key: str, time: str, *, lower: bool, floor: Floor | None
 ) -> tuple[list[tuple[Any, ...]], list[np.ndarray]]:
-    """Draw one key.
+    """Draw the panel of one metric.
 
     Returns:
         The texts beside points as (x, y, text, colour), and the lines that the texts must not cover.

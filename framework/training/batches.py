@@ -230,7 +230,7 @@ class Batches(pl.LightningDataModule):
             epoch, first = epoch.started, 0
         else:
             epoch, first = epoch.started - 1, processed
-        # Overfitting wants the same few batches every time.
+        # `overfit_batches` requires the same few batches in every epoch.
         return (0 if trainer.overfit_batches else epoch), first
 
 
