@@ -30,7 +30,7 @@ def measured(target, *batches, dtype=torch.float64):
 
 
 def loop(point, target):
-    """Deviations in degrees by the shorter of the two ways round, one number at a time."""
+    """Return deviations in degrees by the shorter of the two ways round, one number at a time."""
     rows = []
     for predicted, true in zip(point, target, strict=True):
         row = []

@@ -54,9 +54,7 @@ class Brier(Mean):
 def brier(
     probability: Float64[Tensor, "batch class"], label: Int[Tensor, "batch"]
 ) -> Float64[Tensor, "batch"]:
-    """Return (y - p(y = 1))² for two classes (eq. 2.26), Σ_k (p_k - 1[y = k])² for more (Brier 1950, eq. 2), per
-    sample.
-    """
+    """Return (y - p(y = 1))² for two classes (eq. 2.26), else Σ_k (p_k - 1[y = k])² (Brier 1950, eq. 2)."""
     classes = probability.shape[-1]
     error = probability - torch.nn.functional.one_hot(label, classes)
     return error[:, 1].square() if classes == 2 else error.square().sum(-1)

@@ -141,7 +141,7 @@ class CalibrationError(Metric, Pictured):
             accuracy_label=f"share of {self.names[1]}" if self.positive else "accuracy",
             title=title,
             synthetic=synthetic,
-            # the largest of so many probabilities is at least their mean
+            # the largest class probability is at least the mean of all of them
             least=0.0 if self.positive or len(self.names) < 2 else 1 / len(self.names),
         )
 
@@ -149,8 +149,9 @@ class CalibrationError(Metric, Pictured):
         return in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
 
     def _seen(self, first: int = 0) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
-        """Return the confidences in ascending order, so that no sum depends on the order of the samples, and which are
-        right.
+        """Return the confidences in ascending order, and which are right.
+
+        The order makes sums independent of the order in which samples came.
         """
         samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 4, dtype=torch.float64)
         confidence, order = samples[:, first].contiguous().sort()
@@ -198,7 +199,7 @@ def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, 
     ordered = confidence.sort().values
     first = torch.searchsorted(ordered, confidence)
     after = torch.searchsorted(ordered, confidence, right=True)
-    # their middle is (first + after - 1) / 2, and with ½ more (first + after) / 2: in integers, so that nothing rounds
+    # the middle rank r is (first + after - 1) / 2, and r + ½ is (first + after) / 2: integers avoid rounding
     return bins * (first + after) // (2 * max(1, len(confidence)))
 
 
@@ -211,7 +212,7 @@ def least_of_near(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sam
     """
     ordered, order = confidence.sort()
     count = len(ordered)
-    # where the group of each one would end if it began there; groups begin where jumps from the first lead
+    # `end` is where a group that began at each place would end; groups begin where jumps from the first one lead
     end = torch.searchsorted(ordered, ordered + NEAR, right=True)
     end = torch.cat([end, end.new_full((1,), count)])
     begins = torch.zeros_like(end, dtype=torch.bool)
@@ -245,9 +246,7 @@ def expected_error(bins: Bins) -> Float64[Tensor, ""]:
 
 
 def largest_error(bins: Bins) -> Float64[Tensor, ""]:
-    """Return max_l |conf(B_l) - acc(B_l)| over the bins that have samples (Guo et al. 2017, eq. 5); NaN without
-    samples.
-    """
+    """Return max_l |conf(B_l) - acc(B_l)| over bins with samples (Guo et al. 2017, eq. 5); NaN without samples."""
     seen = bins.seen
     gaps = (seen.confidence - seen.right).abs() / seen.count
     return gaps.max() if len(gaps) else gaps.new_tensor(torch.nan)

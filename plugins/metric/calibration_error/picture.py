@@ -67,7 +67,7 @@ def _histogram(axes: Axes, count: Numbers, confidence: float, right: float, accu
         f"{accuracy_label} {right / total:.3f}": (right / total, GREEN, "-"),
     }
     for label, (place, colour, style) in lines.items():
-        # drawn whole where the mean is 0 or 1
+        # without clipping, a line at 0 or 1 is drawn in full width
         axes.axvline(place, color=colour, linestyle=style, linewidth=1.8, label=label, clip_on=False)
     legend = axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, fontsize=8, frameon=False)
     for text in legend.get_texts():
@@ -89,7 +89,7 @@ def _curve(axes: Axes, count: Numbers, confidence: Numbers, right: Numbers) -> N
         style = {"align": "edge", "color": colour, "alpha": 0.45, "edgecolor": "white", "hatch": "///"}
         axes.bar(left, np.maximum(gap, 0), width, lower, label=label, **style)
     low, high = wilson(right[seen], number)
-    # where the samples of the bin lie on average, so that a calibrated bin touches the diagonal
+    # put the marker at the mean confidence of the bin, so that a calibrated bin touches the diagonal
     bars = {"linestyle": "", "marker": "o", "markersize": 3.5, "color": "black", "capsize": 2.5}
     axes.errorbar(
         stated,
@@ -108,9 +108,7 @@ def _curve(axes: Axes, count: Numbers, confidence: Numbers, right: Numbers) -> N
 
 
 def wilson(right: Numbers, count: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the ends of the 95 % score interval of a share (Wilson 1927); it is proper also for none or all of few
-    samples.
-    """
+    """Return the ends of the 95 % score interval of a share (Wilson 1927), also for none or all of few samples."""
     share, spread = right / count, QUANTILE**2 / count
     centre = (share + spread / 2) / (1 + spread)
     half = np.sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)

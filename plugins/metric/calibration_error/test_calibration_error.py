@@ -25,13 +25,13 @@ TWO = Target("class", ("off", "on"))
 
 
 def predicted(probability, label, dtype=torch.float64):
-    """A batch with these class probabilities."""
+    """Return a batch with these class probabilities."""
     logits = torch.as_tensor(np.asarray(probability), dtype=dtype).log()
     return Prediction(Categorical(logits=logits, validate_args=False), {"target": torch.as_tensor(label)})
 
 
 def positive(probability):
-    """Both classes' probabilities from the second's."""
+    """Return both classes' probabilities from the second one's."""
     probability = np.asarray(probability, dtype=float)
     return np.stack([1 - probability, probability], -1)
 
@@ -44,7 +44,9 @@ def measured(*batches, target=TWO, **config):
 
 
 def loop_width(confidence, right, bins):
-    """[(count, mean confidence, accuracy)] of the bins of eq. 2.28, edges a little lower; the last one closed."""
+    """Return [(count, mean confidence, accuracy)] of the bins of eq. 2.28, with edges slightly lower and the last one
+    closed.
+    """
     found = []
     for number in range(bins):
         last = number == bins - 1
@@ -59,7 +61,9 @@ def loop_width(confidence, right, bins):
 
 
 def loop_mass(confidence, right, bins):
-    """The same of equally many samples; a group of near confidences goes where its middle lies."""
+    """Return [(count, mean confidence, accuracy)] of bins of equal mass; a group of near confidences goes to its
+    middle's bin.
+    """
     groups = []
     for pair in sorted(zip(confidence, right, strict=True)):
         if not groups or pair[0] > groups[-1][0][0] + NEAR:

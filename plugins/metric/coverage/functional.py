@@ -87,9 +87,7 @@ def of_classes(density: Distribution, value: Int[Tensor, "batch"], mass: float) 
 
 
 def of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    """Return the result for an angle by cubic interpolation of density and slope on a grid finer than the moments'
-    grid.
-    """
+    """Return the result for an angle by cubic interpolation of density and slope on a finer grid than the moments'."""
     rows = max(1, BLOCK // (2 * FINER * len(seen.moments)))
     parts = zip(seen.moments.split(rows, 1), seen.resolved.split(rows), log_prob.split(rows), strict=True)
     found = [_of_angle(CircularMoments(moments, known), at, mass) for moments, known, at in parts]
@@ -101,7 +99,7 @@ def _of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: flo
     level, equal = log_prob.double().exp(), EQUAL[log_prob.dtype]
     low, _ = cubic.above(level)
     high = low.clone()
-    # a plateau, or a mode, on which rounding would decide
+    # on a plateau or at a mode rounding would decide: take both masses with a tolerance
     flat = ((cubic.density - level).abs() <= equal * level).any(0) | (level >= cubic.density.amax(0))
     if bool(flat.any()):
         here = cubic.rows(flat)
@@ -112,8 +110,7 @@ def _of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: flo
 
 
 class Cubic(NamedTuple):
-    """Density on the circle as a cubic Hermite polynomial in each cell of a grid; its error is of the cell's fourth
-    power.
+    """Density on the circle as a cubic Hermite polynomial in each grid cell; its error is of the cell's fourth power.
 
     Attributes:
         density: density at the points of the grid, (point, batch), per radian.
@@ -228,9 +225,7 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
 
 
 def of_draws(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """Return the result from the target's rank in density among draws; the size is E[1{p(X) ≥ t} / p(X)] for one
-    number.
-    """
+    """Return the result by the target's rank among draws; the size of one number's region is E[1{p(X) ≥ t} / p(X)]."""
     drawn = density.sample(torch.Size((samples,)))
     log_prob, at = density.log_prob(drawn).double(), density.log_prob(value).double()
     equal = EQUAL[torch.float32]

@@ -34,8 +34,7 @@ class Score(NamedTuple):
 
 @singledispatch
 def crps(density: Distribution, value: Tensor, samples: int) -> Score:
-    """Return E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21) at a target y; 0 is best, |X - y| for a point
-    mass.
+    """Return E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21); 0 is best, |X - y| for a point mass.
 
     For an angle the distance is the angular one (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact
     for mixtures of up to MOST normals and for angles that a grid resolves (`circular_moments`). Otherwise it is the

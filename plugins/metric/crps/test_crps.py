@@ -102,7 +102,7 @@ def test_nan_is_named_and_classes_are_refused():
 
 @pytest.mark.parametrize("count", [2, MOST, MOST + 1, 20000])
 def test_many_normals_cost_no_memory_of_their_pairs(count):
-    """Two of them, each many times: beyond MOST it is an estimate with its error."""
+    """Check two normals, each repeated many times: beyond MOST the score is an estimate with its error."""
     place = torch.tensor([-1.0, 2.0], dtype=torch.float64).repeat(1, count // 2 + 1)[:, :count]
     weights = torch.zeros(1, count, dtype=torch.float64)
     density = Mixture(

@@ -14,8 +14,7 @@ from framework.distributions.circular_moments import circular_moments
 from framework.distributions.protocol import arc, cdf, turn
 
 NOTHING = 1e-9
-"""Threshold below which the mass of an arc from a grid is rounding and counts as 0, so that an infinite cost ignores
-it.
+"""Threshold below which the mass of an arc from a grid is rounding: it counts as 0, also at infinite cost.
 """
 
 

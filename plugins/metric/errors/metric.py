@@ -37,9 +37,7 @@ class Errors(Mean):
 
     @abstractmethod
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reported number and its standard error, from the mean of the powers and the standard error of that
-        mean.
-        """
+        """Return the reported number and its standard error, from the mean of the powers and its standard error."""
 
     def update(self, prediction: Prediction) -> None:
         # convert to float64 first, so that the difference is not rounded to float32

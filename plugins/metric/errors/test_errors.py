@@ -1,4 +1,4 @@
-"""Errors of reals against plain NumPy, and their standard errors against a spread over repetitions."""
+"""Tests of errors of reals against plain NumPy, and of their standard errors against a spread over repetitions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Where paths land, and how well draws say so, against formulas."""
+"""Tests of landing places, and of the scores of drawn ones, against formulas."""
 
 import torch
 
@@ -23,7 +23,7 @@ def test_landing_places_against_their_formulas() -> None:
 
 
 def test_a_ball_may_land_before_the_first_predicted_frame() -> None:
-    """From where it was seen last, whatever the order of frames; not where it was never seen."""
+    """Check the start at the place seen last, whatever the order of frames, and NaN where the ball was never seen."""
     truth = torch.tensor([[[0.2, 1.0, -0.95], [0.3, 1.2, -0.8]]]).double().expand(3, -1, -1)
     frames = torch.zeros(3, 2, len(PARTS)).double()
     frames[0] = torch.tensor([[-0.032, 9.0, 9.0, 9.0, 1.0], [-0.016, 0.0, 0.8, -0.75, 1.0]])

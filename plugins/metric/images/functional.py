@@ -26,9 +26,7 @@ def psnr(predicted: Pixels, true: Pixels, ceiling: float) -> Float[Tensor, ""]:
 
 
 class Similarity(NamedTuple):
-    """SSIM of every window that lies in the image, and its factor for contrast and structure, (number, height - 10,
-    width - 10).
-    """
+    """SSIM of each window in the image, and its contrast and structure alone, (number, height - 10, width - 10)."""
 
     whole: Tensor
     contrast: Tensor
@@ -76,8 +74,7 @@ def ssim(predicted: Image, true: Image, mask: Mask | None) -> list[Float[Tensor,
 
 
 def ms_ssim(predicted: Image, true: Image, scales: int) -> Float[Tensor, ""]:
-    """Return the multi-scale structural similarity (Wang, Simoncelli & Bovik 2003, eq. 7), the mean over colour
-    channels.
+    """Return the multi-scale structural similarity (Wang, Simoncelli & Bovik 2003, eq. 7), the mean over channels.
 
     With fewer than five scales the weights of the finest ones are taken, scaled to the sum of all five weights. A
     negative mean contrast counts as 0, because its power is not defined.

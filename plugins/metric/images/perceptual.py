@@ -20,8 +20,7 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class Distance(nn.Module):
-    """LPIPS distance (Zhang et al. 2018, eq. 1) with the authors' feature weights, version 0.1, which torchmetrics
-    ships.
+    """LPIPS distance (Zhang et al. 2018, eq. 1) with the authors' weights, version 0.1, which torchmetrics ships.
 
     Args:
         backbone: AlexNet, or VGG16.
@@ -98,9 +97,7 @@ class AlexNet(nn.Sequential):
 
 
 class VGG16(nn.Sequential):
-    """Convolutions of configuration D (Simonyan & Zisserman 2015) up to the last compared layer, numbered as in
-    torchvision.
-    """
+    """Convolutions of configuration D (Simonyan & Zisserman 2015), numbered as in torchvision, as far as compared."""
 
     def __init__(self) -> None:
         layers: list[nn.Module] = []

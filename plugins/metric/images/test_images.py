@@ -1,4 +1,4 @@
-"""Metrics of images against NumPy by hand, kornia, torchmetrics and numbers counted on paper."""
+"""Tests of image metrics against NumPy by hand, kornia, torchmetrics and numbers counted on paper."""
 
 import math
 
@@ -32,7 +32,7 @@ def made(name: str, **config):
 
 
 def shown(color: Tensor) -> Independent:
-    """A density over images with this mean."""
+    """Return a density over images with this mean."""
     return Independent(Laplace(color, torch.ones_like(color), validate_args=False), 3, validate_args=False)
 
 
@@ -42,7 +42,7 @@ def colors(predicted: Tensor, true: Tensor, mask: Tensor | None = None, first: i
 
 
 def pictures(*shape: int, dtype=torch.float64, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Light that is too bright or too dark in places, light near it, and masks."""
+    """Return linear RGB that is out of range in places, linear RGB close to it, and masks."""
     generator = torch.Generator().manual_seed(seed)
     true = 1.2 * torch.rand(shape, generator=generator, dtype=dtype) - 0.1
     near = true + 0.1 * torch.randn(shape, generator=generator, dtype=dtype)
@@ -56,7 +56,7 @@ def measured(metric, *predictions: Prediction) -> dict[str, float]:
 
 
 def file_numbers(light: Tensor, encoding: str) -> np.ndarray:
-    """By kornia, whose transfer reads channels first; light outside of [0, 1] is cut off."""
+    """Return sRGB by kornia, which reads channels first; linear RGB outside of [0, 1] is clipped."""
     light = light.double().clamp(0, 1)
     if encoding == "srgb":
         light = kornia.color.linear_rgb_to_rgb(light.movedim(-1, 1)).movedim(1, -1)
@@ -106,8 +106,10 @@ def window() -> np.ndarray:
 
 
 def by_hand(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SSIM, and its contrast and structure, about every place of one channel: one window at a time, moments about their
-    means."""
+    """Return SSIM, and its contrast and structure, of every window of one channel, one window at a time.
+
+    Moments are taken about their means.
+    """
     weights, (height, width) = window(), one.shape
     whole, contrast = np.zeros((2, height - 10, width - 10))
     for row in range(height - 10):
@@ -142,7 +144,7 @@ def test_ssim_is_that_of_one_window_at_a_time(dtype, limit):
 
 
 def by_convolution(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same of larger images, by SciPy."""
+    """Return the numbers of `by_hand` for larger images, by SciPy."""
     mean_x, mean_y, x, y, product = (
         convolve2d(image, window(), mode="valid") for image in (one, other, one**2, other**2, one * other)
     )
@@ -152,7 +154,7 @@ def by_convolution(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def halved(image: np.ndarray) -> np.ndarray:
-    """The authors' filter of 2 × 2 with mirrored edges, of which every second pixel stays, the first included."""
+    """Return every second pixel, the first included, of the authors' 2 × 2 filter with mirrored edges."""
     filtered = ndimage.correlate(image, np.full((2, 2), 0.25), mode="reflect", origin=-1)
     return filtered[::2, ::2]
 
@@ -183,7 +185,7 @@ def test_ms_ssim_is_a_product_over_scales(scales, size, reference):
 
 
 def drawn(**fields: Tensor) -> Prediction:
-    """What is predicted is named `predicted_<channel>`, the truth `<channel>`."""
+    """Return a prediction of images; predictions are named `predicted_<channel>`, the truth `<channel>`."""
     inside = {name.removeprefix("predicted_"): field for name, field in fields.items() if "_" in name}
     truth = {name: field for name, field in fields.items() if "_" not in name}
     count = len(next(iter(truth.values())))

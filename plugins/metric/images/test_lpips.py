@@ -1,4 +1,4 @@
-"""LPIPS against its formula stated once more in float64, and against torchmetrics', with random weights in a file."""
+"""Tests of LPIPS against its formula in float64 and against torchmetrics', with random weights in a file."""
 
 import math
 from pathlib import Path
@@ -34,7 +34,7 @@ HEADS = Path(torchmetrics.__file__).parent / "functional/image/lpips_models"
 
 
 def weights(backbone: str, seed: int = 0) -> dict[str, Tensor]:
-    """By torchvision's names, random; all layers of the features."""
+    """Return random weights of all feature layers, by torchvision's names."""
     generator = torch.Generator().manual_seed(seed)
     found = {}
     for number, before, width, side in LAYERS[backbone]:
@@ -51,7 +51,7 @@ def written(folder: Path, state: dict[str, Tensor]) -> str:
 
 
 def by_hand(backbone: str, state: dict[str, Tensor], one: Tensor, other: Tensor) -> float:
-    """Eq. 1 of Zhang et al. 2018 of two images (3, height, width) in [0, 1], float64."""
+    """Return eq. 1 of Zhang et al. 2018 of two images (3, height, width) in [0, 1], float64."""
     heads = torch.load(HEADS / f"{backbone}.pth", weights_only=True, map_location="cpu")
     shift, scale = (
         torch.tensor(numbers, dtype=torch.float64)[:, None, None]
@@ -81,7 +81,7 @@ def lpips(**config):
 @pytest.mark.parametrize("backbone, size", [("alex", (33, 40)), ("vgg", (16, 21))])
 @pytest.mark.parametrize("whole", [True, False])
 def test_lpips_is_its_formula_over_the_frame_and_on_white(backbone, size, whole, tmp_path, monkeypatch):
-    """From a file of all of torchvision's layers, or of the features' own names alone."""
+    """Check files of all of torchvision's layers, and of the features' own names alone."""
     state = weights(backbone)
     if whole:
         file = written(tmp_path, {**state, "classifier.1.weight": torch.zeros(4, 9)})

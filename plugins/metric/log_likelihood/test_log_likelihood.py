@@ -19,7 +19,7 @@ from plugins.metric.log_likelihood.metric import LogLikelihood, merged_moments, 
 
 
 class Known(Distribution):
-    """A density whose log-likelihoods are given."""
+    """Density whose log-likelihoods are given."""
 
     arg_constraints = {}  # noqa: RUF012 - as torch has it
 
@@ -35,14 +35,14 @@ estimate.register(Known, exactly)
 
 
 class Untold(Known):
-    """The same by one who has not said whether log_prob draws."""
+    """Density whose log-likelihoods are given, but which has not declared whether log_prob draws."""
 
 
 estimate.register(Untold, estimate.dispatch(Distribution))
 
 
 class Drawn(Known):
-    """A density whose log-likelihoods are estimates: with standard errors 0.1, 0.2, ... from 10, 20, ... samples."""
+    """Density whose log-likelihoods are estimates, with standard errors 0.1, 0.2, ... from 10, 20, ... samples."""
 
 
 @estimate.register

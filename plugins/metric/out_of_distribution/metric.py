@@ -106,9 +106,7 @@ def doubt(density: Distribution) -> Float64[Tensor, "batch"]:
 def ranking(
     outliers: Float[Tensor, "outlier"], test: Float[Tensor, "sample"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Return `auroc`, `aupr` and `fpr95` of two sets of scores, with outliers as the positives; NaN where one set is
-    empty.
-    """
+    """Return `auroc`, `aupr` and `fpr95` of two sets of scores, outliers being the positives; NaN if one is empty."""
     samples, strangers = len(test), len(outliers)
     if samples == 0 or strangers == 0:
         nothing = outliers.new_tensor(torch.nan, dtype=torch.float64)

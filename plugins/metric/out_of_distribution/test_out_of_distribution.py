@@ -18,7 +18,7 @@ from plugins.metric.out_of_distribution.metric import OutOfDistribution, doubt, 
 
 
 class Known(Distribution):
-    """A density whose entropies are given."""
+    """Density whose entropies are given."""
 
     arg_constraints = {}  # noqa: RUF012 - as torch has it
 
@@ -31,7 +31,7 @@ class Known(Distribution):
 
 
 def measured(outliers, test, **config):
-    """Of densities for the outliers and for the test split, each a list of batches."""
+    """Return the results for densities of the outliers and of the test split, each a list of batches."""
     metric = build("metric", resolve("metric", {"name": "out_of_distribution", **config}))
     for density in test:
         metric.update(Prediction(density, {}))
@@ -46,7 +46,7 @@ def ranked(outliers, test):
 
 
 def loops(outliers, test):
-    """From the definitions, one pair and one threshold at a time."""
+    """Return the results by their definitions, one pair and one threshold at a time."""
     wins = [(o > t) + 0.5 * (o == t) for o in outliers for t in test]
     precision, fpr = [], None
     for score in outliers:

@@ -13,8 +13,7 @@ from framework.distributions.protocol import arc, cdf, turn
 
 
 def transform(density: Distribution, value: Float[Tensor, "batch 1"], samples: int) -> Float[Tensor, "batch"]:
-    """Return F(y) under a density of one real or one angle, float64 in [0, 1]; it is uniform if the density is the true
-    one.
+    """Return F(y) under a density of one real or one angle, float64 in [0, 1]; uniform if the density is the true one.
 
     For an angle, F is the mass from the antipode of the density's mean direction counter-clockwise to y; where the mean
     has no direction, it is the mass from ±π. The result is exact where `cdf` or `circular_moments` are exact; otherwise

@@ -67,9 +67,7 @@ def coverage(found: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, 
 
 
 def rank_correlation(one: Float[Tensor, "count"], other: Tensor) -> Float[Tensor, ""]:
-    """Return Spearman's correlation: Pearson's correlation of the ranks, ties sharing their mean; NaN where one is
-    constant.
-    """
+    """Return Spearman's correlation: Pearson's of the ranks, ties sharing their mean; NaN where one is constant."""
     first, second = (part - part.mean() for part in (ranks(one), ranks(other)))
     return (first * second).sum() / (first.square().sum() * second.square().sum()).sqrt()
 

@@ -1,4 +1,4 @@
-"""Shares and ranks of pixels against SciPy and sampling; what is kept, shown and refused."""
+"""Tests of shares and ranks of pixels against SciPy and sampling, and of what is kept, shown and refused."""
 
 import numpy as np
 import pytest
@@ -23,13 +23,13 @@ LEVEL = torch.arange(1, LEVELS + 1).double() / (LEVELS + 1)
 
 
 def laplaces(place: Tensor, wide: Tensor) -> Distribution:
-    """Of the head that is shipped: they know their medians."""
+    """Return densities of the shipped head, which know their medians."""
     head = build("density_head", resolve("density_head", "laplace_image"), target=TARGET).double()
     return type(head(torch.zeros(1, head.size).double()))(place, wide)
 
 
 def images(count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Places and widths of densities, and truths drawn from them."""
+    """Return places and widths of densities, and truths drawn from them."""
     torch.manual_seed(0)
     place = 0.3 + 0.4 * torch.rand(count, *SIZE, 3).double()
     wide = torch.rand(count, *SIZE, 1).double().expand(place.shape) * 0.05 + 0.003
@@ -37,7 +37,7 @@ def images(count: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def stored(value: Tensor) -> Tensor:
-    """As a file of 8 bits gives it back."""
+    """Return the numbers as a file of 8 bits holds them."""
     return (value.clamp(0, 1) * 255).round() / 255
 
 
@@ -89,7 +89,7 @@ def test_ranks_share_ties() -> None:
 def test_what_densities_draw_is_covered_as_promised_however_coarse_the_grid(
     structure: str, wide: float
 ) -> None:
-    """Rounded to 8 bits and cut off at black and white, from a fortieth of a step wide to all saturated."""
+    """Check draws rounded to 8 bits and clipped at black and white, from a fortieth of a step wide to all saturated."""
     torch.manual_seed(1)
     place = torch.rand(2, 3, *SIZE, 3).double().round(decimals=1)  # some of them exactly 0 or 1
     parts = [Independent(Laplace(one, torch.full_like(one, wide)), 3) for one in place.unbind(1)]

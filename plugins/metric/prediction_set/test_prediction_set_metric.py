@@ -37,7 +37,7 @@ def judged(target, density, threshold, labels, score="density", **fields):
 
 @pytest.mark.parametrize("target", [CLASSES, ANGLE, REAL], ids=lambda target: target.kind)
 def test_the_contract_holds_on_sets(target, monkeypatch):
-    """Whose level is 1.7 nats for any density, so that places tell sizes apart where densities differ in them."""
+    """Check sets of level 1.7 nats for every density, so that their sizes differ where the densities do."""
     plain = metrics.density_about
 
     def with_sets(target, place, *more):

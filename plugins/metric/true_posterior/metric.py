@@ -152,8 +152,7 @@ def entropy_and_mode_mass(
     points: int,
     samples: int,
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch modes"]]:
-    """Return the entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, column k <
-    n.
+    """Return the entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, k < n.
 
     Both are integrated by the trapezium rule on the circle. A grid cell that is cut by a window's edge counts with the
     part inside.

@@ -23,7 +23,7 @@ TURN = 2 * math.pi
 
 
 class Modes(Distribution):
-    """Von Mises components of equal weight in the first angle; any other angle is never to be looked at."""
+    """Density with von Mises components of equal weight in the first angle; no other angle may be read."""
 
     arg_constraints = {}  # noqa: RUF012 - as torch has it
     support = circular
@@ -64,7 +64,7 @@ def measured(*predictions, **config):
 
 
 def quadrature(modes, concentration, azimuth, symmetry):
-    """Entropy and mode masses by adaptive quadrature of SciPy's density, one sample at a time."""
+    """Return entropy and mode masses by adaptive quadrature of SciPy's density, one sample at a time."""
 
     def density(angle):
         return vonmises.pdf(angle, concentration, loc=np.asarray(modes)).mean()

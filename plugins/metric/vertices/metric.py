@@ -165,9 +165,7 @@ def bins(distance: Float[Tensor, "batch vertex"]) -> Tensor:
 
 
 def quantile(histogram: Float[Tensor, "bins"], share: float) -> Float[Tensor, ""]:
-    """Return the middle of the bin in which the cumulated share is reached; 0 for the first bin, NaN of an empty
-    histogram.
-    """
+    """Return the middle of the bin that reaches the cumulated share; 0 for the first bin, NaN of an empty histogram."""
     total = histogram.sum()
     place = torch.searchsorted(histogram.cumsum(0), share * total).clamp(max=BINS - 1)
     middle = LOWEST * (HIGHEST / LOWEST) ** ((place.double() + 0.5) / BINS)

@@ -1,4 +1,4 @@
-"""Errors of correspondences against a loop over pairs and points."""
+"""Tests of errors of correspondences against a loop over pairs and points."""
 
 import math
 
@@ -17,7 +17,7 @@ from plugins.metric.vertices.rows import FIELDS, mesh
 
 
 def by_loop(truth, registered, subject):
-    """One pair, one point at a time."""
+    """Return the errors, one pair and one point at a time."""
     errors = {True: [], False: []}
     for one in range(len(truth)):
         for other in range(len(truth)):
@@ -46,7 +46,7 @@ def test_errors_are_those_of_a_loop_whatever_the_template(dtype):
 
 
 def body(number):
-    """A person's own shape in a pose of its own, 40 vertices, metres."""
+    """Return a person's own shape in a pose of its own, 40 vertices, metres."""
     shape = np.random.default_rng(0).normal(0, 0.3, (40, 3)) * (1 + number // 10 / 20)
     return torch.from_numpy(shape + 0.1 * np.sin(3 * shape[:, [1, 2, 0]] + number % 10) + [0, 1.0, 0])
 

@@ -30,7 +30,7 @@ def measured(*batches, vertices):
 
 
 def loop(point, target, scale):
-    """One vertex at a time, centimetres."""
+    """Return the distances one vertex at a time, centimetres."""
     return np.array(
         [
             [100 * s * math.dist(p[3 * v : 3 * v + 3], t[3 * v : 3 * v + 3]) for v in range(len(p) // 3)]

@@ -30,7 +30,7 @@ def measured(point, target, dtype=torch.float64):
 
 
 def scipy_distance(point, target):
-    """Angle of R₁⁻¹R₂ in radians, from unit quaternions, of rotations Rz(t) Rx(e - π/2) Rz(-a)."""
+    """Return the angle of R₁⁻¹R₂ in radians, from unit quaternions, of rotations Rz(t) Rx(e - π/2) Rz(-a)."""
 
     def rotations(angles):
         azimuth, elevation, tilt = np.asarray(angles, dtype=np.float64).T
