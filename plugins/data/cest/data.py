@@ -218,8 +218,7 @@ class CEST(Data, Mapped):
         return write_maps(file, self.wanted.target, point, deviation, folder, synthetic=self.synthetic)
 
     def augment(self, batch: Batch) -> Batch:
-        """Return a batch with random noise and a random B0 shift of the lines; what the fit left unexplained is not
-        shifted.
+        """Return a batch with random noise and a random B0 shift of the lines; the fit's residuals are not shifted.
 
         Strength of noise and shift are cubes of uniform numbers times the greatest value, so that most spectra stay
         nearly unchanged and some change strongly.

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from framework.spectra.offsets import OFFSETS
 from framework.spectra.spectrum import CENTRES, spectrum
 
-# amplitudes and widths (ppm) of water, amide, NOE, MT, amine
+# amplitude and width (ppm) of water, amide, NOE, MT and amine in turn
 TISSUES = np.array(
     [
         [0.76, 0.030, 0.15, 0.12, 0.08, 0.90, 0.8, 4.6, 55.0, 4.5],  # grey matter

@@ -58,9 +58,7 @@ def maps_of(
     point: Float[np.ndarray, "voxel number"],
     deviation: Float[np.ndarray, "voxel number"],
 ) -> dict[str, np.ndarray]:
-    """Return the maps by name, each (x, y, z), NaN where there is no voxel; amplitudes are shares of the unsaturated
-    signal.
-    """
+    """Return maps (x, y, z) by name, NaN where there is no voxel; amplitudes are shares of the unsaturated signal."""
     columns = {ASYMMETRY: asymmetry(volume)}
     for number, name in enumerate(names):
         columns[name], columns[f"{name}_deviation"] = point[:, number], deviation[:, number]

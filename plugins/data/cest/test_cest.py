@@ -1,4 +1,4 @@
-"""Z-spectra of volumes: files that are read and refused, splits without neighbours, maps."""
+"""Tests of volumes of Z-spectra: files that are read and refused, splits without neighbours, maps."""
 
 import gzip
 
@@ -138,7 +138,7 @@ def test_maps_of_a_nifti_file_lie_where_it_lies(tmp_path, brain):
 
 @pytest.mark.parametrize("kind", ["npz", "nii", "mask", "M0"])
 def test_an_imaginary_part_is_refused_and_not_lost(tmp_path, kind):
-    """Complex numbers without one are read."""
+    """Check also that complex numbers without an imaginary part are read."""
     nibabel = pytest.importorskip("nibabel")
     spectra = np.random.default_rng(0).uniform(0.3, 0.9, (3, 4, 1, 6))
     arrays = {

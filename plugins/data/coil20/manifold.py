@@ -11,8 +11,7 @@ FINE = 1440
 
 
 def spline_weights(views: int) -> Float[Tensor, "fine views"]:
-    """Return weights of equally spaced views; row i is the periodic cubic spline through them at (i + 1/2)/FINE of a
-    turn.
+    """Return weights of equally spaced views: row i is the periodic cubic spline at (i + 1/2)/FINE of a turn.
 
     (Murase & Nayar 1995, §2.2, there in an eigenspace. A spline is linear in its points, so the choice of space does
     not change it.)
@@ -23,9 +22,7 @@ def spline_weights(views: int) -> Float[Tensor, "fine views"]:
 
 
 def look_alikes(views: Float[Tensor, "object view 1 side side"]) -> Bool[Tensor, "object"]:
-    """Return which objects have views half a turn apart that are closer than neighbouring ones, by mean
-    root-mean-square.
-    """
+    """Return which objects have views half a turn apart that are closer than neighbouring ones (mean RMS)."""
     flat = views.flatten(2)
     half = (flat - flat.roll(flat.shape[1] // 2, 1)).square().mean(-1).sqrt().mean(-1)
     next_view = (flat - flat.roll(1, 1)).square().mean(-1).sqrt().mean(-1)

@@ -292,9 +292,7 @@ def _cast(
 @compiled
 @no_type_check
 def _paint_face(point, look, color):
-    """Change the skin's colour at facial features; `point` is in the head's frame, and features are seen from its
-    front.
-    """
+    """Change the skin's colour at facial features; `point` is in the head's frame, features are seen from the front."""
     x, y = abs(point[0]), point[1]
     if point[2] < 0.15:
         return

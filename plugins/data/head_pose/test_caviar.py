@@ -1,4 +1,4 @@
-"""The CAVIAR label file, a MATLAB file: what is read, what is refused, and what is written."""
+"""Tests of the CAVIAR label file, a MATLAB file: what is read, refused and written."""
 
 import math
 from pathlib import Path
@@ -26,7 +26,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_fields_are_read_by_their_order(root: Path) -> None:
-    """What the published file calls them is not known."""
+    """Check fields of other names, because those of the published file are not known."""
     names = ("or", "xc", "yc", "s", "im")
     save_caviar(
         root, struct_array([caviar_row(0)], names), struct_array([caviar_row(n) for n in (20, 21, 22)], names)

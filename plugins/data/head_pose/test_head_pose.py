@@ -1,4 +1,4 @@
-"""What IDIAP, TownCentre and CAVIAR have in common: folders read and refused, augmentation, and heads drawn instead."""
+"""Tests of what IDIAP, TownCentre and CAVIAR have in common: folders, augmentation, and drawn heads."""
 
 import json
 import math
@@ -34,7 +34,7 @@ SPLITS = Splits._fields
 
 
 class Published(NamedTuple):
-    """A data set as the tests know it."""
+    """Data set, with functions that write its published layout and the numbers that a test expects."""
 
     archive: Archive
     write: Callable[[Path], Path]
@@ -228,7 +228,7 @@ def test_generated_data_that_are_damaged_are_to_be_deleted(cache: Path, name: st
     [("idiap", 600, 0.4), ("towncentre", 1200, 0.4), ("caviar", 1200, 0.25)],
 )
 def test_pictures_agree_with_their_labels(name: str, images: int, correlation: float) -> None:
-    """A kernel regression of the first angle's sine on coarse grey pictures: on mirror images its sign is turned."""
+    """Check a kernel regression of the first angle's sine on coarse grey images; its sign changes on mirror images."""
     data = prepared(name, None, images=images, image_size=16)
 
     def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:

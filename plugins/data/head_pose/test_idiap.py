@@ -1,4 +1,4 @@
-"""The IDIAP label file, an HDF5 file: what is read, what is refused, and what is written."""
+"""Tests of the IDIAP label file, an HDF5 file: what is read, refused and written."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the loaders of whole, labelled images share (plugins.data.head_pose.labelled_images)."""
+"""Tests of the shared loader of whole, labelled images (plugins.data.head_pose.labelled_images)."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from plugins.data.head_pose.labelled_images import SPLITS, Labelled, Loaded, Rea
 
 
 def samples(place: Path, count: int = 12) -> dict[str, list[Labelled]]:
-    """Images whose red is their number times ten, at angles (number, -number) radians."""
+    """Write images whose red is their number times ten, and return them with the angles (number, -number) radians."""
     made = []
     for number in range(count):
         pixels = np.random.default_rng(number).integers(0, 256, (8, 8, 3), dtype=np.uint8)

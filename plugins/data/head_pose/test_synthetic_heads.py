@@ -1,4 +1,4 @@
-"""Drawn heads (plugins.data.head_pose.synthetic_heads): where the nose points, what a mirror does, what a ray meets."""
+"""Tests of drawn heads (plugins.data.head_pose.synthetic_heads): direction of the nose, mirror images, ray casting."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ PLAIN = Conditions(
 
 
 def seen(who: Person, pose: Pose, light: np.ndarray = FROM_CAMERA, strength: float = 0.4) -> np.ndarray:
-    """Somebody whose shoulders face the camera, unblurred, in the middle."""
+    """Return the image of a person whose shoulders face the camera, without blur, in the middle."""
     return rendered(who, pose, Pose(0.0), SIDE, 20.0, (SIDE / 2, SIDE / 2), light, strength)
 
 
@@ -39,7 +39,7 @@ def short_haired(seed: int) -> Person:
 
 
 def center_of_skin(who: Person, pose: Pose) -> tuple[float, float]:
-    """Column and row, from the middle, of what is brighter than hair and lies in the head's middle part."""
+    """Return column and row, from the middle, of the pixels in the head's middle part that are brighter than hair."""
     who = dataclasses.replace(who, skin=np.ones(3), hair=np.zeros(3), cloth=np.zeros(3))
     image = seen(who, pose, strength=0.0)[: SIDE // 2 + 12, :, 0]
     rows, columns = np.nonzero(image > 0.5)
@@ -93,7 +93,7 @@ def test_the_face_is_where_pan_and_tilt_say() -> None:
 
 @pytest.mark.parametrize("pose", [Pose(0), Pose(35, 10, 12), Pose(-120, -20, 5), Pose(170, 0, -8)])
 def test_mirrored_picture_is_the_picture_at_the_mirrored_angles(pose: Pose) -> None:
-    """The rule that augmentation uses."""
+    """Check the rule that augmentation uses."""
     light = np.array([0.4, 0.6, 0.5])
     mirrored = Pose(-pose.pan, pose.tilt, -pose.roll)
     for seed in range(6):
@@ -105,7 +105,7 @@ def test_mirrored_picture_is_the_picture_at_the_mirrored_angles(pose: Pose) -> N
 
 
 def test_the_back_of_a_head_tells_less_than_its_face() -> None:
-    """So that posteriors are wide there: 60° of turn change the picture less."""
+    """Check that a turn of 60° changes the image less there, so that posteriors are wide."""
     for seed in range(6):
         who = short_haired(seed)
         front = abs(seen(who, Pose(-30)) - seen(who, Pose(30)))[..., :3].mean()
@@ -117,7 +117,7 @@ def test_the_back_of_a_head_tells_less_than_its_face() -> None:
 
 
 def test_silhouette_is_the_union_of_the_projected_ellipsoids() -> None:
-    """An ellipsoid c + M u, |u| = 1, is seen as the ellipse (x - c)ᵀ (M Mᵀ)⁻¹ (x - c) = 1 in two dimensions."""
+    """Check that an ellipsoid c + M u, |u| = 1, is seen as the ellipse (x - c)ᵀ (M Mᵀ)⁻¹ (x - c) = 1 in 2D."""
     pose, body = Pose(25, -15, 10), Pose(-40)
     who, scale, middle = bald(1), 17.0, (31.3, 26.9)
     image = rendered(who, pose, body, SIDE, scale, middle, FROM_CAMERA, 0.3)
@@ -137,7 +137,7 @@ def test_silhouette_is_the_union_of_the_projected_ellipsoids() -> None:
 
 
 def test_ball_is_lit_as_lambert_says() -> None:
-    """A bald head that is a ball, painted one colour: its normals are its points."""
+    """Check a bald head that is a ball of one colour, whose normals are its points."""
     who = dataclasses.replace(bald(2), axes=np.ones(3), skin=np.full(3, 0.5), beard=0.0, glasses=0.0)
     light = np.array([1.0, 2.0, 2.0]) / 3
     image = rendered(who, Pose(180), Pose(0), SIDE, 20.0, (SIDE / 2, SIDE / 2), light, 0.4)
@@ -178,7 +178,7 @@ def test_picture_depends_on_the_random_stream_alone() -> None:
 
 
 def test_conditions_make_pictures_worse() -> None:
-    """Compared with the same random numbers spent on a clear picture: fewer pixels hold less detail."""
+    """Check that fewer pixels hold less detail than a clear image from the same random numbers."""
 
     def detail(conditions: Conditions) -> float:
         changes = []

@@ -1,4 +1,4 @@
-"""The folders of TownCentre heads: what is read, how people are split, what is refused, and what is drawn."""
+"""Tests of the folders of TownCentre heads: reading, splits by people, refusals, and drawn heads."""
 
 import math
 from pathlib import Path
@@ -136,7 +136,7 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
 
 
 def test_pan_that_is_not_finite_is_refused(root: Path) -> None:
-    """As any other label that cannot be used: it is left out where the user asks for that."""
+    """Check that the label is left out, like any unusable label, if the user asks for that."""
     (root / "person3" / "image_3_0.txt").write_text("pan = nan\nvalid = 1\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"image_3_0\.txt: .*wanted two lines, `pan = ` with finite degrees"):
         prepared("towncentre", root)

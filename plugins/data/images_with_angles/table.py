@@ -88,9 +88,7 @@ def read_table(
 
 
 def split_of(name: str) -> Split:
-    """Return train (70 %), validation or test (15 % each) by a hash of the name, so that new images never move old
-    ones.
-    """
+    """Return train (70 %), validation or test (15 % each) by a hash of the name: new images never move old ones."""
     share = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
     for split in SPLITS:
         share -= SHARES[split]

@@ -1,4 +1,4 @@
-"""A user's folder and table: what is read, and what is refused."""
+"""Tests of a user's folder and table: what is read and refused."""
 
 import math
 from collections import Counter
@@ -21,7 +21,7 @@ from plugins.data.images_with_angles.table import SPLITS, split_of
 
 
 def folder(place: Path, table: str | None = None, images: int = 40) -> Path:
-    """Images whose red is their number, and a table of their pan (10° × number) and tilt (-number)."""
+    """Write images whose red is their number, and a table of their pan (10° × number) and tilt (-number)."""
     lines = ["file,pan,tilt,note"]
     for number in range(images):
         name = f"{number:03d}.png"
@@ -141,7 +141,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
 
 
 def test_table_written_by_a_spreadsheet(tmp_path: Path) -> None:
-    """A byte-order mark, carriage returns, quotes and blank lines are no faults."""
+    """Check that a byte-order mark, carriage returns, quotes and blank lines are accepted."""
     text = "file,pan\r\n" + "".join(f'"{n:03d}.png", {10 * n}.5\r\n,\r\n' for n in range(40))
     folder(tmp_path)
     (tmp_path / "angles.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())

@@ -28,9 +28,7 @@ def spared(
 def folds(
     labels: Int[np.ndarray, "samples"], count: int, random: np.random.Generator
 ) -> Int[np.ndarray, "samples"]:
-    """Return the fold of each sample; every class is dealt out in turn, so that folds differ by at most one sample of
-    each.
-    """
+    """Return the fold of each sample; classes are dealt out in turn, so folds differ by at most one sample of each."""
     order = np.concatenate(
         [random.permutation(np.flatnonzero(labels == label)) for label in np.unique(labels)]
     )

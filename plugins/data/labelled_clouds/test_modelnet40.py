@@ -1,4 +1,4 @@
-"""The reader of the official layout, the generated set, and the data contract."""
+"""Tests of the reader of the official layout, the generated set, and the data contract."""
 
 import math
 
@@ -16,7 +16,7 @@ SIZES = {"train_models": 4, "test_models": 2}
 
 
 def cube(folder, *names, size=1.0, content=None):
-    """Cubes as `<folder>/<name>`, the official way to break a header included."""
+    """Write cubes as `<folder>/<name>`, including the official files' broken header."""
     text = as_off(solids.box(size, size, size)).replace("OFF\n", "OFF", 1)
     for name in names:
         file = folder / name
@@ -86,7 +86,7 @@ def test_normals_are_those_of_the_faces(prepared, tmp_path):
 
 
 def test_all_of_the_training_split_may_train(prepared, tmp_path):
-    """As the thesis has it: nothing is held back, and validation sees training clouds, unturned."""
+    """Check that nothing is held out, as in the thesis, and that validation uses unrotated training clouds."""
     config = {"root": official(tmp_path / "ModelNet40"), "points": 40}
     whole, held = prepared(**config, validation_share=0, rotations=2), prepared(**config)
     train, validation, test = whole.splits()

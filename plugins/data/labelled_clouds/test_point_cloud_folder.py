@@ -16,7 +16,7 @@ PLY = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n"
 
 
 def cloud_file(file, points=30, red=None):
-    """A cloud as text, whose size is its own; coloured where `red` says so."""
+    """Write a cloud of its own size as text, coloured if `red` says so."""
     file.parent.mkdir(parents=True, exist_ok=True)
     table = np.random.default_rng(points).normal(size=(points, 3))
     names = "x y z"
@@ -27,7 +27,7 @@ def cloud_file(file, points=30, red=None):
 
 
 def in_every_format(folder, name, height):
-    """A triangle at this height as a mesh where the format has meshes, else its corners."""
+    """Write a triangle at this height as a mesh if the format has meshes, else as its corners."""
     corners = np.array([[0, 0, height], [2, 0, height], [0, 2, height]])
     text = "\n".join(" ".join(map(str, corner)) for corner in corners)
     facet = "".join(f"vertex {line}\n" for line in text.split("\n"))

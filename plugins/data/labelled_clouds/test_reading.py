@@ -1,4 +1,4 @@
-"""Clouds from files: sampling, the cache, padding; shares of classes; configs."""
+"""Tests of clouds from files: sampling, the cache, padding, shares of classes, and configurations."""
 
 import math
 

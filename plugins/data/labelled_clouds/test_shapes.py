@@ -1,4 +1,4 @@
-"""The generated set, and the solids it is made of."""
+"""Tests of the generated set, and of the solids that it is made of."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from plugins.data.labelled_clouds.shapes.generator import CLASSES, Models, as_of
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A generated root of 3 + 2 models a class; its cache too is the module's own."""
+    """Return a generated root of 3 + 2 models of each class, in a cache of the module's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FRAMEWORK_CACHE", str(tmp_path_factory.mktemp("cache")))
         return generated(Models(train_models=3, test_models=2))
@@ -36,7 +36,7 @@ def test_a_root_is_a_function_of_its_seed_to_the_byte(root):
 
 
 def test_the_bytes_are_those_of_this_version():
-    """Whoever changes a family or the writer also raises `generator.VERSION`, or old caches go on being read."""
+    """Check the bytes: a change of a family or the writer must raise `generator.VERSION`, or old caches are read."""
     digest = hashlib.sha256()
     for category in CLASSES:
         digest.update(as_off(model(category, "train", 0, 0)).encode())
@@ -59,7 +59,7 @@ EDGE_M = {  # the longest edge of the upright box around a model, metres: what s
 
 
 def test_the_classes_are_those_of_modelnet40_and_equally_many(root):
-    """Princeton's 40, in their order; nothing else is in the root, and every class has as many models."""
+    """Check that the root holds exactly Princeton's 40 classes, in their order, with equally many models each."""
     assert list(CLASSES) == sorted(CLASSES) == list(EDGE_M)
     assert sorted(path.name for path in root.iterdir() if path.is_dir()) == list(CLASSES)
     for split, count in (("train", 3), ("test", 2)):
@@ -97,7 +97,9 @@ def test_no_triangle_is_needless(category):
 
 
 def assert_edges_meet(vertices, faces):
-    """Every edge is run along as often one way as the other: no hole, no face turned inside out."""
+    """Assert that every edge is passed equally often in both directions: there is no hole and no face turned inside
+    out.
+    """
     names = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces]
     start, end = names.reshape(-1), np.roll(names, -1, axis=1).reshape(-1)
     many = len(vertices)

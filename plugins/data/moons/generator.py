@@ -39,9 +39,7 @@ def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"
     angles, normals = (np.random.default_rng([*key, part]) for part in range(2))
     angle = math.pi * angles.random(size)
     label = np.arange(size) % 2
-    sign = np.where(label == 0, 1.0, -1.0)[
-        :, None
-    ]  # class 1 is class 0 seen from the other side of the centre
+    sign = np.where(label == 0, 1.0, -1.0)[:, None]  # class 1 is class 0 mirrored in the centre
     arc = sign * (np.stack([np.cos(angle), np.sin(angle)], -1) - CENTRE)
     return (arc + noise * normals.standard_normal((size, 2))) / scale(noise), label
 
@@ -94,9 +92,7 @@ def _seen_from_arcs(
 
 
 def _log_piece(low: np.ndarray, high: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return log ∫ exp(-rate sin²(t/2)) dt from `low` to `high`, 0 ≤ low ≤ high ≤ π, where the integrand is not
-    negligible.
-    """
+    """Return log ∫ exp(-rate sin²(t/2)) dt from `low` to `high`, 0 ≤ low ≤ high ≤ π, without its negligible part."""
     start = np.sin(low / 2) ** 2
     width = np.minimum(high - low, _reach(low, rate))
     nodes, weights = np.polynomial.legendre.leggauss(NODES)

@@ -1,4 +1,4 @@
-"""The moons, their exact posterior against independent quadrature, and the outliers."""
+"""Tests of the moons, of their exact posterior against independent quadrature, and of the outliers."""
 
 import math
 from itertools import pairwise
@@ -28,13 +28,15 @@ def prepared(name: str = "moons", **config: Any) -> Any:
 
 
 def plane(step: float, reach: float = 6.0) -> np.ndarray:
-    """Grid points of [-reach, reach]²: sums over them are trapezium rules, spectrally exact for smooth densities."""
+    """Return grid points of [-reach, reach]²: sums over them are trapezium rules, spectrally exact for smooth
+    densities.
+    """
     line = np.arange(-reach, reach + step / 2, step)
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
 
 
 def by_scipy(point: np.ndarray, noise: float) -> np.ndarray:
-    """Either class's density: the normal density about the arc's points, integrated over their angle."""
+    """Return either class's density: the normal density about the arc's points, integrated over their angle."""
     x, y = point * scale(noise) + CENTRE
     arcs = (lambda t: (math.cos(t), math.sin(t)), lambda t: (1 - math.cos(t), 0.5 - math.sin(t)))
     found = []
@@ -51,7 +53,7 @@ def by_scipy(point: np.ndarray, noise: float) -> np.ndarray:
 
 
 def by_mpmath(point: np.ndarray, noise: float) -> list[mpmath.mpf]:
-    """Logs of the same with as many digits as points far away ask for."""
+    """Return the logarithms of the densities with as many digits as distant points need."""
     with mpmath.workdps(60):
         spread = mpmath.mpf(noise)
         sides = (mpmath.sqrt(0.75 + spread**2), mpmath.sqrt(0.5625 - 1 / mpmath.pi + spread**2))
@@ -134,7 +136,7 @@ def test_the_classes_mirror_each_other() -> None:
 
 
 def scores(noise: float, step: float = 0.05) -> tuple[float, float, float]:
-    """Accuracy, negative log-likelihood (nats) and Brier score (thesis eq. 2.26) of the exact posterior."""
+    """Return accuracy, negative log-likelihood (nats) and Brier score (thesis eq. 2.26) of the exact posterior."""
     points = plane(step)
     logs = log_posterior(points, noise)
     both = np.exp(logs)
@@ -155,7 +157,7 @@ def test_the_best_possible_scores_are_those_of_the_readme() -> None:
 
 
 def test_draws_follow_the_density() -> None:
-    """The exact posterior scores on draws what quadrature says it does; so do draws of another's generator."""
+    """Check the exact posterior's scores on draws, and on those of another generator, against quadrature."""
     size = 40_000
     _, expected, _ = scores(DEFAULT)
     points, label = draw(size, DEFAULT, 5, 0)

@@ -67,9 +67,7 @@ class Framing:
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """Variation of training images: half of them are mirrored, all are shifted, scaled and made brighter by up to
-    `jitter`.
-    """
+    """Variation of training images: half are mirrored, all are shifted, scaled and made brighter by up to `jitter`."""
 
     mirror: bool = True
     jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08

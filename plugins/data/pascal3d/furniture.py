@@ -91,8 +91,7 @@ def chair(random: Generator) -> Body:
 
 
 def diningtable(random: Generator) -> Body:
-    """Return a rectangular table with twofold symmetry: one half is built, and its copy rotated by half a turn is the
-    other.
+    """Return a rectangular table with twofold symmetry: half of it is built, and copied with half a turn.
 
     A long side faces the front. Plates and chairs, where there are any, come in pairs that are rotated likewise.
     """

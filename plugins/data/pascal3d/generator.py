@@ -119,7 +119,7 @@ def _objects(shot: Shot) -> np.ndarray:
             "truncated": float(thing.truncated),
             "occluded": float(thing.occluded),
             "difficult": float(thing.difficult),
-            "bbox": np.array([thing.box], dtype=np.float64) + 1,  # counted from 1
+            "bbox": np.array([thing.box], dtype=np.float64) + 1,  # the official boxes count from 1
             "cad_index": 1.0,
             "viewpoint": _viewpoint(thing),
             "symmetry": float(thing.symmetry),

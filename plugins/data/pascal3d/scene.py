@@ -26,9 +26,7 @@ Draw = Callable[[Scene, Collection[str]], Mapping[str, Tensor]]
 
 
 class View(NamedTuple):
-    """Viewpoint in degrees; `distance` in object diagonals; `focal` and `principal` in pixels
-    (framework.geometry.camera).
-    """
+    """Viewpoint: degrees; `distance` in object diagonals; `focal`, `principal` in pixels (as framework.geometry)."""
 
     azimuth: float
     elevation: float
@@ -71,7 +69,7 @@ def camera_of(view: View) -> Camera:
 
 def window(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale: int) -> Camera:
     """Return the camera for `size` (height, width) pixels from `corner` (x, y) on, each divided `scale` times."""
-    middle = (scale - 1) / 2  # where a pixel's centre lies among its parts
+    middle = (scale - 1) / 2  # position of a pixel's centre among its parts
     (fx, fy), (cx, cy) = camera.focal, camera.principal
     return dataclasses.replace(
         camera,
@@ -153,7 +151,9 @@ def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
         pieces.insert(int(random.random() < 0.25), _place(other, random, renderer, size, aside=True))
 
     view = main.view
-    drop = -view.focal * math.tan(math.radians(view.elevation))  # to the horizon of a camera that looks down
+    drop = -view.focal * math.tan(
+        math.radians(view.elevation)
+    )  # distance to the horizon of a camera that looks down
     tilt = math.radians(view.tilt)
     horizon = (view.principal[0] + drop * math.sin(tilt), view.principal[1] + drop * math.cos(tilt))
     pixels = background(random, height, width, horizon, tilt)

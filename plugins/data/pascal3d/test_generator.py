@@ -1,4 +1,4 @@
-"""The object families, the convention of angles, and the generator."""
+"""Tests of the object families, the convention of angles, and the generator."""
 
 import json
 import math
@@ -34,7 +34,7 @@ def renderer() -> Renderer:
 
 
 def closed(solid: shapes.Solid) -> trimesh.Trimesh:
-    """The solid as an outward mesh with its shading seams welded."""
+    """Return the solid as an outward mesh with its shading seams welded."""
     body = shapes.Body()
     body.add(solid, (1.0, 1.0, 1.0))
     faces = body.mesh().faces  # outward
@@ -110,7 +110,7 @@ def test_family_is_a_unit_object_with_outward_normals(category: str) -> None:
 
 
 def seen(renderer: Renderer, mesh: Mesh, azimuth: float, elevation: float, tilt: float) -> np.ndarray:
-    """The object's unlit colours, 96 × 96."""
+    """Return the object's unlit colours, 96 × 96."""
     view = View(azimuth, elevation, tilt, 3.0, 230.0, (47.5, 47.5))
     camera = camera_of(view)
     layer = draw(renderer, mesh, mesh.colors, camera, outline(mesh, camera), (96, 96))
@@ -131,7 +131,7 @@ def test_symmetry_is_what_the_family_says(category: str, renderer: Renderer) -> 
 
 @pytest.mark.parametrize("category", [name for name in CLASSES if name != "aeroplane"])
 def test_mirrored_picture_is_the_picture_at_the_mirrored_angles(category: str, renderer: Renderer) -> None:
-    """The rule that `augment` uses; an aeroplane's propeller is the one part that is not mirror-symmetric."""
+    """Check the rule that `augment` uses; only an aeroplane's propeller is not mirror-symmetric."""
     mesh = FAMILIES[category].build(np.random.default_rng(3)).mesh()
     picture = seen(renderer, mesh, 35.0, 20.0, 12.0)[:, ::-1]
     assert abs(picture - seen(renderer, mesh, -35.0, 20.0, -12.0)).mean() < 0.002
@@ -143,7 +143,7 @@ def test_mirrored_picture_is_the_picture_at_the_mirrored_angles(category: str, r
 
 
 def projected_as_in_the_toolbox(points: np.ndarray, viewpoint: dict[str, float]) -> np.ndarray:
-    """Pixels counted from 1, by the steps of `project_3d.m` of the PASCAL3D+ toolbox (release 1.1)."""
+    """Return pixels counted from 1, by the steps of `project_3d.m` of the PASCAL3D+ toolbox (release 1.1)."""
     a, e, t = (math.radians(viewpoint[name]) for name in ("azimuth", "elevation", "theta"))
     d, f = viewpoint["distance"], viewpoint["focal"] * viewpoint["viewport"]
     center = np.array([d * math.cos(e) * math.sin(a), -d * math.cos(e) * math.cos(a), d * math.sin(e)])
@@ -157,7 +157,7 @@ def projected_as_in_the_toolbox(points: np.ndarray, viewpoint: dict[str, float])
 
 
 def first_mesh(category: str, seed: int) -> Mesh:
-    """The first object that `shoot` hands to the renderer."""
+    """Return the first object that `shoot` passes to the renderer."""
 
     class Kept(Exception):
         pass
@@ -175,7 +175,7 @@ def first_mesh(category: str, seed: int) -> Mesh:
 
 @pytest.mark.parametrize("category", ["car", "aeroplane", "bottle"])
 def test_annotated_viewpoint_projects_the_object_onto_its_box(category: str, renderer: Renderer) -> None:
-    """The official fields, read by the official formula, say where the object is in the picture."""
+    """Check that the official formula on the official fields gives the place of the object in the image."""
     for seed in range(6):
         shot = shoot(category, np.random.default_rng(seed), renderer)
         mesh = first_mesh(category, seed)
@@ -202,7 +202,9 @@ def test_annotated_viewpoint_projects_the_object_onto_its_box(category: str, ren
     ],
 )
 def test_azimuth_names_the_side_that_is_seen(azimuth: float, nearest: str, to_the_left: str) -> None:
-    """Front -y, up z, so the object's own left is x; at 90° it is seen from its left and faces left."""
+    """Check the axes: the front is -y, up is z, so the object's left is x; at 90° it is seen from its left and faces
+    left.
+    """
     points = {"front": (0, -1, 0), "rear": (0, 1, 0), "left side": (1, 0, 0), "right side": (-1, 0, 0)}
     camera = camera_of(View(azimuth, 0.0, 0.0, 3.0, 100.0, (0.0, 0.0)))
     seen_at = {name: camera.rotation.double() @ torch.tensor(p).double() for name, p in points.items()}
@@ -219,7 +221,7 @@ def test_elevation_lifts_the_camera_and_tilt_turns_the_picture_counter_clockwise
 
 
 def test_a_window_shows_the_same_picture() -> None:
-    """Whole pixels drawn fine and averaged lie where the camera sees them."""
+    """Check that whole pixels, drawn fine and averaged, lie where the camera sees them."""
     camera = camera_of(View(10.0, 20.0, 5.0, 3.0, 80.0, (31.5, 20.25)))
     part = window(camera, (7, 11), (30, 40), 2)
     assert (part.height, part.width) == (60, 80)
@@ -374,7 +376,7 @@ def test_pictures_hold_what_the_protocol_leaves_out(renderer: Renderer) -> None:
 def test_annotations_written_at_once_are_those_written_one_after_the_other(
     tmp_path: Path,
 ) -> None:
-    """Threads change places every microsecond; SciPy's writers share a tag."""
+    """Check with threads that switch every microsecond, because SciPy's writers share a tag."""
     pixels = np.zeros((8, 9, 3), np.uint8)
     view = View(10.0, 20.0, 0.0, 3.0, 100.0, (4.0, 4.0))
     things = [

@@ -1,4 +1,4 @@
-"""The reader of the official layout, its protocol, its complaints, and the data contract."""
+"""Tests of the reader of the official layout, its protocol, its messages, and the data contract."""
 
 import math
 import shutil
@@ -32,13 +32,13 @@ def renderer() -> Renderer:
 
 @pytest.fixture(scope="session")
 def drawn(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Path:
-    """A generated root of 80 cars, which tests read and do not change."""
+    """Return a generated root of 80 cars, which tests read and do not change."""
     return generated(tmp_path_factory.mktemp("roots"), "car", 80, 0, renderer)
 
 
 @pytest.fixture
 def root(drawn: Path, tmp_path: Path) -> Path:
-    """The same root, for a test to spoil."""
+    """Return a copy of that root, which a test may damage."""
     return Path(shutil.copytree(drawn, tmp_path / "root"))
 
 
@@ -63,7 +63,7 @@ EMPTY = np.zeros((0, 0))
 
 
 def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
-    """A MATLAB struct array; fields that an entry lacks are empty, as MATLAB fills them."""
+    """Return a MATLAB struct array; fields that an entry lacks are empty, as MATLAB fills them."""
     names = list(dict.fromkeys(name for entry in entries for name in entry))
     array = np.empty((1, len(entries)), dtype=[(name, object) for name in names])
     for index, entry in enumerate(entries):
@@ -74,7 +74,7 @@ def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
 def annotated(
     folder: Path, *objects: dict[str, Any], filename: str = "one.jpg", **record: Any
 ) -> list[layout.Annotation]:
-    """What the reader makes of one annotation file with these objects."""
+    """Return what the reader reads from one annotation file with these objects."""
     place = folder / "Annotations" / "car_pascal"
     place.mkdir(parents=True, exist_ok=True)
     content = {"filename": filename, "objects": struct_array(list(objects)), **record}
@@ -213,7 +213,7 @@ def test_annotation_that_is_cut_short_or_is_another_matrix(tmp_path: Path) -> No
 @pytest.mark.filterwarnings("ignore")  # SciPy warns of some damage beside
 @pytest.mark.parametrize("compressed", [False, True])
 def test_damaged_annotations_are_read_or_named(tmp_path: Path, compressed: bool) -> None:
-    """SciPy alone crashes the process on about one in twenty of the uncompressed ones."""
+    """Check damaged files, of which SciPy alone crashes the process on about one in twenty of the uncompressed ones."""
     annotated(tmp_path, CAR, {**CAR, "truncated": 1})
     file = tmp_path / "Annotations" / "car_pascal" / "one.mat"
     record = scipy.io.loadmat(file)["record"]
@@ -258,7 +258,7 @@ def test_lists(tmp_path: Path) -> None:
 
 
 def test_generated_root_reads_back_what_was_drawn(drawn: Path, renderer: Renderer) -> None:
-    """Every picture is drawn again, and the protocol applied by hand."""
+    """Check against images that are drawn again, with the protocol applied by hand."""
     data = prepared(drawn)
     assert data.synthetic
     expected: dict[str, list[tuple[float, ...]]] = {"learned": [], "test": []}
@@ -307,7 +307,7 @@ def test_fields_of_a_batch(drawn: Path) -> None:
 
 
 def test_crop_holds_the_object_and_its_margin(drawn: Path) -> None:
-    """The crop's middle is the box's middle: compared with the picture itself, cut by hand."""
+    """Check that the crop's middle is the box's middle, against the image itself, cut by hand."""
     data = prepared(drawn, margin=0.25, image_size=64)
     first = layout.read_list(drawn / VOC_LISTS / "car_val.txt")
     annotation = next(
@@ -361,7 +361,7 @@ def test_occluded_objects_may_be_learned_from_but_are_never_tested(drawn: Path) 
 
 
 def test_real_data_have_no_symmetry_and_no_blur(root: Path) -> None:
-    """A root without the mark is taken for real, whatever its annotations hold."""
+    """Check that a root without the mark counts as real, whatever its annotations hold."""
     (root / "synthetic.json").unlink()
     data = prepared(root)
     assert "blur" not in table(data, "train")
@@ -407,7 +407,7 @@ def test_box_beyond_the_image_is_clipped(root: Path) -> None:
 def change_objects(
     root: Path, list_name: str, change: Callable[[dict[str, Any]], None], only: int = 1
 ) -> list[str]:
-    """Rewrite the first `only` annotations of a VOC list whose first object is kept; their names."""
+    """Rewrite the first `only` annotations of a VOC list whose first object is kept, and return their names."""
     changed = []
     for name in layout.read_list(root / VOC_LISTS / f"{list_name}.txt"):
         file = root / "Annotations" / "car_pascal" / f"{name}.mat"
@@ -599,7 +599,7 @@ def test_fingerprint_changes_with_a_label(root: Path) -> None:
 
 
 def test_crop_of_an_annotation_shows_no_other_pixels_than_the_image_has(drawn: Path) -> None:
-    """A box that spans the image, squared: the border is repeated, nothing black is added."""
+    """Check a box that spans the image, made square: the border is repeated, and nothing black is added."""
     file = next((drawn / "Images" / "car_pascal").glob("*.jpg"))
     with Image.open(file) as image:
         width, height = image.size

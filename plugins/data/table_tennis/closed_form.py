@@ -20,8 +20,7 @@ Motion = Callable[[Any], tuple[Any, Any]]
 def landing(
     height: float, climb: float, times: list[float], constants: Constants, spring: Spring
 ) -> list[float]:
-    """Return heights above the touching ball's, m, at rising times, s, of a ball that is released above the table at 0
-    s.
+    """Return heights above the touching ball's, m, at rising times, s, of a ball released above the table at time 0.
 
     Args:
         height: height above the touching ball's at time 0, m.

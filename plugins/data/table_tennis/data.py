@@ -158,7 +158,7 @@ class TableTennis(Data):
                 flights += self._flights_of(file)
                 others = (
                     other_columns(file, self.writing) if others is None else others
-                )  # of the first file alone
+                )  # columns of the first file alone
             except DataError:
                 if self.unreadable == "error":
                     raise

@@ -155,8 +155,7 @@ class _Walk:
         )
 
     def _solver(self, state: NDArray[np.float64], end: float, phase: str) -> OdeSolver:
-        """Return a solver whose error scale fits the motion of this phase, and whose first step cannot pass over all of
-        it.
+        """Return a solver whose error scale fits this phase, and whose first step cannot pass over all of the phase.
 
         The height of a ball pressed into a hard table is measured in g/Ω², that of a small hop in the hop's height.
         Measured in metres it would be lost in the tolerance, and the ball might come out below the table.

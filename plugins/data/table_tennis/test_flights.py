@@ -1,4 +1,4 @@
-"""Flights from files and from the simulator to windows, and what is refused."""
+"""Tests of flights from files and from the simulator, their windows, and what is refused."""
 
 import os
 from pathlib import Path
@@ -61,7 +61,7 @@ def test_another_frame_rate_is_told_with_the_remedy(tmp_path: Path) -> None:
 def test_times_in_another_unit_are_read_as_that_is_said(
     tmp_path: Path, unit: str, seconds: float, said: str
 ) -> None:
-    """And where another unit is said, the message names the right one, which the schema then takes."""
+    """Check also that a wrong unit gives a message that names the right one, which the schema then takes."""
     tables = [table(number) for number in range(4)]
     for number, rows in enumerate(tables):
         write_csv(tmp_path / f"{number}.csv", np.column_stack([rows[:, 0] / seconds, rows[:, 1:]]))

@@ -1,4 +1,4 @@
-"""Solvers of a single flight against each other, and against 50 digits on stiff contact."""
+"""Tests of solvers of a single flight against each other, and against 50 digits on stiff contact."""
 
 import math
 
@@ -41,7 +41,7 @@ def test_explicit_solvers_crawl_and_then_say_so() -> None:
 
 @pytest.mark.parametrize("method", list(METHODS))
 def test_a_hard_springs_bounce_is_the_one_in_no_time(method: str) -> None:
-    """With ζ the spring gives back exp(-ζ/√(1 - ζ²) (π - atan2(2 ζ √(1 - ζ²), 1 - 2 ζ²))) of the speed."""
+    """Check that with ζ the spring returns exp(-ζ/√(1 - ζ²) (π - atan2(2 ζ √(1 - ζ²), 1 - 2 ζ²))) of the speed."""
     zeta = 0.04
     turn = math.sqrt(1 - zeta**2)
     given_back = math.exp(-zeta / turn * (math.pi - math.atan2(2 * zeta * turn, 1 - 2 * zeta**2)))

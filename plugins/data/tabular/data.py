@@ -127,9 +127,7 @@ class Tabular(Data):
         return read(files, self._reading, self.writing)
 
     def inputs(self, given: Any) -> Tensor:
-        """Return standardised inputs (row, column) from a CSV file, a DataFrame, a mapping by column, or an array of
-        rows.
-        """
+        """Return standardised inputs (row, column) from a CSV file, a DataFrame, a mapping by column, or an array."""
         if isinstance(given, str | Path) or (isinstance(given, list) and isinstance(given[0], str | Path)):
             return Data.inputs(self, given)
         return of_rows(given, self._reading)

@@ -12,9 +12,7 @@ UP, DOWN, MIDDLE = (31, 119, 180), (214, 39, 40), (150, 150, 150)
 
 
 def bars(values: Float[np.ndarray, "column"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image with one bar for each column, blue above the mean of the training rows and red below it, on
-    white.
-    """
+    """Return an image with one bar per column, blue above the mean of the training rows and red below it, on white."""
     pitch = max(2, WIDTH // len(values))
     canvas = np.full((HEIGHT, pitch * len(values), 3), 255, np.uint8)
     middle = HEIGHT // 2

@@ -178,8 +178,7 @@ def read(files: Sequence[Path], reading: Reading, writing: Writing | None = None
 
 
 def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
-    """Return standardised inputs from rows in memory: a DataFrame, a mapping by column, or an array in the columns'
-    order.
+    """Return standardised inputs from rows in memory: a DataFrame, a mapping by column, or an array in column order.
 
     Raises:
         DataError: a column is missing, a cell is not a finite number, or an array has another number of columns.

@@ -1,4 +1,4 @@
-"""A user's table: what is read, what is refused, and a whole run on it."""
+"""Tests of a user's table: what is read and refused, and a whole run on it."""
 
 import csv
 import json
@@ -29,7 +29,7 @@ ROWS = 40
 
 
 def table(folder: Path, text: str | None = None, rows: int = ROWS) -> Path:
-    """Rows with a number, its square, a word, a constant, and three columns worth predicting."""
+    """Return rows with a number, its square, a word, a constant, and three columns that can be predicted."""
     lines = ["number,square,word,same,class,real,angle"]
     for row in range(rows):
         label = ("cat", "dog", "emu")[row % 3]

@@ -129,9 +129,7 @@ def mantel(random: Random) -> Solid:
 
 
 def stairs(random: Random) -> Solid:
-    """Return a flight of stairs, solid or with treads on strings, straight, with a landing, or winding; optionally with
-    rails.
-    """
+    """Return stairs, solid or with treads on strings, straight, with a landing, or winding; optionally with rails."""
     count, rise = int(random.integers(4, 15)), random.uniform(0.14, 0.2)
     run, width = random.uniform(0.22, 0.34), random.uniform(0.6, 1.5)
     kind, open_ = random.random(), random.random() < 0.4

@@ -65,8 +65,7 @@ CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
 """Classes of ModelNet40, in its order, and the functions that make their objects."""
 SPLITS = ("train", "test")
 JITTER_DEG, QUARTERS = 12.0, 0.25
-"""Largest rotation of each object about the up axis, degrees, and share of objects that are rotated by quarter turns
-too.
+"""Largest rotation of objects about the up axis, degrees, and share that is rotated by quarter turns too.
 
 The official models are not aligned either.
 """

@@ -68,18 +68,14 @@ def tapered(
 
 
 def slab(outline: Sequence[Point], thickness: Number) -> Solid:
-    """Return a flat plate in the plane z = 0, centred in its thickness; its outline (x, y) is convex,
-    counter-clockwise.
-    """
+    """Return a flat plate centred in the plane z = 0; its outline (x, y) is convex and counter-clockwise."""
     flat = np.array([(x, y, 0.0) for x, y in outline])
     half = np.array([0, 0, thickness / 2])
     return Solid(*_rings([flat - half, flat + half], len(flat)))
 
 
 def revolved(profile: Sequence[Point], sides: int = 24) -> Solid:
-    """Return the surface of a profile (radius, height), from bottom to top, rotated about the z axis; its ends are
-    closed.
-    """
+    """Return the surface of a profile (radius, height), from bottom to top, rotated about the z axis, ends closed."""
     angle = 2 * math.pi * np.arange(sides) / sides
     rings = [
         np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(sides, float(z))]) for r, z in profile
@@ -141,9 +137,7 @@ def extruded(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
 
 
 def carried(outline: Sequence[Point], width: Number) -> Solid:
-    """Return a side view (y, z) extruded along x, centred; it is counter-clockwise and star-shaped about its corners'
-    mean.
-    """
+    """Return a side view (y, z) extruded along x; it is counter-clockwise and star-shaped about its corners' mean."""
     flat = np.asarray(outline, float)
     middle = flat.mean(0)
     solid = extruded(flat - middle, width)
