@@ -24,8 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class RandomSearch(Sweeper):
-    """Sweeper that draws trials at random, runs all under the launcher, ranks them, and writes the best as an
-    experiment.
+    """Sweeper that draws trials at random, runs and ranks them all, and writes the best as an experiment.
 
     A draw is a function of (seed, number of the trial, key) alone: more trials, or another parameter, do not change the
     existing draws. [Bergstra & Bengio, JMLR 13, 2012]
