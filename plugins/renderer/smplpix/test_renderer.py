@@ -27,12 +27,12 @@ def renderer(run, **config):
 
 
 def own_paths(encoders):
-    """What the user of a run says of its paths: none is used for being in its checkpoint."""
+    """Return the paths that the user of a run gives again; no path is used only because the checkpoint has it."""
     return {"encoder.rasterised.root": encoders[0]["root"]} if "root" in encoders[0] else {}
 
 
 def seen_from(size, azimuth=0.4):
-    """A camera of unequal focal lengths, off the middle, far from any canonical one."""
+    """Return a camera of unequal focal lengths, off the middle, far from any canonical one."""
     camera = look_from(azimuth, 0.3, -0.2, distance=3.5, field_of_view=0.8, size=size)
     return replace(camera, focal=(camera.focal[0], 1.1 * camera.focal[1]), principal=(17.0, 15.5))
 
@@ -46,7 +46,7 @@ def encoders(request, tmp_path_factory):
 
 
 def root(folder):
-    """The sphere as the registration of everybody, in the layout that `rasterised` reads its triangles from."""
+    """Return the sphere as everybody's registration, in the layout from which `rasterised` reads its triangles."""
     for split in ("train", "validation", "test"):
         (folder / f"{split}.txt").write_text(f"{split}\n")
     file = folder / "subjects/train/registration_7k.ply"
@@ -61,7 +61,7 @@ def root(folder):
 
 
 def given(scene):
-    """What a user of the loaded run hands over."""
+    """Return the input that a user of the loaded run passes."""
     assert scene.colors is not None
     return torch.cat([scene.camera.canonical(scene.vertices), encoded(scene.colors)], 1)[None]
 
