@@ -25,7 +25,7 @@ SIZES_KEPT = 4
 
 
 class SMPLpix(Renderer):
-    """Image that a trained run of `smplpix/quick` or a similar experiment predicts for a scene.
+    """Renderer that paints a scene with the trained network of a run of `smplpix/quick` or a similar experiment.
 
     The camera may be any camera: vertices are transformed to the canonical camera of its image size, which sees them at
     the same pixels (`Camera.canonical`). Faces matter only to a run that paints over a rasterised mesh, which then
