@@ -11,9 +11,9 @@ from torch import Tensor
 from framework.geometry.rotation import viewpoint_rotation
 
 SHAPES = {"rotation": (3, 3), "translation": (3,), "focal": (2,), "principal": (2,)}
-"""Of what a camera is made of."""
+"""Shapes of the tensors that a camera consists of."""
 SAID = {"focal": ", (fx, fy), pixels", "principal": ", (cx, cy), pixels"}
-"""What the numbers of a lens are."""
+"""Meaning and unit of the numbers of a lens, for messages."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,11 @@ class Camera:
     Attributes:
         rotation: world to camera, determinant +1.
         translation: metres.
-        focal: (fx, fy), pixels, > 0; a tensor where it is to be differentiated in.
-        principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2). Likewise.
+        focal: (fx, fy), pixels, > 0; a tensor if its gradient is wanted.
+        principal: (cx, cy), pixels; the centre of an image is ((width - 1) / 2, (height - 1) / 2). A tensor if its
+            gradient is wanted.
         height, width: image size, pixels.
-        near: nothing nearer than this is seen, metres, > 0.
+        near: smallest depth that is seen, metres, > 0.
     """
 
     rotation: Float[Tensor, "3 3"]
@@ -40,10 +41,13 @@ class Camera:
     near: float = 1e-3
 
     def check_shapes(self) -> None:
-        """Nothing else does: a single focal length would pass for two, and kernels would read what is not there.
+        """Check the shapes of the camera's tensors.
+
+        Nothing else checks them: a single focal length would count as two, and kernels would read beyond an array.
 
         Raises:
-            ValueError: rotation, translation, focal or principal has another shape; says what came and what was wanted.
+            ValueError: rotation, translation, focal or principal has another shape; the message says what came and what
+                was wanted.
         """
         for name, wanted in SHAPES.items():
             came = _shape(getattr(self, name))
@@ -56,8 +60,9 @@ class Camera:
     def projected(
         self, points: Real[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points 2"], Float[Tensor, "*points"]]:
-        """Pixels (column, row) at which world points are seen, and their depths along the optical axis, metres. Of a
-        depth that is not above 0 the pixel means nothing. Whole numbers are taken as torch's default float type.
+        """Return pixels (column, row) at which world points are seen, and their depths along the optical axis, metres.
+
+        The pixel has no meaning for a depth that is not above 0. Integers are converted to torch's default float type.
 
         Raises:
             ValueError: as `check_shapes`.
@@ -66,12 +71,14 @@ class Camera:
         return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
 
     def canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        """Where world points lie before the `canonical_camera` of the same image size, metres: it sees them at the same
-        pixels and depths. So a cloud alone says what this camera sees, and no camera has to come with it.
+        """Return world points in coordinates of the `canonical_camera` of the same image size, metres.
+
+        That camera sees them at the same pixels and depths, so that a cloud alone determines the view and needs no
+        camera.
 
         Of (x, y, z) = rotation @ X + translation and the canonical focal length f and principal point (c, d) they are
-        ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z), since then f x'/z + c = fx x/z + cx. Differentiable in
-        points and lens. Whole numbers are taken as torch's default float type.
+        ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z), since then f x'/z + c = fx x/z + cx. The result is
+        differentiable in points and lens. Integers are converted to torch's default float type.
 
         Raises:
             ValueError: as `check_shapes`.
@@ -83,9 +90,9 @@ class Camera:
         return torch.cat([across / focal.new_tensor(plain.focal), depth], -1)
 
     def _seen(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Camera coordinates of world points, and focal lengths and principal point as tensors like them."""
+        """Return camera coordinates of world points, and focal lengths and principal point as tensors like them."""
         self.check_shapes()
-        if not points.is_floating_point():  # in whole numbers a rotation would be 0 and 1 alone
+        if not points.is_floating_point():  # as integers a rotation would have only the entries -1, 0 and 1
             points = points.to(torch.get_default_dtype())
         seen = points @ self.rotation.to(points).T + self.translation.to(points)
         focal, principal = (
@@ -96,7 +103,7 @@ class Camera:
 
 
 def _shape(numbers: object) -> tuple[int, ...]:
-    """Of a tensor, an array, or a sequence of numbers."""
+    """Return the shape of a tensor, an array, or a sequence of numbers."""
     if isinstance(numbers, Tensor | np.ndarray):
         return tuple(numbers.shape)
     if not isinstance(numbers, tuple | list):
@@ -105,10 +112,10 @@ def _shape(numbers: object) -> tuple[int, ...]:
 
 
 def focal_length(height: int, field_of_view: float) -> float:
-    """Pixels; of an image of so many rows that shows `field_of_view`, radians, from its upper edge to its lower.
+    """Return the focal length, pixels, of an image with `height` rows that shows `field_of_view`, radians, vertically.
 
     Raises:
-        ValueError: the angle is not between 0 and π: degrees, perhaps.
+        ValueError: the angle is not between 0 and π; it may be in degrees.
     """
     if not 0 < field_of_view < math.pi:
         raise ValueError(
@@ -118,8 +125,11 @@ def focal_length(height: int, field_of_view: float) -> float:
 
 
 def canonical_camera(height: int, width: int) -> Camera:
-    """The camera of images of this size that no further number describes: in the origin, along the axes, its focal
-    length as many pixels as the image has rows, its principal point in the middle."""
+    """Return the camera for images of this size that needs no further number.
+
+    It is at the origin, along the axes. Its focal length is as many pixels as the image has rows, and its principal
+    point is the centre of the image.
+    """
     return Camera(
         rotation=torch.eye(3),
         translation=torch.zeros(3),
@@ -138,11 +148,11 @@ def look_from(
     field_of_view: float,
     size: tuple[int, int],
 ) -> Camera:
-    """A camera at `distance` (metres) from the origin that looks at it, z up, angles in radians.
+    """Return a camera at `distance` (metres) from the origin that looks at it, z up, angles in radians.
 
-    Azimuth turns about the vertical (0 looks at the object's front, from -y), elevation lifts the camera, tilt
-    rolls it in the plane: the convention of PASCAL3D+ annotations. `field_of_view` is vertical; `size` is
-    (height, width).
+    Azimuth rotates about the vertical (0 looks at the object's front, from -y), elevation raises the camera, tilt rolls
+    it in the image plane: the convention of PASCAL3D+ annotations. `field_of_view` is vertical; `size` is (height,
+    width).
 
     Raises:
         ValueError: as `focal_length`.

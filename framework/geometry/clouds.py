@@ -1,4 +1,4 @@
-"""Pads batches of point clouds, counts their points, normalises them and leads back (thesis eq. 6.1-6.2).
+"""Batches of point clouds: padding, sizes, normalisation and its inverse (thesis eq. 6.1-6.2).
 
 A batch is a float tensor (batch, points, columns): x, y, z, then attributes of each point (colours, normals, anything).
 Clouds of fewer points are padded at their end with rows that are NaN in every column. Messages count clouds and points
@@ -18,18 +18,18 @@ from framework.errors import ConfigError, DataError
 
 Normalisation = Literal["unit_ball", "robust", "none"]
 REACH = 3.0
-"""Of "robust": points further from the middle than this many median distances count neither for centre nor scale."""
+"""Radius of "robust", in median distances: points farther from the middle do not count for centre and scale."""
 LOOSE, TIGHT = 2.0, 0.01
-"""A cloud whose largest norm, in units of what it is compared with, is outside of these was not normalised."""
+"""Bounds on the largest norm of a cloud, relative to a reference; a cloud beyond them was not normalised."""
 
 
 class Normalised(NamedTuple):
-    """Clouds about the origin; centre and scale lead back (`denormalised`).
+    """Clouds around the origin; centre and scale lead back (`denormalised`).
 
     Attributes:
-        clouds: of the dtype that came; attributes and padding as they came.
-        centre, scale: of each cloud, in its own units, float64, so that the way back loses no digits of clouds that
-            are far from the origin. The scale of a cloud whose points are all in one place is 1.
+        clouds: of the input's dtype; attributes and padding are unchanged.
+        centre, scale: of each cloud, in its own units, float64, so that the way back loses no digits of clouds that are
+            far from the origin. The scale of a cloud whose points are all at one position is 1.
     """
 
     clouds: Float[Tensor, "batch points columns"]
@@ -38,10 +38,10 @@ class Normalised(NamedTuple):
 
 
 def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
-    """Refuse inputs that are no clouds, (points, columns).
+    """Require inputs that are clouds, (points, columns).
 
     Raises:
-        ConfigError: says what `by` wants.
+        ConfigError: they are not; the message says what `by` wants.
     """
     if len(input_shape) != 2 or input_shape[1] < 3:
         raise ConfigError(
@@ -51,11 +51,11 @@ def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
 
 
 def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
-    """How many points each cloud of (batch, points, columns) has, without the padding.
+    """Return the number of points of each cloud of (batch, points, columns), without the padding.
 
     Raises:
-        DataError: no batch of clouds; a cloud without points; a number that is NaN or infinite. Names the cloud, and
-            its first bad point.
+        DataError: no batch of clouds; a cloud without points; a number that is NaN or infinite. The message names the
+            cloud, and its first bad point.
     """
     if clouds.dim() != 3 or clouds.shape[2] < 3 or clouds.dtype not in (torch.float32, torch.float64):
         raise DataError(
@@ -63,7 +63,7 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
             " of float32 or float64 with x, y, z in the first three columns. Check what `data` yields."
         )
     count, points, _ = clouds.shape
-    # a finite sum has no summand that is not, so that one pass suffices for clouds without padding
+    # a finite sum has only finite summands, so that one pass suffices for clouds without padding
     if points and math.isfinite(float(clouds.detach().sum())):
         return torch.full((count,), points, device=clouds.device)
     number = torch.arange(1, points + 1, device=clouds.device)
@@ -88,14 +88,14 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
 
 
 def filled(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
-    """Which rows hold points, of clouds of so many points; all, where None."""
+    """Return which rows of clouds with these sizes hold points; all rows if None."""
     if sizes is None:
         return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
     return torch.arange(clouds.shape[1], device=clouds.device) < sizes.to(clouds.device)[:, None]
 
 
 def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
-    """Clouds (points, columns) of different sizes as one batch: rows of NaN at the end of those that are not largest.
+    """Return clouds (points, columns) of different sizes as one batch, with rows of NaN at the end of smaller clouds.
 
     Raises:
         DataError: no cloud, or clouds that differ in their columns.
@@ -113,15 +113,16 @@ def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
 def normalised(
     clouds: Float[Tensor, "batch points columns"], how: Normalisation, counts: Tensor | None = None
 ) -> Normalised:
-    """Clouds about the origin, within the unit ball; differentiable in the clouds.
+    """Return clouds around the origin, within the unit ball; differentiable in the clouds.
 
-    "unit_ball": the mean of the points is subtracted, then all is divided by the largest norm (eq. 6.2). "robust": the
-    same, but mean and largest norm are those of the points within `REACH` median distances of the coordinates' medians,
-    so that far outliers, up to some 30 % of the points, do not shift them at all; they end outside of the ball. Where
-    half of the points or more are in one place, all count. "none": as they came, about 0 and of scale 1.
+    "unit_ball": the mean of the points is subtracted, then all is divided by the largest norm (eq. 6.2). "robust": as
+    "unit_ball", but mean and largest norm are those of the points within `REACH` median distances of the medians of the
+    coordinates, so that far outliers, up to some 30 % of the points, do not shift them at all; outliers end outside of
+    the ball. If half of the points or more are at one position, all count. "none": unchanged, with centre 0 and scale
+    1.
 
     Args:
-        counts: what `sizes` says of them, where that is known.
+        counts: result of `sizes`, if it is known.
 
     Raises:
         DataError: as `sizes`; or squared distances within a cloud exceed float64.
@@ -134,7 +135,7 @@ def normalised(
         return Normalised(clouds, origin, torch.ones_like(origin[:, 0]))
     if how == "unit_ball" and clouds.device.type == "cpu":
         found = _compiled(clouds.detach(), counts)
-        if clouds.requires_grad and torch.is_grad_enabled():  # the same bits, and a gradient
+        if clouds.requires_grad and torch.is_grad_enabled():  # adds a gradient and changes no bit
             traced = _composed(clouds, how, counts)
             pairs = zip(found, traced, strict=True)
             found = Normalised(*(value + (other - other.detach()) for value, other in pairs))
@@ -150,10 +151,10 @@ def normalised(
 
 
 def _compiled(clouds: Tensor, counts: Tensor) -> Normalised:
-    """ "unit_ball" on the processor: a third of the time that tensor operations take, one cloud at a time."""
+    """Return the result of "unit_ball" on the CPU, one cloud at a time, in a third of the time of tensor operations."""
     from framework.geometry.clouds_compiled import unit_ball
 
-    clouds = clouds.contiguous()  # compiled for that alone
+    clouds = clouds.contiguous()  # the function is compiled for contiguous arrays only
     made = torch.empty_like(clouds)
     centre = torch.empty(len(clouds), 3, dtype=torch.float64)
     scale = torch.empty(len(clouds), dtype=torch.float64)
@@ -162,14 +163,14 @@ def _compiled(clouds: Tensor, counts: Tensor) -> Normalised:
 
 
 def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
-    """By operations on tensors, on any device, differentiable."""
+    """Return the normalised clouds by operations on tensors, on any device, differentiable."""
     _, points, columns = clouds.shape
     real = None  # a mask of the points, where there is padding
     if not bool((counts == points).all()):
         real = filled(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()
     first = coordinates[:, :1]
-    # about the first point: what is far from the origin keeps its digits, equal points are exactly equal
+    # relative to the first point: clouds far from the origin keep their digits, and equal points are exactly equal
     offset = coordinates - first
     if real is not None:
         offset = offset.where(real, 0)  # before anything is multiplied: NaN × 0 is no gradient
@@ -194,11 +195,11 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Which points are within `REACH` median distances of the coordinates' medians; which are not far outliers."""
+    """Return which points are within `REACH` median distances of the medians of the coordinates: no far outliers."""
     known = offset if real is None else offset.where(real, math.nan)
     distance = torch.linalg.vector_norm(known - known.nanmedian(1, keepdim=True).values, dim=-1, keepdim=True)
     typical = distance.nanmedian(1, keepdim=True).values
-    near = distance <= REACH * typical  # not where NaN
+    near = distance <= REACH * typical  # False for NaN
     return near.where(typical > 0, ~distance.isnan())
 
 
@@ -207,7 +208,7 @@ def denormalised(
     centre: Float[Tensor, "batch 3"],
     scale: Float[Tensor, "batch"],
 ) -> Float[Tensor, "batch points columns"]:
-    """Normalised points back in their cloud's own units, of the dtype that came; further columns as they came."""
+    """Return normalised points in their cloud's own units, of the input's dtype; further columns are unchanged."""
     back = points[..., :3] * scale[:, None, None] + centre[:, None]
     return torch.cat([back.to(points.dtype), points[..., 3:]], -1)
 
@@ -215,16 +216,16 @@ def denormalised(
 def require_normalised(
     coordinates: Float[Tensor, "batch points 3"], reach: float, counts: Tensor, by: str
 ) -> None:
-    """Refuse clouds that were plainly not normalised, of which a basis or a grid about the origin says nothing.
+    """Require normalised clouds; a basis or a grid around the origin cannot describe others.
 
     Args:
         coordinates: of clouds that were not normalised by "unit_ball" or "robust".
-        reach: how far basis or grid reach along an axis.
+        reach: extent of the basis or grid along an axis.
         counts: sizes of the clouds.
-        by: who refuses.
+        by: name of the caller, for the message.
 
     Raises:
-        DataError: half of a cloud's points are further than 2 reaches from the origin (fewer may be outliers that a
+        DataError: half of a cloud's points are farther than 2 reaches from the origin (fewer may be outliers that a
             robust normalisation left there), or all are within 0.01 (but not all on it).
     """
     real = filled(coordinates, counts)
@@ -244,6 +245,6 @@ def require_normalised(
 
 
 def cell_centres(side: int) -> Float[Tensor, "cells 3"]:
-    """Of the side³ cells of the cube [-1, 1]³, x slowest, float64."""
-    axis = (torch.arange(side, dtype=torch.float64) * 2 + 1 - side) / side  # exactly symmetric about 0
+    """Return the centres of the side³ cells of the cube [-1, 1]³, x slowest, float64."""
+    axis = (torch.arange(side, dtype=torch.float64) * 2 + 1 - side) / side  # exactly symmetric around 0
     return torch.cartesian_prod(axis, axis, axis)

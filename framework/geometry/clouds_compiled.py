@@ -1,4 +1,4 @@
-"""Normalises clouds in the usual way in one pass of compiled code, for small batches on the processor."""
+"""Normalisation of clouds to the unit ball in one pass of compiled code, for small batches on the CPU."""
 
 from pathlib import Path
 from typing import no_type_check
@@ -13,17 +13,17 @@ compiled = compiler(kept_in("unit_ball", [Path(__file__)]))
 @compiled
 @no_type_check
 def unit_ball(clouds, counts, made, centre, scale):
-    """Eq. 6.2 of each cloud; `framework.geometry.clouds.normalised` says the rest.
+    """Fill `made` with eq. 6.2 of each cloud; see `framework.geometry.clouds.normalised`.
 
     Args:
         clouds: (cloud, point, column) float32 or float64.
-        counts: how many points each has, int64.
-        made: to be filled, like `clouds`.
-        centre, scale: to be filled, (cloud, 3) and (cloud,) float64.
+        counts: number of points of each cloud, int64.
+        made: filled with the normalised clouds, like `clouds`.
+        centre, scale: filled, (cloud, 3) and (cloud,) float64.
     """
     for number in range(clouds.shape[0]):
         cloud, out, count = clouds[number], made[number], counts[number]
-        # about the first point: what is far from the origin keeps its digits, equal points are exactly equal
+        # relative to the first point: clouds far from the origin keep their digits, equal points are exactly equal
         x, y, z = np.float64(cloud[0, 0]), np.float64(cloud[0, 1]), np.float64(cloud[0, 2])
         mean_x = mean_y = mean_z = 0.0
         for point in range(count):

@@ -1,4 +1,4 @@
-"""Orders the points of clouds so that each is as far as can be from those before it (Eldar et al. 1997)."""
+"""Farthest-point order of clouds: each point is as far as possible from the points before it (Eldar et al. 1997)."""
 
 import numpy as np
 import torch
@@ -10,15 +10,16 @@ from torch import Tensor
 def farthest(
     places: Float[Tensor, "batch points 3"], counts: Int[Tensor, "batch"], count: int
 ) -> Int[Tensor, "batch count"]:
-    """Indices of points of each cloud: each as far as can be from all before it, the first from the mean.
+    """Return indices of points of each cloud: each as far as possible from all before it, the first from the mean.
 
-    Of equally far points the first, and none twice before all were chosen; then the same ones in turn. So every order
-    of a cloud's points gives the same places but where distances are equal, and what is asked for less is the
-    beginning of what is asked for more. Computed in float64 on the processor, wherever the clouds are.
+    Of equally far points the first is chosen. None is chosen twice before all were chosen; then they repeat in turn. So
+    every order of a cloud's points gives the same positions, unless distances are equal, and a smaller `count` gives
+    the beginning of the result of a larger one. It is computed in float64 on the CPU, whatever device the clouds are
+    on.
 
     Args:
         counts: sizes of the clouds, 1 or more; rows behind them are not read.
-        count: how many are wanted.
+        count: number of points wanted.
     """
     from framework.geometry.farthest_compiled import farthest as compiled
 

@@ -14,12 +14,12 @@ compiled = compiler(kept_in("farthest", [Path(__file__)]))
 @compiled
 @no_type_check
 def farthest(clouds, counts, count):
-    """Indices (cloud, count); `framework.geometry.farthest.farthest` says which.
+    """Return indices (cloud, count), as `framework.geometry.farthest.farthest` defines them.
 
     Args:
         clouds: (cloud, point, 3) float64, C-contiguous.
-        counts: how many points each has, int64; what stands behind them is not read.
-        count: how many are wanted.
+        counts: number of points of each cloud, int64; rows behind them are not read.
+        count: number of points wanted.
     """
     found = np.empty((len(clouds), count), dtype=np.int64)
     for number in range(len(clouds)):
@@ -36,11 +36,11 @@ def farthest(clouds, counts, count):
         distance[:] = np.inf
         for step in range(count):
             if step >= size:
-                found[number, step] = found[number, step - size]  # all were chosen: over again
+                found[number, step] = found[number, step - size]  # all were chosen: repeat them
                 continue
             found[number, step] = place
             at[:] = cloud[place]
-            distance[place] = -1.0  # chosen; what lies at the same place is not
+            distance[place] = -1.0  # marks this point as chosen, not others at the same position
             best, place = -1.0, 0
             for point in range(size):
                 if distance[point] >= 0:

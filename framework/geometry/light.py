@@ -1,4 +1,4 @@
-"""Between the numbers of image files and light: sRGB (IEC 61966-2-1) to and from linear."""
+"""Conversion between the sRGB numbers of image files (IEC 61966-2-1) and linear RGB."""
 
 import torch
 from jaxtyping import Float, UInt8
@@ -6,24 +6,24 @@ from torch import Tensor
 
 
 def linear(stored: UInt8[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """Light in [0, 1], float32, of 8-bit numbers."""
+    """Return linear RGB in [0, 1], float32, of 8-bit numbers."""
     return light_of(stored.float() / 255)
 
 
 def light_of(numbers: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """Light in [0, 1] of sRGB numbers in [0, 1]; what lies outside is cut off. The inverse of `encoded`."""
+    """Return linear RGB in [0, 1] of sRGB numbers in [0, 1]; others are clamped. It is the inverse of `encoded`."""
     share = numbers.clamp(0, 1)
     return torch.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def eight_bit(light: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
-    """8-bit numbers of light; what lies outside of [0, 1] is cut off."""
+    """Return 8-bit numbers of linear RGB; values outside of [0, 1] are clamped."""
     return (encoded(light) * 255).round().to(torch.uint8)
 
 
 def encoded(light: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """The same before they are rounded, in [0, 1]; with a gradient where light is inside of [0, 1]."""
+    """Return sRGB numbers in [0, 1], not rounded; they have a gradient where linear RGB is inside of [0, 1]."""
     light = light.clamp(0, 1)
-    # 1.055 x - 0.055, written so that white is 1 to the bit: what is white is told from what is not
+    # 1.055 x - 0.055, written so that white is 1 to the bit, since white pixels are recognised by this value
     curve = 1 + 1.055 * (light.clamp(min=1e-8) ** (1 / 2.4) - 1)
     return torch.where(light <= 0.0031308, light * 12.92, curve)

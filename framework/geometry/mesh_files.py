@@ -1,8 +1,8 @@
-"""Parses mesh and cloud files into arrays, one function a format; what a file does not hold is never made up.
+"""Parsers of mesh and cloud files, one function for each format; they never make up what a file does not hold.
 
 Every parser takes the bytes of a file and raises a ValueError that says what came, in which line, and what was wanted;
-the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, line ends may be those
-of any system, polygons are cut into fans of triangles (right where they are convex).
+the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and line ends may be
+those of any system. Polygons are cut into fans of triangles (correct for convex ones).
 """
 
 import re
@@ -23,15 +23,15 @@ XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
 OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
-"""What files call the columns that have a name of their own here."""
+"""Names in files of columns that have another name here."""
 
 
 PADDING = 8
-"""Most blank bytes that may follow a binary file."""
+"""Largest number of blank bytes that may follow a binary file."""
 
 
 class Parsed(NamedTuple):
-    """What a file holds: `attributes` has one column for each of `columns`, whose values are as the file has them."""
+    """The content of a file: `attributes` has one column for each of `columns`, with values as in the file."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
@@ -40,24 +40,24 @@ class Parsed(NamedTuple):
 
 
 def column_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The project's names of columns, small letters."""
+    """Return the project's names of columns, in lower case."""
     small = [name.lower() for name in names]
     return tuple(OTHER_NAMES.get(name, name) for name in small)
 
 
 Place = Callable[[int], int]
-"""The number in the file, from 1, of one of some lines, from 0; called where something is wrong."""
+"""Function from the index of a line among some lines to its number in the file (from 1); called for messages."""
 
 
 def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[bytes] = ()) -> list[bytes]:
-    """The lines that are neither blank nor a comment, without their comments and without a byte-order mark.
+    """Return the lines that are neither blank nor a comment, without their comments and without a byte-order mark.
 
     Args:
-        comment: what begins a comment, but not within a number: 1.#INF is one. None: nothing does.
-        names: first words of lines whose rest is a name, which may hold what begins a comment elsewhere.
+        comment: beginning of a comment, but not within a number, such as 1.#INF. None: there are no comments.
+        names: first words of lines whose rest is a name, which may hold the beginning of a comment.
 
     Raises:
-        ValueError: it is text in UTF-16.
+        ValueError: the text is UTF-16.
     """
     return [line for line in _lines(content, comment, names) if line and not line.isspace()]
 
@@ -69,7 +69,7 @@ def placed(
     key: bytes = b"",
     first: int = 0,
 ) -> Place:
-    """Where the lines that `text_lines` finds stand in the file, from number `first` on.
+    """Return a function that gives the line numbers in the file of the lines of `text_lines`, from `first` on.
 
     Args:
         key: counts only lines with this first word.
@@ -97,12 +97,12 @@ def _lines(content: bytes, comment: bytes | None, names: Sequence[bytes]) -> lis
 
 
 def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | None = None) -> NDArray:
-    """All numbers of some lines, in a row.
+    """Return all numbers of some lines, concatenated.
 
     Raises:
-        ValueError: a word is none; names the line.
+        ValueError: a word is no number; the message names the line.
     """
-    joined = b" ".join(lines).strip()  # NumPy reads a number out of blanks
+    joined = b" ".join(lines).strip()  # NumPy reads blanks alone as a number
     try:
         return np.fromstring(joined, dtype=dtype, sep=" ") if joined else np.empty(0, dtype)
     except ValueError:
@@ -133,17 +133,17 @@ def _no_number(word: bytes, dtype: type, line: bytes) -> str:
 
 
 def _at(number: int, place: Place | None) -> str:
-    """The number of a line, before a message about it."""
+    """Return the number of a line, as the beginning of a message."""
     return "" if place is None else f"line {place(number)}: "
 
 
 def rows(
     lines: Sequence[bytes], what: str, width: int | None = None, place: Place | None = None
 ) -> Float[np.ndarray, "rows width"]:
-    """Lines of equally many numbers; `width` None: as many as the first has.
+    """Return lines of equally many numbers, (rows, width); `width` None: as many as the first line has.
 
     Raises:
-        ValueError: a line has another number of them, or a word that is none; names it.
+        ValueError: a line has another number of them, or a word that is no number; the message names it.
     """
     wanted = len(lines[0].split()) if width is None and lines else width or 0
     values = numbers(lines, place=place)
@@ -156,13 +156,13 @@ def rows(
 
 
 def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarray, "faces 3"]:
-    """Faces written as their number of corners, the corners, and perhaps more (colours), which is left out."""
+    """Return the triangles of faces written as their number of corners and the corners; further words are skipped."""
     if not lines:
         return np.empty((0, 3), np.int64)
     corners = int(numbers(lines[0].split()[:1], np.int64, place)[0])
     try:
         flat = numbers(lines, np.int64)
-    except ValueError:  # colours, or no number at all: line by line below
+    except ValueError:  # colours, or no number at all: parsed line by line below
         flat = np.empty(0, np.int64)
     alike = corners >= 3 and len(flat) == len(lines) * (corners + 1)
     if alike and (flat[:: corners + 1] == corners).all():
@@ -183,7 +183,7 @@ def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarr
 def fans(
     counts: Int[np.ndarray, "polygons"], corners: Int[np.ndarray, "corners"]
 ) -> Int[np.ndarray, "faces 3"]:
-    """Polygons of `counts` corners each, cut into triangles that share the polygon's first corner."""
+    """Return polygons of `counts` corners each, cut into triangles that share the polygon's first corner."""
     if len(counts) and counts.min() < 3:
         number = int(np.flatnonzero(counts < 3)[0])
         raise ValueError(f"face {number} (from 0) has {counts[number]} corners; wanted at least 3")
@@ -198,14 +198,14 @@ def fans(
 
 
 def off(content: bytes) -> Parsed:
-    """Object File Format, also with `OFF` and the counts on one line or without a blank between them.
+    """Parse the Object File Format, also with `OFF` and the counts on one line or without a blank between them.
 
-    Colours behind the corners of a face, and what follows the announced faces, are no part of the shape.
+    Colours after the corners of a face, and lines after the announced faces, are skipped.
     """
     lines = text_lines(content)
     if not lines:
         raise ValueError("the file is empty; wanted OFF in its first line")
-    keyword, first = lines[0].strip()[:3], lines[0].strip()[3:]  # OFF490 518 0
+    keyword, first = lines[0].strip()[:3], lines[0].strip()[3:]  # such as OFF490 518 0
     if keyword != b"OFF":
         raise ValueError(
             f"wanted OFF in its first line, got {_shown(lines[0])}; save variants with colours or normals as PLY"
@@ -231,7 +231,7 @@ def off(content: bytes) -> Parsed:
 
 
 def continued(content: bytes) -> bytes:
-    """An OBJ file in which no line goes on in the next, with as many lines as before."""
+    """Return an OBJ file with continued lines joined, with as many lines as before."""
     if b"\\" not in content:
         return content
     lines: list[bytes] = []
@@ -247,7 +247,7 @@ def continued(content: bytes) -> bytes:
 
 
 def obj(content: bytes) -> Parsed:
-    """Wavefront OBJ: vertices (with colours behind the coordinates, where all have them) and faces of all objects."""
+    """Parse Wavefront OBJ: vertices (with colours after the coordinates, if all have them) and faces of all objects."""
     joined = continued(content)
     points, faces, before = [], [], []
     for line in text_lines(joined):
@@ -276,7 +276,7 @@ def obj(content: bytes) -> Parsed:
 
 
 def stl(content: bytes) -> Parsed:
-    """STL, binary or text, its keywords in capitals or not; every face has corners of its own."""
+    """Parse STL, binary or text, its keywords in capitals or not; every face has corners of its own."""
     promised = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
     wanted = 84 + 50 * promised
     if 84 <= wanted <= len(content) and ends_well(content, wanted):
@@ -318,15 +318,15 @@ def _stl_text(content: bytes) -> Float[np.ndarray, "corners 3"]:
 
 
 def ends_well(content: bytes, end: int) -> bool:
-    """Whether after `end` a binary file has nothing, or only what editors and transfers put there: a line's end."""
+    """Return whether a binary file has nothing after `end`, except the line end that editors and transfers add."""
     return len(content) - end <= PADDING and not content[end:].strip(b" \t\r\n\x1a")
 
 
 def xyz(content: bytes) -> Parsed:
-    """A point in each line, numbers separated by blanks, tabs, commas or semicolons; the first three are coordinates.
+    """Parse a point in each line, with numbers separated by blanks, tabs, commas or semicolons.
 
-    A first line of as many names (`x y z red …`, also as a comment) names the columns, which then may stand in any
-    order; else they are column_4 and on.
+    The first three numbers are coordinates. A first line of as many names (`x y z red …`, also as a comment) names the
+    columns, which may then be in any order; otherwise they are column_4 and so on.
     """
     plain = _separated(text.plain(content))
     if b"//" in plain:
@@ -343,7 +343,7 @@ def xyz(content: bytes) -> Parsed:
     if len(values) and values.shape[1] < 3:
         raise ValueError(f"wanted at least 3 numbers for each point, got the line {_shown(lines[0])}")
     if named and head.startswith(b"#") and names[:3] != XYZ and len(names) != values.shape[1]:
-        named = False  # a comment that has these words
+        named = False  # an ordinary comment that contains these words
     if not named:
         return _table(values, None)
     if len(values) and len(names) != values.shape[1]:
@@ -363,16 +363,19 @@ def _as_comment(found: re.Match[bytes]) -> bytes:
 
 
 DECIMAL_COMMA = re.compile(rb"\d,\d")
-OTHER_SEPARATOR = re.compile(rb"[\d.](?:[ \t]++;?+|;)[ \t]*+[-+.\d]")  # possessive: in linear time
+OTHER_SEPARATOR = re.compile(
+    rb"[\d.](?:[ \t]++;?+|;)[ \t]*+[-+.\d]"
+)  # possessive quantifiers keep it in linear time
 QUOTED_COMMA = re.compile(rb"\"[-+]?\d*,\d")
 NO_NUMBER = re.compile(rb"[,;][ \t]*[,;]")
 
 
 def _separated(content: bytes) -> bytes:
-    """A cloud's lines with blanks between the numbers.
+    """Return a cloud's lines with blanks between the numbers.
 
     Raises:
-        ValueError: a comma is the decimal sign, or a number is missing between two separators; names the line.
+        ValueError: a comma is the decimal sign, or a number is missing between two separators; the message names the
+            line.
     """
     if b'"' in content:
         _refuse(content, lambda line: QUOTED_COMMA.search(line) is not None, COMMAS)
@@ -398,19 +401,19 @@ COMMAS = "commas stand for decimal points, or separate beside another separator;
 
 
 def _refuse(content: bytes, wrong: Callable[[bytes], bool], why: str) -> None:
-    """Refuse the first line that is wrong, apart from comments."""
+    """Raise for the first line that is wrong, apart from comments."""
     for number, line in enumerate(_lines(content, b"#", ()), 1):
         if not re.match(rb"\s*//", line) and wrong(line):
             raise ValueError(f"line {number}: {why}, got {_shown(line)}")
 
 
 def npy(content: bytes) -> Parsed:
-    """A NumPy array of (points, 3 or more) numbers."""
+    """Parse a NumPy array of (points, 3 or more) numbers."""
     return _table(_points(arrays.array(content)), None)
 
 
 def npz(content: bytes) -> Parsed:
-    """A NumPy archive: `points`, or the only array; `normals`, `colors` and other columns by their names; `faces`."""
+    """Parse a NumPy archive: `points`, or the only array; `normals`, `colors` and other named columns; `faces`."""
     held = arrays.archive(content)
     require_numbers(sum(array.size for array in held.values()), MOST_NUMBERS, len(content))
     key = "points" if "points" in held or len(held) != 1 else next(iter(held))
@@ -426,7 +429,7 @@ def npz(content: bytes) -> Parsed:
     for name, values in held.items():
         names = groups.get(name, (name,))
         if values.dtype.kind not in "biuf" or values.shape not in {(len(points), len(names)), (len(points),)}:
-            continue  # of the file, not of its points
+            continue  # an array that has no row for each point
         full = np.iinfo(values.dtype).max if names == COLOURS and values.dtype.kind == "u" else 1
         parts.append(values.reshape(len(points), -1).astype(np.float64) / full)
         columns += column_names(names)
@@ -450,6 +453,6 @@ def _table(values: NDArray, names: tuple[str, ...] | None) -> Parsed:
 
 
 def _shown(text: bytes) -> str:
-    """The beginning of a word or line, for a message."""
+    """Return the beginning of a word or line, for a message."""
     plain = text[:60].decode("utf-8", "replace").strip()
     return repr(plain + ("…" if len(text) > 60 else ""))

@@ -1,4 +1,4 @@
-"""Reads meshes and point clouds from files, and draws points from a surface, uniformly by area."""
+"""Reading of meshes and point clouds from files, and sampling of points from a surface, uniformly by area."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -25,20 +25,20 @@ READERS: dict[str, Callable[[bytes], Parsed]] = {
     ".npz": mesh_files.npz,
     ".xyz": mesh_files.xyz,
 }
-"""What can be read, by the end of the file's name."""
+"""Parsers of the formats that can be read, by the suffix of the file's name."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh, or a point cloud: a mesh without faces.
+    """A mesh, or a point cloud, which is a mesh without faces.
 
     Attributes:
-        source: where it comes from, for messages.
+        source: origin of the mesh, for messages.
         vertices: coordinates in the file's unit, finite.
         faces: rows of `vertices`, corners counter-clockwise seen from outside.
         columns: names of the attributes, "red", "green", "blue" (0…1), "normal_x" and so on, or the file's own.
-        attributes: a number for each vertex and column, as the file has it: it may be NaN.
-        dropped: how many vertices were left out because a coordinate was not finite (only when asked).
+        attributes: a number for each vertex and column, as in the file; it may be NaN.
+        dropped: number of vertices that were left out because a coordinate was not finite (only on request).
     """
 
     source: str
@@ -49,7 +49,7 @@ class Mesh:
     dropped: int = 0
 
     def attribute(self, names: Sequence[str]) -> Float[np.ndarray, "vertices names"]:
-        """The attributes asked for.
+        """Return the attributes with these names.
 
         Raises:
             DataError: there is none of this name, one is not finite, or a colour lies outside 0…1.
@@ -81,15 +81,15 @@ class Mesh:
 
 
 def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
-    """Read a mesh or cloud file; which format it is its name says, in capitals or not.
+    """Read a mesh or cloud file; the suffix of its name gives the format, in capitals or not.
 
     Args:
-        drop_non_finite: leave out vertices with a NaN or infinite coordinate, and faces that use them, and count
-            them in `dropped`, instead of refusing.
+        drop_non_finite: leave out vertices with a NaN or infinite coordinate, and faces that use them, and count them
+            in `dropped`, instead of raising.
 
     Raises:
-        DataError: no such file or format, damage, no vertices, a face that names a vertex that is not there, a
-            coordinate that is not finite. Nothing is mended silently.
+        DataError: no such file or format, damage, no vertices, a face that names a missing vertex, a coordinate that is
+            not finite. Nothing is repaired silently.
     """
     parse = READERS.get(file.suffix.lower())
     if parse is None:
@@ -136,7 +136,13 @@ def _finite(mesh: Mesh, drop: bool) -> Mesh:
 
 
 class Sampled(NamedTuple):
-    """Points of a surface, in the mesh's unit; `weights` of the three corners of the `face` each lies in."""
+    """Points of a surface, in the mesh's unit.
+
+    Attributes:
+        points: coordinates.
+        face: the face that each point lies in.
+        weights: barycentric weights of the three corners of that face.
+    """
 
     points: Float[np.ndarray, "points 3"]
     face: Int[np.ndarray, "points"]
@@ -144,7 +150,9 @@ class Sampled(NamedTuple):
 
 
 def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
-    """Independent points, uniform by area: faces with probability proportional to their area, which may be zero.
+    """Return independent points, uniform by area: faces are drawn with probability proportional to their area.
+
+    A face may have area zero.
 
     Raises:
         DataError: the mesh has no faces, or none with an area.
@@ -157,7 +165,7 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
         )
     cumulative = np.cumsum(areas)
     drawn = random.random((3, count))
-    # `right`: a face without area has no interval; the last one with area also gets what rounding leaves over
+    # `right`: a face without area has no interval; the last face with area also gets the remainder from rounding
     face = np.searchsorted(cumulative, drawn[0] * cumulative[-1], side="right")
     face = np.minimum(face, np.flatnonzero(areas)[-1])
     root = np.sqrt(drawn[1])  # P = (1 - √r₁) A + √r₁ (1 - r₂) B + √r₁ r₂ C (Osada et al. 2002, eq. 1)
@@ -167,14 +175,16 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
 
 
 def normals(mesh: Mesh) -> Float[np.ndarray, "faces 3"]:
-    """Unit normals of the faces, outwards; 0 where a face has no area."""
+    """Return unit normals of the faces, outwards; 0 for a face without area."""
     cross, length = _cross(mesh)
     return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0).T
 
 
 def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, "faces"]]:
-    """Cross products of two sides of every face and their lengths, in units² of the longest side: none over- or
-    underflows."""
+    """Return cross products of two sides of every face and their lengths, in units² of the longest side.
+
+    In these units none over- or underflows.
+    """
     if not len(mesh.faces):
         raise DataError(
             f"{mesh.source}: it has no faces; wanted a surface to draw points from. Use it as the point cloud it is, "
@@ -196,6 +206,6 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """The random numbers of a file, whatever was read before it; `name` is the file's own, without folders."""
+    """Return the random numbers of a file, independent of files read before; `name` is its name without folders."""
     digest = hashlib.blake2b(as_bytes(name), digest_size=8).digest()
     return np.random.default_rng([seed, int.from_bytes(digest, "little")])

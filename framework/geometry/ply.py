@@ -1,4 +1,4 @@
-"""Parses PLY files, text or binary, into arrays: vertices with all their properties, and faces."""
+"""Parser of PLY files, text or binary: vertices with all their properties, and faces."""
 
 import re
 import struct
@@ -37,14 +37,14 @@ TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I"}
-"""Of whole numbers for `struct`."""
+"""Format characters of integers for `struct`."""
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 
 
 @dataclass(frozen=True)
 class Property:
-    """A value of each item; `length`: NumPy's type of the number before a list, None: no list."""
+    """A value of each item; `length`: NumPy's type of the number before a list, None if it is no list."""
 
     name: str
     kind: str
@@ -61,13 +61,15 @@ class Element:
 
 
 def ply(content: bytes) -> Parsed:
-    """PLY 1.0: x, y, z of the vertices, their other properties as attributes (whole-number colours as 0…1), faces.
+    """Parse PLY 1.0: x, y, z of the vertices, their other properties as attributes, and faces.
+
+    Integer colours become 0…1.
 
     Raises:
-        ValueError: no PLY, a type nobody knows, fewer or more data than the header announces, faces as strips.
+        ValueError: no PLY, an unknown type, fewer or more data than the header announces, faces as strips.
     """
     content = text.plain(content)
-    # as its first line ends, so does the last of the header: behind \r alone, \n may be the first byte of the data
+    # The last line of the header ends as the first does: after \r alone, \n may be the first byte of the data.
     last = rb"\r" if re.match(rb"ply[ \t]*\r(?!\n)", content) else rb"\r?\n"
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)
     if not content.startswith(b"ply") or end is None:
@@ -92,7 +94,7 @@ def ply(content: bytes) -> Parsed:
 def _header(content: bytes) -> tuple[str, list[Element]]:
     order: str | None = None
     elements: list[Element] = []
-    # of bytes, since lines of text end at more: at the last byte of Å, say
+    # lines of bytes, since lines of text also end at other characters, such as the last byte of Å
     for line in content.splitlines()[1:]:
         if max(len(elements), len(elements[-1].properties) if elements else 0) > MOST_COLUMNS:
             raise ValueError(f"its header has more than {MOST_COLUMNS} elements, or properties of one")
@@ -126,11 +128,11 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
 
 
 def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tuple[NDArray, NDArray]:
-    """Properties of the vertices, one column each, and triangles, from a body of one line an item.
+    """Return properties of the vertices, one column each, and triangles, from a body with one line per item.
 
     Args:
-        place: of a line of the body that is not blank, its number.
-        before: lines of the header.
+        place: function from the index of a line of the body that is not blank to its number.
+        before: number of lines of the header.
     """
     lines = text_lines(body, None)
     promised = sum(element.count for element in elements if element.properties)
@@ -175,12 +177,14 @@ def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, 
 
 
 def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[np.ndarray, "faces 3"], int]:
-    """Triangles of an element whose properties may be lists, and where its data end."""
+    """Return the triangles of an element whose properties may be lists, and the end of its data."""
     empty = np.empty((0, 3), np.int64)
     if element.count == 0 or not element.properties:
         return empty, start
     wanted = _corners(element) if element.name == "face" else None
-    kind = _uniform(body, start, element, order)  # all items as the first: nearly always so
+    kind = _uniform(
+        body, start, element, order
+    )  # assumes that all items are like the first, as they nearly always are
     if start + element.count * kind.itemsize <= len(body):
         table = np.frombuffer(body, kind, element.count, start)
         lengths = [name for name in table.dtype.names or () if name.startswith("length")]
@@ -206,7 +210,7 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
 def _walked(
     body: bytes, start: int, element: Element, wanted: Property | None, order: str
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
-    """Of each item how long its list `wanted` is, and where that begins; the last place is where the items end."""
+    """Return for each item the length of its list `wanted`, and the list's position; the last position is the end."""
     counts, places = np.zeros(element.count, np.int64), np.zeros(element.count + 1, np.int64)
     lengths = [
         struct.Struct((order or "=") + CODES[entry.length]) if entry.length else None
@@ -235,7 +239,7 @@ def _walked(
 
 
 def _uniform(body: bytes, start: int, element: Element, order: str) -> np.dtype:
-    """The record of the element's first item."""
+    """Return the record type of the element's first item."""
     fields = []
     for number, entry in enumerate(element.properties):
         if entry.length is None:

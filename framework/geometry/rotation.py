@@ -6,9 +6,9 @@ from torch import Tensor
 
 
 def viewpoint_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation of the object seen at (azimuth a, elevation e, tilt t), radians: Rz(t) Rx(e - π/2) Rz(-a).
+    """Return the rotation of the object seen at (azimuth a, elevation e, tilt t), radians: Rz(t) Rx(e - π/2) Rz(-a).
 
-    The Euler convention of PASCAL3D+ annotations (Xiang et al., WACV 2014), as used for viewpoint evaluation by
+    This is the Euler convention of PASCAL3D+ annotations (Xiang et al., WACV 2014), as used for viewpoint evaluation by
     Tulsiani & Malik (CVPR 2015). The camera frame has x right, y up, z towards the viewer.
     """
     azimuth, elevation, tilt = angles.unbind(-1)
@@ -18,10 +18,11 @@ def viewpoint_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*bat
 def geodesic_distance(
     first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Angle of the rotation between two rotations, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
+    """Return the angle between two rotations, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
 
-    Exact near 0, where the arc cosine of the trace loses half the digits, and near π, where the trace's cos(angle / 2)
-    does: there that is sin(angle) / (2 sin(angle / 2)), from the part of R₁ᵀR₂ that is not symmetric.
+    It is exact near 0, where the arc cosine of the trace loses half the digits. It is exact near π, where cos(angle /
+    2) from the trace does: there it is computed as sin(angle) / (2 sin(angle / 2)), from the antisymmetric part of
+    R₁ᵀR₂.
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5  # sin(angle / 2)
     trace = (first * second).sum((-2, -1))
@@ -33,7 +34,7 @@ def geodesic_distance(
 
 
 def about_z(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation about the third axis, radians, counter-clockwise seen from its positive end."""
+    """Return the rotation about the third axis, radians, counter-clockwise seen from its positive end."""
     cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
     rows = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1)
     return rows.unflatten(-1, (3, 3))

@@ -1,7 +1,7 @@
-"""Finds the point of a cloud that is nearest to each query, exactly; and the Chamfer distance (thesis eq. 6.4-6.6).
+"""Exact search for the point of a cloud nearest to each query, and the Chamfer distance (thesis eq. 6.4-6.6).
 
-On the processor by compiled kernels (`processor`, imported when first needed), elsewhere in torch (`device`). For
-clouds in pieces see `streamed`; the modules beside it are for this package alone.
+The CPU uses compiled kernels (`processor`, imported when first needed), other devices use torch (`device`). For clouds
+in pieces see `streamed`; the other modules are for this package alone.
 """
 
 import math
@@ -18,7 +18,7 @@ from framework.geometry.clouds import filled
 from framework.geometry.nearest.exponents import MOST
 
 OFTEN = 2**16
-"""Queries up to which packing them well takes less than a second."""
+"""Largest number of queries that can be packed well in less than a second."""
 
 
 class Nearest(NamedTuple):
@@ -26,8 +26,8 @@ class Nearest(NamedTuple):
 
     Attributes:
         distance: Euclidean, in the unit of the coordinates, of their dtype; NaN for queries beyond `query_sizes`.
-        index: row of the cloud, int64; 0 for queries beyond `query_sizes`. Of points at the same distance, rounded as
-            the dtype rounds its square, the lowest.
+        index: row of the cloud, int64; 0 for queries beyond `query_sizes`. Of points at the same distance, after
+            rounding of its square in the dtype, the lowest row.
     """
 
     distance: Float[Tensor, "batch query"]
@@ -36,11 +36,11 @@ class Nearest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """Queries that are the same for every cloud, with what is computed from them once (`prepare`).
+    """Queries that all clouds share, with results that are computed from them once (`prepare`).
 
     Attributes:
         points: finite.
-        once: whether they are asked of one batch alone, so that it does not pay to pack them well.
+        once: whether they are used for one batch alone, so that packing them well does not pay.
     """
 
     points: Float[Tensor, "query 3"]
@@ -48,11 +48,12 @@ class Queries:
 
     @cached_property
     def largest(self) -> float:
-        """The largest coordinate."""
+        """Largest magnitude of a coordinate."""
         return float(self.points.abs().max())
 
     @cached_property
     def packed(self) -> Any:
+        """Queries packed for the kernels of the CPU."""
         from framework.geometry.nearest.processor import packed_once, packed_well
 
         points = self.points.numpy()
@@ -60,10 +61,10 @@ class Queries:
 
 
 def prepare(queries: Tensor, once: bool = False) -> Queries:
-    """Queries (query, 3) to be asked of many clouds: `nearest` takes them in place of the tensor, and is faster.
+    """Return queries (query, 3) prepared for many clouds: `nearest` takes them in place of the tensor, and is faster.
 
     Raises:
-        DataError: there is none, or a coordinate is NaN or infinite.
+        DataError: there is no query, or a coordinate is NaN or infinite.
     """
     queries = queries.detach().contiguous()
     checked(queries[None], "queries")
@@ -74,19 +75,21 @@ def prepare(queries: Tensor, once: bool = False) -> Queries:
 def nearest(
     clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None = None, query_sizes: Tensor | None = None
 ) -> Nearest:
-    """The nearest point of each cloud to each query: exact in the dtype of the coordinates, float32 or float64.
+    """Return the nearest point of each cloud to each query: exact in the dtype of the coordinates, float32 or float64.
 
-    Squares of differences are added in that dtype, so that the distance, and that of the point that is found, are the
-    least to 2.5e-7 of the largest coordinate or distance in float32, 1e-15 in float64. Uses as many threads
-    as torch does. No gradient flows through it: gather points by `index` where one is needed.
+    Squares of differences are added in that dtype. The distance, and that of the point that is found, are therefore the
+    smallest to 2.5e-7 of the largest coordinate or distance in float32, 1e-15 in float64. The function uses as many
+    threads as torch does. It has no gradient: gather points by `index` if a gradient is needed.
 
     Args:
         clouds: (batch, points, 3), on the device of the queries. Rows from `sizes` on are not read.
-        queries: (query, 3), the same for all clouds, or (batch, query, 3), of each cloud its own.
-        sizes: (batch,) how many points each cloud has; all, where None. Likewise `query_sizes`, of queries (batch, …).
+        queries: (query, 3), shared by all clouds, or (batch, query, 3), separate for each cloud.
+        sizes: (batch,) number of points of each cloud; all if None.
+        query_sizes: (batch,) number of queries of each cloud, for queries (batch, …); all if None.
 
     Raises:
-        DataError: an empty cloud, a number that is not finite, a distance that the dtype cannot hold; names the cloud.
+        DataError: an empty cloud, a number that is not finite, a distance that the dtype cannot hold; the message names
+            the cloud.
     """
     clouds = clouds.detach()
     own = isinstance(queries, Tensor) and queries.dim() == 3
@@ -116,7 +119,11 @@ def nearest(
 
 
 def checked(points: Tensor, name: str) -> None:
-    """Raises DataError unless (batch, points ≥ 1, 3) of float32 or float64."""
+    """Check that points are (batch, points ≥ 1, 3) of float32 or float64.
+
+    Raises:
+        DataError: they are not.
+    """
     if points.dim() != 3 or points.shape[2] != 3 or points.dtype not in (torch.float32, torch.float64):
         raise DataError(
             f"{name} of shape {tuple(points.shape)} and type {points.dtype} came where coordinates x, y, z of "
@@ -127,7 +134,11 @@ def checked(points: Tensor, name: str) -> None:
 
 
 def counted(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
-    """The sizes as int64 on the processor; DataError where one is not in 1…points."""
+    """Return the sizes as int64 on the CPU.
+
+    Raises:
+        DataError: a size is not in 1…points.
+    """
     if sizes is None:
         return None
     sizes = sizes.to("cpu", torch.int64)
@@ -146,7 +157,11 @@ def counted(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
 
 
 def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
-    """Raises DataError that names the first number that is not finite, where there is one."""
+    """Raise an error that names the first number that is not finite, if there is one.
+
+    Raises:
+        DataError: a number is not finite.
+    """
     bad = ~points.isfinite().all(-1)
     if sizes is not None:
         bad &= filled(points, sizes)
@@ -161,6 +176,7 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
 def on_processor(
     clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None, query_sizes: Tensor | None
 ) -> Nearest:
+    """Return the nearest points by the compiled kernels of the CPU."""
     from framework.geometry.nearest import processor
 
     shared = isinstance(queries, Queries)
@@ -193,6 +209,7 @@ def on_processor(
 
 
 def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes: Tensor | None) -> Nearest:
+    """Return the nearest points by torch, on other devices."""
     from framework.geometry.nearest.device import nearest_of
 
     refuse_bad(clouds, sizes, "clouds")
@@ -205,13 +222,20 @@ def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes:
 
 
 def scaling(cloud: Tensor, queries: Tensor) -> float:
-    """A power of two, by which multiplying is exact, that takes the largest coordinate to 1, or nearer where the dtype
-    cannot hold such a power: `nearest` then scales once more."""
+    """Return a power of two, by which multiplying is exact, that scales the largest coordinate to about 1.
+
+    If the dtype cannot hold such a power, the coordinate comes nearer to 1, and `nearest` then scales once more.
+    """
     largest = max(float(cloud.abs().max()), float(queries.abs().max()))
     return 2.0 ** max(-MOST[cloud.dtype], min(MOST[cloud.dtype], -math.frexp(largest)[1]))
 
 
 def unscaled(distance: Tensor, scale: float, cloud: int) -> Tensor:
+    """Return distances divided by the scale.
+
+    Raises:
+        DataError: the dtype cannot hold one.
+    """
     distance = distance / scale
     if not distance.isfinite().all():
         raise DataError(
@@ -227,10 +251,13 @@ def chamfer(
     sizes_a: Int[Tensor, "batch"] | None = None,
     sizes_b: Int[Tensor, "batch"] | None = None,
 ) -> Float[Tensor, "batch"]:
-    """Mean squared distance to the nearest point of the other cloud, both ways added (eq. 6.6); differentiable.
+    """Return the mean squared distance to the nearest point of the other cloud, both ways added (eq. 6.6).
+
+    The result is differentiable.
 
     Raises:
-        DataError: as `nearest`; or the dtype cannot hold the squares' mean, which is too large, or too small and not 0.
+        DataError: as `nearest`; or the dtype cannot hold the mean of the squares: it is too large, or too small and not
+            0.
     """
     there, back = offsets(a, b, sizes_a, sizes_b), offsets(b, a, sizes_b, sizes_a)
     found = mean_square(there, sizes_a) + mean_square(back, sizes_b)
@@ -251,7 +278,7 @@ def chamfer(
 def offsets(
     queries: Tensor, clouds: Tensor, query_sizes: Tensor | None, sizes: Tensor | None
 ) -> Float[Tensor, "batch query 3"]:
-    """From the nearest point of the cloud to each query; 0 for queries beyond `query_sizes`."""
+    """Return the vectors from the nearest point of the cloud to each query; 0 for queries beyond `query_sizes`."""
     index = nearest(clouds, queries, sizes, query_sizes).index
     real = None if query_sizes is None else filled(queries, query_sizes)[..., None]
     if real is not None:
@@ -261,13 +288,13 @@ def offsets(
 
 
 def mean_square(offsets: Float[Tensor, "batch query 3"], sizes: Tensor | None) -> Float[Tensor, "batch"]:
-    """Mean of the squared lengths of so many offsets of each cloud; the others are 0."""
+    """Return the mean of the squared lengths of the first `sizes` offsets of each cloud; the other offsets are 0."""
     sizes = offsets.new_full((len(offsets),), offsets.shape[1]) if sizes is None else sizes.to(offsets)
     return MeanSquare.apply(offsets, sizes)  # type: ignore[return-value]
 
 
 class MeanSquare(torch.autograd.Function):
-    """Squares of offsets in units of the largest, so that only a mean that the dtype cannot hold is lost.
+    """Mean of the squares of offsets, in units of the largest, so that only a mean that the dtype cannot hold is lost.
 
     A unit is a power of two, by which multiplying is exact. The derivative is that of the formula, since a chain of the
     single steps would multiply by the square of the unit, which the dtype may not hold.
@@ -275,6 +302,7 @@ class MeanSquare(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, offsets: Tensor, sizes: Tensor) -> Tensor:  # type: ignore[override]
+        """Return the mean squared length, (batch,)."""
         ctx.save_for_backward(offsets, sizes)
         exponent = torch.frexp(offsets.abs().amax((1, 2))).exponent.clamp(
             -MOST[offsets.dtype], MOST[offsets.dtype]
@@ -285,5 +313,6 @@ class MeanSquare(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, along: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        """Return the gradient in the offsets."""
         offsets, sizes = ctx.saved_tensors
         return 2 * offsets * (along / sizes)[:, None, None], None

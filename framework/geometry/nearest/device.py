@@ -1,4 +1,4 @@
-"""Finds nearest neighbours in torch, on devices other than the processor: all pairs, in pieces of bounded memory."""
+"""Nearest neighbours in torch, on devices other than the CPU: all pairs, in pieces of bounded memory."""
 
 import torch
 from jaxtyping import Float, Int
@@ -8,7 +8,7 @@ from framework.geometry.clouds import filled
 from framework.geometry.nearest.exponents import MOST
 
 PAIRS = 2**24
-"""Squared distances held at a time: three arrays of this size, 192 MiB in float32."""
+"""Number of squared distances held at a time: three arrays of this size, 192 MiB in float32."""
 
 
 def nearest_of(
@@ -18,17 +18,18 @@ def nearest_of(
     query_sizes: Int[Tensor, "batch"] | None,
     pairs: int = PAIRS,
 ) -> tuple[Float[Tensor, "batch query"], Int[Tensor, "batch query"]]:
-    """Distance and index as `framework.geometry.nearest.Nearest` has them, of finite coordinates.
+    """Return distance and index as in `framework.geometry.nearest.Nearest`, for finite coordinates.
 
-    Differences are taken before they are squared: |p|² - 2 p·q + |q|² would lose the digits of what is near. Each
-    square is rounded before it is added, while the processor's search adds it unrounded (fused multiply-add): distances
-    differ from its by a unit in the last place, and of two points nearer to equally far it may choose the other.
+    Differences are computed before they are squared: |p|² - 2 p·q + |q|² would lose the digits of small distances. Each
+    square is rounded before it is added, while the search on the CPU adds it unrounded (fused multiply-add). Distances
+    therefore differ from the CPU's by a unit in the last place, and of two nearly equally far points the other may be
+    chosen.
     """
     batch, points, _ = clouds.shape
     asked = queries.shape[-2]
     if queries.dim() == 2:
         queries = queries.expand(batch, -1, -1)
-    # divided by a power of two, which is exact, so that no square overflows or vanishes
+    # division by a power of two is exact, and no square over- or underflows afterwards
     real, asking = filled(clouds, sizes), filled(queries, query_sizes)
     clouds, queries = clouds.where(real[..., None], 0), queries.where(asking[..., None], 0)
     largest = torch.maximum(clouds.abs().amax((1, 2)), queries.abs().amax((1, 2)))
@@ -38,7 +39,7 @@ def nearest_of(
 
     distance = clouds.new_empty(batch, asked)
     index = torch.empty(batch, asked, dtype=torch.int64, device=clouds.device)
-    # the dimension that is cut last is cut finest
+    # the batch is cut first, then the queries; points are cut only if they exceed `pairs`
     cut_points = min(points, pairs)
     cut_queries = max(1, min(asked, pairs // cut_points))
     cut_batch = max(1, min(batch, pairs // (cut_points * cut_queries)))

@@ -1,6 +1,6 @@
-"""Exponents of the powers of two that coordinates are scaled by."""
+"""Exponents of the powers of two by which coordinates are scaled."""
 
 import torch
 
 MOST = {torch.float32: 126, torch.float64: 1000}
-"""Exponents of two up to which a power is finite, and its inverse too, by type of number."""
+"""Largest exponent of two, by dtype, for which the power and its inverse are finite."""

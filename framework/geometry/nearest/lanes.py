@@ -1,10 +1,10 @@
-"""Gives functions compiled by numba short vectors: sixteen numbers that move together.
+"""Short vectors for functions compiled by numba: sixteen numbers that are computed together.
 
-A value of type `Lanes` holds 16 numbers (4 where a name ends in 4) of an array's dtype, or as many truth values. `-`,
-`+`, `*`, `&`, `|` and the comparisons work lane by lane on two of the same type. Vectors are LLVM's own, so the
-compiler makes of them what the processor has: one register, two or four. No function checks bounds.
+A value of type `Lanes` holds 16 numbers (4 if a name ends in 4) of an array's dtype, or as many truth values. `-`, `+`,
+`*`, `&`, `|` and the comparisons work lane by lane on two values of one type. Vectors are LLVM's own, so that the
+compiler maps them to the registers of the processor: one, two or four. No function checks bounds.
 
-`no_type_check` keeps the type checks that tests switch on away from what numba calls while it compiles.
+`no_type_check` keeps the type checks that tests switch on away from functions that numba calls while it compiles.
 """
 
 import operator
@@ -21,11 +21,11 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 LANES = 16
 INT32 = ir.IntType(32)
 Make = Callable[..., Any]
-"""(builder, element type, values…) → value."""
+"""Function that emits code: (builder, element type, values…) → value."""
 
 
 class Lanes(types.Type):
-    """`count` numbers of the scalar type `element`."""
+    """Numba type of `count` numbers of the scalar type `element`."""
 
     @no_type_check
     def __init__(self, element, count=LANES):
@@ -35,7 +35,7 @@ class Lanes(types.Type):
 
 @register_model(Lanes)
 class LanesModel(models.PrimitiveModel):
-    """In memory and in registers an LLVM vector; truth values have one bit."""
+    """An LLVM vector, in memory and in registers; truth values have one bit."""
 
     @no_type_check
     def __init__(self, manager, kind):
@@ -46,16 +46,20 @@ class LanesModel(models.PrimitiveModel):
 
 @no_type_check
 def real(element):
+    """Return whether the element type is floating-point."""
     return isinstance(element, types.Float)
 
 
 @no_type_check
 def truths(like):
+    """Return the type of as many truth values."""
     return Lanes(types.boolean, like.count)
 
 
 @no_type_check
 def arithmetic(of_reals: str, of_integers: str) -> Make:
+    """Return the emitter of an operation on reals or integers."""
+
     def make(builder, element, x, y):
         return getattr(builder, of_reals if real(element) else of_integers)(x, y)
 
@@ -64,8 +68,10 @@ def arithmetic(of_reals: str, of_integers: str) -> Make:
 
 @no_type_check
 def comparison(sign: str) -> Make:
+    """Return the emitter of a comparison."""
+
     def make(builder, element, x, y):
-        compare = builder.fcmp_ordered if real(element) else builder.icmp_signed  # NaN enters none
+        compare = builder.fcmp_ordered if real(element) else builder.icmp_signed  # False for NaN
         return compare(sign, x, y)
 
     return make
@@ -73,7 +79,7 @@ def comparison(sign: str) -> Make:
 
 @no_type_check
 def register(operation: Make, make: Make, compares: bool = False) -> None:
-    """Gives an operator of two vectors its type and its code."""
+    """Register type and code of an operator on two vectors."""
 
     @infer_global(operation)  # type: ignore[reportOptionalCall]
     class Template(AbstractTemplate):
@@ -102,17 +108,19 @@ register(operator.ne, comparison("!="), compares=True)
 
 @no_type_check
 def least_of(builder, element, x, y):
+    """Emit the smaller value of each lane."""
     return builder.select(comparison("<")(builder, element, x, y), x, y)
 
 
 @no_type_check
 def most_of(builder, element, x, y):
+    """Emit the larger value of each lane."""
     return builder.select(comparison(">")(builder, element, x, y), x, y)
 
 
 @no_type_check
 def coded(result, arguments, make):
-    """What an intrinsic returns: its signature, and code that needs nothing but the values."""
+    """Return what an intrinsic returns: its signature, and code that depends on the values alone."""
 
     def generate(context, builder, sig, values):
         return make(builder, *values)
@@ -123,27 +131,28 @@ def coded(result, arguments, make):
 @intrinsic
 @no_type_check
 def least(typing, a, b):
-    """The smaller in each lane; b where a is NaN."""
+    """Return the smaller number in each lane; b if a is NaN."""
     return coded(a, (a, b), lambda builder, x, y: least_of(builder, a.element, x, y))
 
 
 @intrinsic
 @no_type_check
 def most(typing, a, b):
-    """The larger in each lane; b where a is NaN."""
+    """Return the larger number in each lane; b if a is NaN."""
     return coded(a, (a, b), lambda builder, x, y: most_of(builder, a.element, x, y))
 
 
 @intrinsic
 @no_type_check
 def where(typing, truth, a, b):
+    """Return a in lanes that are true, b in the others."""
     return coded(a, (truth, a, b), lambda builder, t, x, y: builder.select(t, x, y))
 
 
 @intrinsic
 @no_type_check
 def fma(typing, a, b, c):
-    """a·b + c, rounded once where the processor can; the same everywhere on one machine."""
+    """Return a·b + c, rounded once if the processor can; the result is the same everywhere on one machine."""
     kind = {types.float32: "f32", types.float64: "f64"}[a.element]
 
     def make(builder, *values):
@@ -158,7 +167,7 @@ def fma(typing, a, b, c):
 @intrinsic
 @no_type_check
 def splat(typing, number):
-    """The number in every lane."""
+    """Return a vector with the number in every lane."""
 
     def generate(context, builder, sig, values):
         vector = context.get_value_type(sig.return_type)
@@ -171,12 +180,13 @@ def splat(typing, number):
 
 @no_type_check
 def places(indices):
+    """Return a constant vector of lane indices."""
     return ir.Constant(ir.VectorType(INT32, len(indices)), indices)
 
 
 @no_type_check
 def folded(vector, combine):
-    """The one number that `combine` leaves of all lanes."""
+    """Return the number to which `combine` reduces all lanes."""
 
     def make(builder, value):
         count = vector.count
@@ -196,25 +206,28 @@ def folded(vector, combine):
 @intrinsic
 @no_type_check
 def lowest(typing, vector):
+    """Return the smallest number of all lanes."""
     return folded(vector, least_of)
 
 
 @intrinsic
 @no_type_check
 def highest(typing, vector):
+    """Return the largest number of all lanes."""
     return folded(vector, most_of)
 
 
 @intrinsic
 @no_type_check
 def total(typing, vector):
+    """Return the sum of all lanes."""
     return folded(vector, arithmetic("fadd", "add"))
 
 
 @intrinsic
 @no_type_check
 def bits(typing, truth):
-    """Lane i as bit i of an int64."""
+    """Return an int64 with lane i as bit i."""
 
     def make(builder, value):
         return builder.zext(builder.bitcast(value, ir.IntType(truth.count)), ir.IntType(64))
@@ -225,7 +238,7 @@ def bits(typing, truth):
 @intrinsic
 @no_type_check
 def mask(typing, number):
-    """The 16 lowest bits of an int64 as truth values."""
+    """Return the 16 lowest bits of an int64 as truth values."""
 
     def make(builder, value):
         return builder.bitcast(builder.trunc(value, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
@@ -236,21 +249,21 @@ def mask(typing, number):
 @intrinsic
 @no_type_check
 def first(typing, number):
-    """The lowest set bit of an int64 that is not 0."""
+    """Return the index of the lowest set bit of an int64 that is not 0."""
     return coded(types.int64, (number,), lambda builder, x: builder.cttz(x, ir.Constant(ir.IntType(1), 1)))
 
 
 @intrinsic
 @no_type_check
 def how_many(typing, number):
-    """The number of set bits."""
+    """Return the number of set bits."""
     return coded(types.int64, (number,), lambda builder, x: builder.ctpop(x))
 
 
 @intrinsic
 @no_type_check
 def whole(typing, vector):
-    """Towards zero, as int32; numbers must fit."""
+    """Return the numbers rounded towards zero, as int32; they must fit."""
     result = Lanes(types.int32, vector.count)
     return coded(result, (vector,), lambda builder, x: builder.fptosi(x, ir.VectorType(INT32, vector.count)))
 
@@ -258,13 +271,14 @@ def whole(typing, vector):
 @intrinsic
 @no_type_check
 def lane(typing, vector, index):
+    """Return the number in one lane."""
     return coded(vector.element, (vector, types.intp), lambda builder, x, i: builder.extract_element(x, i))
 
 
 @intrinsic
 @no_type_check
 def with_id(typing, vector, number):
-    """Four lanes whose last holds the bits of a whole number (int32 beside float32, int64 beside float64)."""
+    """Return four lanes whose last holds the bits of an integer (int32 beside float32, int64 beside float64)."""
     width = vector.element.bitwidth
 
     def make(builder, value, whole_number):
@@ -279,7 +293,7 @@ def with_id(typing, vector, number):
 
 @no_type_check
 def pointer(context, builder, sig, values):
-    """Where element values[1] of the 1-D contiguous array values[0] lies."""
+    """Return the address of element values[1] of the 1-D contiguous array values[0]."""
     array = context.make_array(sig.args[0])(context, builder, values[0])
     return builder.gep(array.data, [values[1]])
 
@@ -287,7 +301,7 @@ def pointer(context, builder, sig, values):
 @intrinsic
 @no_type_check
 def take(typing, array, index):
-    """One element; index ≥ 0."""
+    """Return one element; index ≥ 0."""
 
     def generate(context, builder, sig, values):
         return builder.load(pointer(context, builder, sig, values))
@@ -297,7 +311,7 @@ def take(typing, array, index):
 
 @no_type_check
 def loaded(array, stride, parts, count=LANES):
-    """`parts` vectors; part c holds elements c, c + stride, c + 2 stride, … from a start."""
+    """Return `parts` vectors; part c holds elements c, c + stride, c + 2 stride, … from a start."""
     vector = Lanes(array.dtype, count)
 
     def generate(context, builder, sig, values):
@@ -320,32 +334,36 @@ def loaded(array, stride, parts, count=LANES):
 @intrinsic
 @no_type_check
 def load(typing, array, start):
+    """Return 16 elements from a start."""
     return loaded(array, 1, 1)
 
 
 @intrinsic
 @no_type_check
 def load4(typing, array, start):
+    """Return 4 elements from a start."""
     return loaded(array, 1, 1, 4)
 
 
 @intrinsic
 @no_type_check
 def load_triples(typing, array, start):
-    """x, y, z of 16 points that lie as x y z x y z …"""
+    """Return x, y, z of 16 points that are stored as x y z x y z …"""
     return loaded(array, 3, 3)
 
 
 @intrinsic
 @no_type_check
 def load_quadruples(typing, array, start):
-    """The four parts of 16 records that lie as x y z w x y z w …"""
+    """Return the four parts of 16 records that are stored as x y z w x y z w …"""
     return loaded(array, 4, 4)
 
 
 @intrinsic
 @no_type_check
 def store(typing, array, start, vector):
+    """Write a vector to an array from a start."""
+
     def generate(context, builder, sig, values):
         address = pointer(context, builder, sig, values)
         address = builder.bitcast(address, context.get_value_type(vector).as_pointer())

@@ -1,7 +1,7 @@
-"""Packs a point cloud for search: points in the order of a space-filling curve, and boxes around every 16 of them.
+"""Packing of a cloud for search: points along a space-filling curve, and bounding boxes of every 16 of them.
 
 A packed cloud is a tree without pointers. Its leaves hold 16 points that follow each other along a Hilbert curve
-through a grid (counting sort, two passes over the points); cells that hold too many of them, since an outlier has
+through a grid (counting sort, two passes over the points). Cells that hold too many points, since an outlier has
 stretched the grid or a cluster is dense, are sorted again by a grid of their own. Every 16 leaves are a node, every 16
 nodes a node of the next level, up to a level of at most 16.
 
@@ -35,22 +35,22 @@ from framework.geometry.nearest.lanes import (
 )
 
 MODERATE = {4: (2.0**-40, 2.0**60), 8: (2.0**-40, 2.0**500)}
-"""Of the largest coordinate, by bytes of a number: squares between neither overflow nor lose digits that count."""
+"""Bounds of the largest coordinate, by bytes of a number: squares between them neither overflow nor lose precision."""
 BITS = 6
-"""At most: 2^18 cells, whose counts stay in a processor's second cache."""
+"""Largest number of bits: 2^18 cells, whose counts stay in a processor's second cache."""
 CROWD = 256
-"""Points of one cell that are sorted by a grid of their own."""
+"""Number of points above which one cell is sorted by a grid of its own."""
 FLAT = 1e-30
-"""An extent below which points count as one place: its inverse would overflow in float32."""
+"""Extent below which points count as one position: its inverse would overflow in float32."""
 
 
 class Packed(NamedTuple):
     """A packed cloud of at least one point.
 
     Attributes:
-        points: a leaf after the other: 16 x, 16 y, 16 z, 16 ids; the last point is repeated to fill the last leaf.
-        ids: the same memory read as whole numbers (int32 beside float32, int64 beside float64): the row in the cloud.
-        box: lowest x, y, z and highest x, y, z of each node; six arrays one after the other, level after level.
+        points: leaves in order: 16 x, 16 y, 16 z, 16 ids; the last point is repeated to fill the last leaf.
+        ids: the memory of `points` read as integers (int32 beside float32, int64 beside float64): the row in the cloud.
+        box: lowest x, y, z and highest x, y, z of each node; six concatenated arrays, level after level.
         low: lowest id of each node.
         levels: first node of each level in 0…7, number of nodes in 8…15, the topmost level in 16; 17 is free.
     """
@@ -63,7 +63,7 @@ class Packed(NamedTuple):
 
 
 class Bench(NamedTuple):
-    """Where packing works: key of each point, number of points in each cell (a row per thread), crowded cells."""
+    """Working memory of packing: key of each point, number of points in each cell (a row per thread), crowded cells."""
 
     key: NDArray[np.int32]
     count: NDArray[np.int32]
@@ -71,7 +71,7 @@ class Bench(NamedTuple):
 
 
 def room(points: int, dtype: np.dtype) -> Packed:
-    """Memory for a packed cloud of up to so many points."""
+    """Return memory for a packed cloud of up to so many points."""
     leaves = -(-points // LANES)
     nodes, level = 0, leaves
     while True:
@@ -86,6 +86,7 @@ def room(points: int, dtype: np.dtype) -> Packed:
 
 
 def bench(points: int, threads: int = 1) -> Bench:
+    """Return working memory for packing up to so many points."""
     cells = 8 ** cell_bits(points)
     return Bench(
         np.empty(points, np.int32),
@@ -97,7 +98,7 @@ def bench(points: int, threads: int = 1) -> Bench:
 @compiled
 @no_type_check
 def cell_bits(points):
-    """As many as leave a point or more for each cell; the cells that a surface passes through hold more."""
+    """Return the largest number of bits with at least one point per cell; cells on a surface then hold more."""
     bits = 1
     while bits < BITS and 8 ** (bits + 1) <= points:
         bits += 1
@@ -107,10 +108,10 @@ def cell_bits(points):
 @compiled
 @no_type_check
 def curve(bits):
-    """The cells of the grids of 1…bits along the Hilbert curve, one grid after the other (from (8^b - 8) / 7 on).
+    """Return the cells of the grids of 1…bits along the Hilbert curve, concatenated (from (8^b - 8) / 7 on).
 
-    Cells are numbered (x 2^b + y) 2^b + z. Skilling, Programming the Hilbert curve, 2004: his transposed index of a
-    cell, whose bits give the place along the curve.
+    Cells are numbered (x 2^b + y) 2^b + z. Source: Skilling, Programming the Hilbert curve, 2004: the bits of the
+    transposed index of a cell give the position along the curve.
     """
     cells = np.empty((8 ** (bits + 1) - 8) // 7, np.int32)
     start = 0
@@ -148,17 +149,17 @@ def curve(bits):
 @compiled
 @no_type_check
 def extent(cloud, size, box):
-    """Lowest and highest x, y, z into box (6,); False where a number is NaN or infinite."""
+    """Write the lowest and highest x, y, z to box (6,); return False if a number is NaN or infinite."""
     real = cloud.dtype.type
     low0 = splat(real(np.inf))
     low1, low2 = low0, low0
     high0 = splat(real(-np.inf))
     high1, high2 = high0, high0
     zero = splat(real(0))
-    nothing = zero  # stays 0 as long as all are finite: 0·∞ and 0·NaN are NaN
+    nothing = zero  # stays 0 if all numbers are finite: 0·∞ and 0·NaN are NaN
     blocks = size // LANES
     for block in range(blocks):
-        a = load(cloud, 48 * block)  # as x y z x …, so lane i of a, b, c is always the same axis
+        a = load(cloud, 48 * block)  # stored as x y z x …, so lane i of a, b, c is always the same axis
         b = load(cloud, 48 * block + 16)
         c = load(cloud, 48 * block + 32)
         low0, low1, low2 = least(a, low0), least(b, low1), least(c, low2)
@@ -188,14 +189,14 @@ def extent(cloud, size, box):
 @inlined
 @no_type_check
 def cells_per_unit(size, grid, real):
-    """Such that the highest coordinate falls into the last cell; 0, one cell for all, where there is no extent."""
+    """Return a factor that maps the highest coordinate to the last cell; 0, one cell for all, if there is no extent."""
     return real(grid * 0.9999) / size if size > FLAT else real(0)
 
 
 @compiled
 @no_type_check
 def histogram(cloud, box, bits, begin, end, key, count):
-    """The cell of each point from `begin`, a multiple of 16, to `end`, and how many points of these each cell has."""
+    """Write the cell of each point from `begin`, a multiple of 16, to `end`, and the number of points in each cell."""
     grid = np.int32(1 << bits)
     scale = cells_per_unit(max(box[3] - box[0], box[4] - box[1], box[5] - box[2]), grid, box.dtype.type)
     x0, y0, z0 = splat(box[0]), splat(box[1]), splat(box[2])
@@ -219,7 +220,7 @@ def histogram(cloud, box, bits, begin, end, key, count):
 @compiled
 @no_type_check
 def places(count, bits, cells, crowded):
-    """Turns the counts (threads, cells) into the place of each cell's first point; returns how many are crowded."""
+    """Replace the counts (threads, cells) by the position of each cell's first point; return how many are crowded."""
     start = (8**bits - 8) // 7
     place = np.int32(0)
     found = 0
@@ -240,7 +241,7 @@ def places(count, bits, cells, crowded):
 @compiled
 @no_type_check
 def scatter(cloud, size, begin, end, key, count, points, ids):
-    """Writes records x y z id to their places; points of a cell keep their order."""
+    """Write records x y z id to their positions; points of a cell keep their order."""
     last = min(end, size - 1)
     for i in range(begin, last):
         cell = take(key, i)
@@ -257,7 +258,7 @@ def scatter(cloud, size, begin, end, key, count, points, ids):
 @compiled
 @no_type_check
 def sort_crowded(points, crowded, found, cells):
-    """Sorts the records of crowded cells by grids of their own, and of what is crowded there."""
+    """Sort the records of crowded cells by grids of their own, and those of cells that are crowded there."""
     largest = 0
     for i in range(found):
         largest = max(largest, crowded[2 * i + 1] - crowded[2 * i])
@@ -274,7 +275,7 @@ def sort_crowded(points, crowded, found, cells):
             low, high = least(record, low), most(record, high)
         size = max(lane(high, 0) - lane(low, 0), lane(high, 1) - lane(low, 1), lane(high, 2) - lane(low, 2))
         if not size > FLAT:
-            continue  # all in one place
+            continue  # all at one position
         bits = cell_bits(end - begin)
         grid = np.int32(1 << bits)
         scale = cells_per_unit(size, grid, points.dtype.type)
@@ -306,7 +307,7 @@ def sort_crowded(points, crowded, found, cells):
 @compiled
 @no_type_check
 def box_leaves(packed, size, begin, end):
-    """Fills the last leaf, turns records into 16 x, 16 y, 16 z, 16 ids, and finds the boxes of leaves begin…end."""
+    """Fill the last leaf, turn records into 16 x, 16 y, 16 z, 16 ids, and compute the boxes of leaves begin…end."""
     points, ids, box, low, _ = packed
     nodes = box.shape[0] // 6
     for i in range(size, min(16 * end, (size + 15) // 16 * 16)):
@@ -330,7 +331,7 @@ def box_leaves(packed, size, begin, end):
 @compiled
 @no_type_check
 def box_nodes(packed, size):
-    """The boxes of all levels above the leaves."""
+    """Compute the boxes of all levels above the leaves."""
     _, _, box, low, levels = packed
     nodes = box.shape[0] // 6
     levels[0] = 0
@@ -359,7 +360,7 @@ def box_nodes(packed, size):
 @compiled
 @no_type_check
 def pack(cloud, size, box, cells, bench, packed):
-    """All of the above in one thread, where `extent` has found the box."""
+    """Pack a cloud in one thread; `extent` has computed the box."""
     bits = cell_bits(size)
     count = bench.count[:1]
     histogram(cloud, box, bits, 0, size, bench.key, count[0])

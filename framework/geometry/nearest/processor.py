@@ -1,4 +1,4 @@
-"""Finds nearest neighbours on the processor: chooses the kernel for each cloud, and the number of threads."""
+"""Nearest neighbours on the CPU: choice of the kernel for each cloud, and of the number of threads."""
 
 from functools import lru_cache
 from threading import local
@@ -33,25 +33,26 @@ from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
-"""What became of a cloud: answered; a number is not finite, in it or in its queries; to be scaled first."""
+"""Outcome of a cloud: answered; a number is not finite, in it or in its queries; must be scaled first."""
 ASKED = 17
-"""Where packed queries keep their number, among the levels."""
+"""Index in `levels` at which packed queries keep their number."""
 LARGE = 2**15
-"""Points or queries from which one cloud is worth several threads."""
+"""Number of points or queries from which one cloud is shared by several threads."""
 TURNS = 16
-"""Parts of each thread's share of the work: so little is left to one while the others have ended."""
+"""Number of parts of each thread's share of the work: one thread then has little left when the others have ended."""
 AT_ONCE = 2**24
-"""Points and queries of one call, some tenths of a second: signals are heard between calls."""
+"""Number of points and queries of one call, which takes some tenths of a second: signals are handled between calls."""
 
 
 class Problem(NamedTuple):
-    """A batch of clouds and their queries, as the kernels read it.
+    """A batch of clouds and their queries, in the form that the kernels read.
 
     Attributes:
-        clouds: (batch, 3 points); sizes (batch,).
-        queries: (batch, 3 queries), query_sizes (batch,); of no batch where all clouds share `packets`.
-        moderate: see `MODERATE`; largest: of the coordinates of shared queries.
-        distance, index, outcome: what is written; the last is one of the four above.
+        clouds: (batch, 3 points).
+        sizes: (batch,).
+        queries: (batch, 3 queries), query_sizes (batch,); with an empty batch if all clouds share `packets`.
+        moderate: see `MODERATE`; largest: largest coordinate of shared queries.
+        distance, index, outcome: outputs; the last is one of the four above.
     """
 
     clouds: Array
@@ -69,13 +70,17 @@ class Problem(NamedTuple):
 @compiled
 @no_type_check
 def worth_packing(size, packets):
-    """Measured: packing a cloud costs as much as comparing it with three packets, a search as some hundred points."""
+    """Return whether packing a cloud pays, by measurement.
+
+    Packing a cloud costs as much as comparing it with three packets, a search as much as some hundred points.
+    """
     return packets > 3 and size * packets > 8192
 
 
 @compiled
 @no_type_check
 def largest_of(box):
+    """Return the largest magnitude of a coordinate of a box."""
     largest = abs(box[0])
     for i in range(1, 6):
         largest = max(largest, abs(box[i]))
@@ -85,7 +90,7 @@ def largest_of(box):
 @compiled
 @no_type_check
 def answer(problem, begin, end, cells, work, packed, own):
-    """Clouds begin…end of a batch, one after the other."""
+    """Search clouds begin…end of a batch, one after the other."""
     shared = problem.query_sizes.shape[0] == 0
     box = np.empty(6, problem.clouds.dtype)
     for i in range(begin, end):
@@ -121,7 +126,7 @@ def answer(problem, begin, end, cells, work, packed, own):
 @compiled
 @no_type_check
 def answer_share(problem, taken, step, limit, cells, work, packed, own):
-    """What one thread answers of a batch: the next `step` clouds in turn, until it has answered `limit` or all are."""
+    """Search one thread's part of a batch: `step` clouds in turn, until it has done `limit` or none are left."""
     batch = problem.sizes.shape[0]
     answered = 0
     while answered < limit:
@@ -135,7 +140,7 @@ def answer_share(problem, taken, step, limit, cells, work, packed, own):
 @compiled
 @no_type_check
 def search_share(packed, packets, taken, step, distance, index):
-    """What one thread searches for: the next `step` packets in turn, until there are none."""
+    """Search one thread's part of the packets: `step` packets in turn, until none are left."""
     number = packets.levels[8]
     while True:
         begin = taken_from(taken, step)
@@ -147,7 +152,7 @@ def search_share(packed, packets, taken, step, distance, index):
 @compiled
 @no_type_check
 def search_all_share(cloud, size, packets, taken, step, distance, index):
-    """As above, of a cloud that was not packed."""
+    """Search one thread's part of the packets in a cloud that is not packed."""
     number = packets.levels[8]
     while True:
         begin = taken_from(taken, step)
@@ -158,11 +163,12 @@ def search_all_share(cloud, size, packets, taken, step, distance, index):
 
 @lru_cache(maxsize=BITS)
 def curves(bits: int) -> NDArray[np.int32]:
+    """Return the cells along the Hilbert curve, cached."""
     return curve(bits)
 
 
 def packed_once(points: Array) -> Packed:
-    """Queries in packets of sixteen neighbours as `pack` makes them: fast, for queries that are asked once."""
+    """Return queries in packets of sixteen neighbours by `pack`: fast, for queries that are used once."""
     size, box = len(points), np.empty(6, points.dtype)
     low, high = MODERATE[points.itemsize]
     flat = points.reshape(-1)
@@ -175,7 +181,7 @@ def packed_once(points: Array) -> Packed:
 
 
 def packed_well(points: Array) -> Packed:
-    """Queries in packets of sixteen neighbours, by halving at medians: tighter, for queries that are asked often."""
+    """Return queries in packets of sixteen neighbours, by halving at medians: tighter, for queries used often."""
     packets: list[NDArray[np.int64]] = []
     waiting = [np.arange(len(points))]
     while waiting:
@@ -204,20 +210,20 @@ UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.
 
 
 class Desks(local):
-    """Memory of each thread; a small cloud's is kept for the next call: asking for it takes as long as answering."""
+    """Working memory of each thread; that for small clouds is kept, since allocating it takes as long as the search."""
 
     def __init__(self) -> None:
         self.kept: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}
 
     def of(self, points: int, queries: int, dtype: np.dtype) -> tuple[Bench, Packed, Packed]:
-        """For clouds of up to so many points, with up to so many queries of their own."""
+        """Return memory for clouds of up to `points` points, with up to `queries` queries of their own."""
         key = points, queries, dtype
         if key in self.kept:
             return self.kept[key]
         own = room(queries, dtype) if queries else UNUSED[dtype.itemsize]
         made = bench(max(points, queries)), room(points, dtype), own
         if max(points, queries) < LARGE:
-            self.kept = {key: made}  # no more than one
+            self.kept = {key: made}  # at most one entry
         return made
 
 
@@ -225,7 +231,7 @@ DESKS = Desks()
 
 
 class Answers(NamedTuple):
-    """distance and index (batch, queries), NaN and 0 where nothing was asked; outcome (batch,), one of the four."""
+    """Distance and index (batch, queries), NaN and 0 for absent queries; outcome (batch,), one of the four."""
 
     distance: Array
     index: NDArray[np.int64]
@@ -239,9 +245,9 @@ def answers(
     query_sizes: NDArray[np.int64] | None,
     largest: float,
 ) -> Answers:
-    """Nearest points of clouds (batch, points, 3) to packed queries, or to queries (batch, queries, 3); contiguous.
+    """Return nearest points of clouds (batch, points, 3) to packed queries, or to queries (batch, queries, 3).
 
-    `largest` is of the coordinates of packed queries.
+    All arrays are contiguous. `largest` is the largest coordinate of packed queries.
     """
     batch, points, _ = clouds.shape
     shared = isinstance(queries, Packed)
@@ -275,7 +281,7 @@ def answers(
         for i in range(batch):
             solve_one(problem, i, cells, threads)
         return found
-    threads = 1 if points * asked * batch < 2**20 else min(threads, batch)  # a thread's start takes as long
+    threads = 1 if points * asked * batch < 2**20 else min(threads, batch)  # starting a thread takes as long
     limit = max(1, AT_ONCE // (points + asked))
     step = min(limit, max(1, batch // (TURNS * threads)))
     taken = np.zeros(1, np.int64)
@@ -288,12 +294,12 @@ def answers(
     try:
         POOL.run(share, threads)
     finally:
-        taken[0] = batch  # where this thread was interrupted, the others stop too
+        taken[0] = batch  # if this thread was interrupted, the others stop too
     return found
 
 
 def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
-    """One large cloud, or one with many queries, in several threads; to the bit what one thread finds."""
+    """Search one large cloud, or one with many queries, in several threads; equal to one thread to the bit."""
     cloud, size = problem.clouds[i], int(problem.sizes[i])
     box = extent_together(cloud, size, threads)
     if box is None:
@@ -322,7 +328,7 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
 
 
 def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
-    """`extent` in several threads: the box; None where a number is not finite."""
+    """Return the box of `extent`, computed in several threads; None if a number is not finite."""
     threads = max(1, min(threads, size // LARGE))
     cuts = [size * thread // threads for thread in range(threads + 1)]
     boxes, finite = np.empty((threads, 6), cloud.dtype), [False] * threads
@@ -338,7 +344,7 @@ def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
 def pack_together(
     cloud: Array, size: int, box: Array, cells: NDArray[np.int32], packed: Packed, threads: int
 ) -> None:
-    """`pack` in several threads: each counts, then scatters, its share of the points."""
+    """Pack a cloud in several threads: each counts, then scatters, its share of the points."""
     threads = max(1, min(threads, size // LARGE))
     bits, work = cell_bits(size), bench(size, threads)
     leaves = -(-size // LANES)

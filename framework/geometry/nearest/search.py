@@ -1,15 +1,15 @@
-"""Finds for each of many queries the nearest point of a packed cloud, exactly.
+"""Exact search for the nearest point of a packed cloud to each of many queries.
 
 Sixteen neighbouring queries, a leaf of the packed queries, walk through the cloud's tree together. A node is opened if
 its box is nearer to the box of the sixteen than the worst of their best distances so far; then the boxes of its
-children are compared with each query. Where few of the sixteen have business with a child they go on alone, each
-against sixteen boxes or points at a time. The sixteen before leave their nearest points as first guesses.
+children are compared with each query. If few of the sixteen need a child, they continue alone, each against sixteen
+boxes or points at a time. The nearest points of the previous sixteen are the first guesses.
 
-No slack is needed: a box's squared distance is computed by the same operations as a point's, each of which rounds
-monotonically, so that rounded it is no more than that of any point within.
+No tolerance is needed: a box's squared distance is computed by the same operations as a point's, each of which rounds
+monotonically, so that the rounded distance is no more than that of any point within.
 
-Ties go to the lowest id: a query that met its best squared distance a second time, in a point or a box, looks through
-all that is as near (`lowest_id`).
+Ties go to the lowest id: a query that met its best squared distance a second time, in a point or a box, searches all
+points that are as near (`lowest_id`).
 """
 
 from typing import no_type_check
@@ -38,27 +38,28 @@ from framework.geometry.nearest.lanes import (
 )
 
 ALONE = 3
-"""Up to so many of sixteen queries go on alone into a node; measured, as the next."""
+"""Largest number of sixteen queries that continue alone into a node; measured, like `ALONE_IN_LEAF`."""
 ALONE_IN_LEAF = 8
 
 
 @inlined
 @no_type_check
 def squared(x, y, z):
+    """Return the squared length of x, y, z."""
     return fma(z, z, fma(y, y, x * x))
 
 
 @inlined
 @no_type_check
 def beside(low, high, query_low, query_high, zero):
-    """How far two intervals are apart, 0 where they meet."""
+    """Return the distance of two intervals, 0 if they meet."""
     return most(zero, most(low - query_high, query_low - high))
 
 
 @inlined
 @no_type_check
 def to_boxes(box, nodes, start, low, high, zero):
-    """Squared distances of the boxes of 16 nodes from one box."""
+    """Return squared distances of the boxes of 16 nodes from one box."""
     return squared(
         beside(load(box, start), load(box, 3 * nodes + start), low[0], high[0], zero),
         beside(load(box, nodes + start), load(box, 4 * nodes + start), low[1], high[1], zero),
@@ -69,7 +70,7 @@ def to_boxes(box, nodes, start, low, high, zero):
 @inlined
 @no_type_check
 def to_box(box, nodes, node, query, zero):
-    """Squared distances of one node's box from 16 queries."""
+    """Return squared distances of one node's box from 16 queries."""
     return squared(
         beside(splat(take(box, node)), splat(take(box, 3 * nodes + node)), query[0], query[0], zero),
         beside(splat(take(box, nodes + node)), splat(take(box, 4 * nodes + node)), query[1], query[1], zero),
@@ -82,7 +83,7 @@ def to_box(box, nodes, node, query, zero):
 @inlined
 @no_type_check
 def to_point(points, at, query):
-    """Squared distances of 16 queries from the point whose x stands at `at`."""
+    """Return squared distances of 16 queries from the point whose x is stored at `at`."""
     return squared(
         splat(take(points, at)) - query[0],
         splat(take(points, at + 16)) - query[1],
@@ -93,7 +94,7 @@ def to_point(points, at, query):
 @inlined
 @no_type_check
 def to_leaf(points, leaf, x, y, z):
-    """Squared distances of a leaf's 16 points from one query."""
+    """Return squared distances of a leaf's 16 points from one query."""
     at = 64 * leaf
     return squared(load(points, at) - x, load(points, at + 16) - y, load(points, at + 32) - z)
 
@@ -101,14 +102,14 @@ def to_leaf(points, leaf, x, y, z):
 @inlined
 @no_type_check
 def children(level, node, levels):
-    """First child of a node of the level above, and a bit for each child."""
+    """Return the first child of a node of the level above, and a bit for each child."""
     return levels[level] + 16 * node, (1 << min(16, levels[8 + level] - 16 * node)) - 1
 
 
 @inlined
 @no_type_check
 def nearest_bit(open_, gaps, at):
-    """Which of the open children is nearest, and how near; `gaps` of the 16 from `at` on."""
+    """Return which of the open children is nearest, and its distance; `gaps` holds those of the 16 from `at` on."""
     gap = where(mask(open_), load(gaps, at), splat(gaps.dtype.type(np.inf)))
     nearest = lowest(gap)
     return first(bits(gap == splat(nearest)) & open_), nearest
@@ -117,7 +118,10 @@ def nearest_bit(open_, gaps, at):
 @compiled
 @no_type_check
 def alone(packed, level, node, query, best, leaf, opened, gaps):
-    """One query below a node of the level above; best squared distance, its leaf, whether it may be met twice."""
+    """Search for one query below a node; return best squared distance, its leaf, and whether it may occur twice.
+
+    The node is of the level above `level`.
+    """
     points, _, box, _, levels = packed
     nodes = box.shape[0] // 6
     zero = splat(box.dtype.type(0))
@@ -157,7 +161,7 @@ def alone(packed, level, node, query, best, leaf, opened, gaps):
 @compiled
 @no_type_check
 def lowest_id(packed, x, y, z, best, number):
-    """The lowest id, `number` or below, of the points at squared distance `best`, the least."""
+    """Return the lowest id, at most `number`, of the points at squared distance `best`, the smallest."""
     points, ids, box, low, levels = packed
     nodes = box.shape[0] // 6
     zero = splat(box.dtype.type(0))
@@ -188,7 +192,7 @@ def lowest_id(packed, x, y, z, best, number):
 @inlined
 @no_type_check
 def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at):
-    """Compares children with each query and keeps the squared distances; a bit for each child that may hold a best."""
+    """Store the squared distances of children from each query; return a bit for each child to be searched."""
     zero = splat(box.dtype.type(0))
     close = bits(to_boxes(box, nodes, start, low, high, zero) <= splat(worst)) & valid
     kept = 0
@@ -204,7 +208,7 @@ def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at)
 @compiled
 @no_type_check
 def search(packed, packets, begin, end, distance, index):
-    """Distance and index of the nearest point for the queries of packets begin…end, at the places of their ids."""
+    """Write distance and index of the nearest points to the queries of packets begin…end, by the queries' ids."""
     points, ids, box, _, levels = packed
     real = box.dtype.type
     nodes = box.shape[0] // 6
@@ -234,7 +238,7 @@ def search(packed, packets, begin, end, distance, index):
             gap = to_point(points, (guess[i] >> 4) * 64 + (guess[i] & 15), query)
             leaf = where(gap < best, splat(np.int32(guess[i] >> 4)), leaf)
             best = least(gap, best)
-        tie = best < zero  # nobody
+        tie = best < zero  # False in every lane
         ties = 0
         worst = highest(best)
         level = top = levels[16]
@@ -300,7 +304,7 @@ def search(packed, packets, begin, end, distance, index):
                         gap = where(mask(np.int64(1) << i), splat(one), gap)
                 this = splat(np.int32(node))
                 tie = tie | ((gap == best) & (leaf != this))
-                leaf = where(gap < best, this, leaf)  # no branch: whether it is nearer cannot be foreseen
+                leaf = where(gap < best, this, leaf)  # no branch, since it could not be predicted
                 best = least(gap, best)
             worst = highest(best)
         ties |= bits(tie)
@@ -322,7 +326,10 @@ def search(packed, packets, begin, end, distance, index):
 @compiled
 @no_type_check
 def search_all(cloud, size, packets, begin, end, distance, index):
-    """As `search`, comparing every query with every point of a cloud as it came: for small clouds or few queries."""
+    """Write the results of `search` by comparing every query with every point of an unpacked cloud.
+
+    This is for small clouds or few queries.
+    """
     queries = packets.points
     blocks = (size + 15) // 16
     tail = np.empty(48, cloud.dtype)  # the last block, filled with its last point

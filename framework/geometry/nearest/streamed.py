@@ -1,4 +1,4 @@
-"""Finds nearest neighbours in clouds larger than memory: points come in chunks of any size, one after the other.
+"""Nearest neighbours in clouds larger than memory: points come in chunks of any size, one after the other.
 
     middle = Middle()                       # first reading
     for chunk in chunks(): middle.add(chunk)
@@ -7,7 +7,7 @@
     stream = Stream(queries)                # third
     for chunk in chunks(): stream.add(normal(chunk, middle.mean, reach.norm))
 
-A chunk is a cloud (points, columns): x, y, z, then attributes. Memory holds one chunk and what was found so far.
+A chunk is a cloud (points, columns): x, y, z, then attributes. Memory holds one chunk and the results so far.
 """
 
 from typing import NamedTuple
@@ -24,8 +24,8 @@ class Streamed(NamedTuple):
     """The nearest point of each query.
 
     Attributes:
-        distance, index: as `framework.geometry.nearest.Nearest` has them; the index counts over all chunks.
-        point: that point, with all its columns.
+        distance, index: as in `framework.geometry.nearest.Nearest`; the index counts over all chunks.
+        point: the nearest point, with all its columns.
     """
 
     distance: Float[Tensor, "query"]
@@ -34,16 +34,20 @@ class Streamed(NamedTuple):
 
 
 class Stream:
-    """The nearest points among all chunks so far: on one device to the bit what `nearest` finds in all at once."""
+    """The nearest points among all chunks so far: on one device equal to those of `nearest` on all points, to the bit."""
 
     def __init__(self, queries: Float[Tensor, "query 3"] | Queries) -> None:
-        # copies, here and below: whoever reads a large cloud fills one buffer again and again
+        # copies, here and below: a reader of a large cloud may fill one buffer again and again
         self.queries = queries if isinstance(queries, Queries) else prepare(queries.clone())
         self.count = 0
         self.best: Streamed | None = None
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
-        """DataError as `nearest`, or where the columns are not those of the chunk before; nothing changes then."""
+        """Search one more chunk.
+
+        Raises:
+            DataError: as `nearest`, or the columns are not those of the chunk before; nothing changes then.
+        """
         chunk = chunk.detach()
         if len(chunk) == 0:
             return
@@ -66,10 +70,10 @@ class Stream:
     def nearer(
         self, distance: Float[Tensor, "query"], points: Float[Tensor, "query 3"]
     ) -> Bool[Tensor, "query"]:
-        """Which points are nearer than the best so far; at a tie none, so that the lower index stays."""
+        """Return which points are nearer than the best so far; none at a tie, so that the lower index stays."""
         assert self.best is not None
         nearer = distance < self.best.distance
-        # squared distances that differ may have the same root, and it is by them that `nearest` decides
+        # squared distances that differ may have the same root, and `nearest` compares the squares
         same = (distance == self.best.distance).nonzero().flatten()
         if len(same):
             both = torch.stack([self.best.point[same, :3], points[same]], 1)
@@ -77,7 +81,11 @@ class Stream:
         return nearer
 
     def result(self) -> Streamed:
-        """Of the chunks so far; DataError where none had a point."""
+        """Return the nearest points among the chunks so far.
+
+        Raises:
+            DataError: no chunk had a point.
+        """
         if self.best is None:
             raise DataError("A stream of chunks held no point; wanted one at least. Leave out what is empty.")
         return Streamed(*(tensor.clone() for tensor in self.best))
@@ -91,6 +99,7 @@ class Middle:
         self.first = self.sum = torch.zeros(3, dtype=torch.float64)
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
+        """Add the points of a chunk."""
         points = finite(chunk)
         if len(points) == 0:
             return
@@ -99,22 +108,24 @@ class Middle:
             self.sum = torch.zeros_like(self.first)
         self.sum = self.sum + (points - self.first).sum(
             0
-        )  # about the first: keeps the digits of what is far from 0
+        )  # relative to the first point: clouds far from 0 keep their digits
         self.count += len(points)
 
     @property
     def mean(self) -> Float[Tensor, "3"]:
+        """Mean of the points, (3,)."""
         return self.first + self.sum / max(1, self.count)
 
 
 class Reach:
-    """The largest distance from a centre of all points so far, in float64; 1 where all points are at the centre."""
+    """The largest distance from a centre of all points so far, in float64; 1 if all points are at the centre."""
 
     def __init__(self, centre: Float[Tensor, "3"]) -> None:
         self.centre = centre.detach().double().clone()
         self.largest = 0.0
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
+        """Add the points of a chunk."""
         points = finite(chunk)
         if len(points):
             self.largest = max(
@@ -123,11 +134,16 @@ class Reach:
 
     @property
     def norm(self) -> float:
+        """Largest distance from the centre, or 1."""
         return self.largest or 1.0
 
 
 def finite(chunk: Tensor) -> Float[Tensor, "points 3"]:
-    """Coordinates in float64; DataError where one is NaN or infinite."""
+    """Return coordinates in float64.
+
+    Raises:
+        DataError: one is NaN or infinite.
+    """
     points = chunk.detach()[:, :3].double()
     bad = (~points.isfinite().all(1)).nonzero()
     if len(bad):
@@ -141,6 +157,6 @@ def finite(chunk: Tensor) -> Float[Tensor, "points 3"]:
 def normal(
     chunk: Float[Tensor, "points columns"], centre: Tensor, scale: float
 ) -> Float[Tensor, "points columns"]:
-    """The chunk less the centre, then divided by the scale (eq. 6.2); in its dtype, attributes as they are."""
+    """Return the chunk less the centre, divided by the scale (eq. 6.2); in its dtype, with attributes unchanged."""
     points = (chunk[:, :3].double() - centre) / scale
     return torch.cat([points.to(chunk.dtype), chunk[:, 3:]], 1)
