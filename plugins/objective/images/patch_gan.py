@@ -92,7 +92,7 @@ class PatchGAN(Objective):
         lead: tuple[int, ...],
         of_true: tuple[int, ...],
     ) -> Float[Tensor, "*lead"]:
-        """Return the mean distance of features over all layers but the last and all scales (Wang et al. 2018, eq. 4)."""
+        """Return the mean feature distance over all scales and all layers but the last (Wang et al. 2018, eq. 4)."""
         found = []
         for one, other in zip(false, true, strict=True):
             for ours, theirs in zip(one[:-1], other[:-1], strict=True):

@@ -20,7 +20,7 @@ from framework.uncertainty import Uncertainty
 from plugins.uncertainty.scaling.likelihood import Term, minimise, total
 
 GRID = 17
-"""Number of temperatures tried before the fit, which starts at the best: mixtures may have several likelihood maxima."""
+"""Number of temperatures tried before the fit, which starts at the best, since mixtures may have several maxima."""
 _log = logging.getLogger(__name__)
 
 
