@@ -34,7 +34,7 @@ class Streamed(NamedTuple):
 
 
 class Stream:
-    """The nearest points among all chunks so far: on one device equal to those of `nearest` on all points, to the bit."""
+    """The nearest points among all chunks so far; on one device they equal those of `nearest` to the bit."""
 
     def __init__(self, queries: Float[Tensor, "query 3"] | Queries) -> None:
         # copies, here and below: a reader of a large cloud may fill one buffer again and again

@@ -41,18 +41,22 @@ class BernoulliImage(Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
+        """Support of the density."""
         return constraints.independent(constraints.boolean, 3)
 
     @property
     def mean(self) -> Tensor:
+        """Probability of 1 of each number."""
         return self.logits.sigmoid()
 
     @property
     def mode(self) -> Tensor:
+        """Most likely image: 1 where that is at least as likely as 0."""
         return (self.logits >= 0).to(self.logits)
 
     @property
     def variance(self) -> Tensor:
+        """Variance of each number."""
         return self.logits.sigmoid() * (-self.logits).sigmoid()
 
     def each_log_prob(self, value: Tensor) -> Tensor:
@@ -61,13 +65,16 @@ class BernoulliImage(Distribution):
         return share * logsigmoid(self.logits) + (1 - share) * logsigmoid(-self.logits)
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-probability, nats, (*sample, *batch)."""
         return self.each_log_prob(value).sum((-3, -2, -1))
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        """Return samples, (*sample, *batch, *event)."""
         with torch.no_grad():
             return self.mean.expand(torch.Size(sample_shape) + self.logits.shape).bernoulli()
 
     def entropy(self) -> Tensor:
+        """Return the entropy, nats, (*batch)."""
         # -p log p - q log q = log(1 + e^-|r|) + |r| / (1 + e^|r|)
         size = self.logits.abs()
         return (size * (-size).sigmoid() - logsigmoid(size)).sum((-3, -2, -1))

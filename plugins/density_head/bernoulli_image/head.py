@@ -55,15 +55,18 @@ class BernoulliImageHead(DensityHead):
         require_state(self, factor=(LEAST / 2, 2 * MOST))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> BernoulliImage:
+        """Return the density for raw parameters."""
         logits = self._logits(raw)
         return BernoulliImage(logits * self.factor.to(logits))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the mean cross-entropy of the numbers of each image, nats per number."""
         # without the calibrated factor, so that the loss does not change with calibration
         return -BernoulliImage(self._logits(raw)).each_log_prob(target).mean((-3, -2, -1))
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Fit the factor of log-odds by maximum likelihood."""
         # the log-likelihood is concave in the factor, so that its derivative has a single zero
         if len(raw) == 0:
             raise ValueError("the factor of log-odds is fitted to validation data, but got none of it.")

@@ -33,13 +33,15 @@ class CategoricalHead(DensityHead):
         self.size = len(target.names)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Categorical:
+        """Return the density for raw parameters."""
         return classes(require_finite(raw, self.size))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the cross-entropy of each sample, nats."""
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""
 
 
 class BernoulliHead(DensityHead):
@@ -67,15 +69,17 @@ class BernoulliHead(DensityHead):
         self.size = 1
 
     def forward(self, raw: Float[Tensor, "*batch 1"]) -> Categorical:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         # the softmax of (0, r) is the logistic of r (eq. 2.11)
         return classes(torch.cat([torch.zeros_like(raw), raw], -1))
 
     def loss(self, raw: Float[Tensor, "*batch 1"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the binary cross-entropy of each sample, nats."""
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch 1"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""
 
 
 def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:

@@ -131,6 +131,7 @@ class BallisticHead(DensityHead, Fitted):
             self.noise.copy_((left.median() / 0.6745).clamp(LEAST_NOISE, MOST_NOISE))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         flat = raw.detach().reshape(math.prod(raw.shape[:-1]), self.size)
         seen = seen_of(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
@@ -140,6 +141,7 @@ class BallisticHead(DensityHead, Fitted):
         return build(seen, estimate, raw, (raw * 0).sum(-1, keepdim=True))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats."""
         return -self(raw).log_prob(target)
 
     @torch.no_grad()

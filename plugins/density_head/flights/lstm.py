@@ -63,6 +63,7 @@ class LSTMHead(DensityHead):
         self.out = nn.Linear(hidden, 6)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         flat = (
             raw.reshape(math.prod(raw.shape[:-1]), self.size)
@@ -106,7 +107,8 @@ class LSTMHead(DensityHead):
         return move + 0.1 * numbers[:, :3], width, (hidden, memory)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats."""
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""

@@ -1,0 +1,1 @@
+"""The Gaussian density of real numbers, and its head."""

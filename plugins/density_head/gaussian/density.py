@@ -57,14 +57,17 @@ class Gaussian(Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
+        """Support of the density."""
         return constraints.real_vector
 
     @property
     def mean(self) -> Tensor:
+        """Mean of each number."""
         return self.location
 
     @property
     def mode(self) -> Tensor:
+        """Value of highest density, which is the mean."""
         return self.location
 
     @property
@@ -112,6 +115,7 @@ class Gaussian(Distribution):
         return numbers
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, nats, (*sample, *batch)."""
         residual = value - self.location
         if self.coefficients is not None:
             residual = residual - _times(self.coefficients, residual)
@@ -119,6 +123,7 @@ class Gaussian(Distribution):
         return -(standard.square() / 2 + self.scale.log() + math.log(2 * math.pi) / 2).sum(-1)
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        """Return samples, (*sample, *batch, *event), differentiable in the parameters."""
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         noise = torch.randn(shape, dtype=self.scale.dtype, device=self.scale.device) * self.scale
         if self.coefficients is not None:
@@ -126,6 +131,7 @@ class Gaussian(Distribution):
         return self.location + noise
 
     def entropy(self) -> Tensor:
+        """Return the entropy, nats, (*batch)."""
         return (self.scale.log() + (1 + math.log(2 * math.pi)) / 2).sum(-1)
 
 

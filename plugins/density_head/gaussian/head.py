@@ -80,6 +80,7 @@ class GaussianHead(DensityHead):
             require_state(self, scale=(0.99 * floor, WIDEST_SCALE), coefficients=coefficient)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Gaussian:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         mean = self._mean(raw)
         if not self.predicted:
@@ -91,6 +92,7 @@ class GaussianHead(DensityHead):
         return Gaussian(*self.unit.given_back(mean, scale, coefficients))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats; with a fixed scale that for σ = 1."""
         if self.predicted:
             return -self(raw).log_prob(target)
         # σ = 1, whatever was calibrated. Few passes over the numbers, since there may be very many.
@@ -101,6 +103,7 @@ class GaussianHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Fit a fixed covariance by maximum likelihood; do nothing if it is predicted."""
         if self.predicted:
             return
         if len(raw) == 0:

@@ -72,6 +72,7 @@ class HybridHead(DensityHead):
         )
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         numbers, location, scale = self._read(raw)
         return Moved(self.component(numbers), location, scale)
 
@@ -98,4 +99,4 @@ class HybridHead(DensityHead):
         return numbers, mean - scale * location.to(mean), scale
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""

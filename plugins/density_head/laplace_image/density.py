@@ -45,18 +45,22 @@ class LaplaceImage(Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
+        """Support of the density."""
         return constraints.independent(constraints.real, 3)
 
     @property
     def mean(self) -> Tensor:
+        """Mean of each number."""
         return self.location
 
     @property
     def mode(self) -> Tensor:
+        """Image of highest density, which is the location."""
         return self.location
 
     @property
     def variance(self) -> Tensor:
+        """Variance of each number."""
         return 2 * self.scale.square()
 
     def each_log_prob(self, value: Tensor) -> Tensor:
@@ -64,15 +68,18 @@ class LaplaceImage(Distribution):
         return -((value - self.location).abs() / self.scale + (2 * self.scale).log())
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, nats, (*sample, *batch)."""
         return self.each_log_prob(value).sum((-3, -2, -1))
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        """Return samples, (*sample, *batch, *event), differentiable in the parameters."""
         shape = torch.Size(sample_shape) + self.location.shape
         # the difference of two exponential draws is a Laplace draw, without the logarithm of a rounded 0
         drawn = self.location.new_empty(2, *shape).exponential_()
         return self.location + self.scale * (drawn[0] - drawn[1])
 
     def entropy(self) -> Tensor:
+        """Return the entropy, nats, (*batch)."""
         return (1 + math.log(2) + self.scale.log()).sum((-3, -2, -1))
 
 

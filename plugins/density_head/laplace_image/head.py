@@ -92,10 +92,12 @@ class LaplaceImageHead(DensityHead):
         require_state(self, factor=(SMALLEST_SCALE, LARGEST_SCALE))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> LaplaceImage:
+        """Return the density for raw parameters."""
         location, scale = self._parts(raw)
         return LaplaceImage(location, (scale * self.factor.to(scale)).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the weighted mean negative log-density of the numbers of each image, nats per number."""
         # without the calibrated factor, so that the loss does not change with calibration
         density = LaplaceImage(*self._parts(raw))
         each = -density.each_log_prob(target)
@@ -109,6 +111,7 @@ class LaplaceImageHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Fit the factor of the scales to the validation split."""
         if len(raw) == 0:
             raise ValueError(
                 "the scale of an image's numbers is fitted to validation data, but got none of it."

@@ -41,6 +41,7 @@ class Gaussian:
         return self.mean + self.log_scale.exp() * noise
 
     def log_prob(self, z: Tensor) -> Tensor:
+        """Return the log-density of z, nats, (*sample, *batch)."""
         return self.log_prob_at((z - self.mean) * torch.exp(-self.log_scale))
 
     def log_prob_at(self, noise: Tensor) -> Tensor:
@@ -79,16 +80,20 @@ class Networks(Latent):
 
     @property
     def center(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Mean of the prior, (*batch, latent)."""
         return self.prior.mean
 
     def numbers(self, noise: Tensor) -> Tensor:
+        """Return the component's raw parameters at z of the noise, (*batch, sample, number)."""
         z = self.prior.at(noise.reshape(len(noise), *self.center.shape))
         return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
+        """Return the log of the importance weights, nats (eq. 3.19)."""
         return importance_log_weights(self.rows(items), value, noise)
 
     def sample(self, count: int) -> Tensor:
+        """Return `count` values of each item, each with a new z."""
         step = self.at_once(count)
         parts = [
             self.component(self.decode(self.prior.draw(min(step, count - done)))).sample()
@@ -97,6 +102,7 @@ class Networks(Latent):
         return torch.cat(parts)
 
     def tempered(self, temperature: Tensor) -> "Networks":
+        """Return a copy with tempered components."""
         return replace(
             self,
             component=lambda raw: tempered(self.component(raw), temperature),
@@ -187,14 +193,16 @@ class CVAEHead(DensityHead):
             self.backbones = parts
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> LatentDensity:
+        """Return the density for raw parameters."""
         effort = Effort(self.training_samples) if self.training else Effort(self.samples, self.tolerance)
         return LatentDensity(self.networks(raw), effort)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative evidence lower bound of each sample, nats (eq. 3.18)."""
         return -evidence_bound(self.networks(raw), target, self.training_samples)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""
 
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
         """Return prior, encoder and decoder, given the features."""

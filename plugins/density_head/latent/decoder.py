@@ -40,6 +40,7 @@ class LatentDecoder(nn.Module):
     def forward(
         self, raw: Float[Tensor, "*#batch size"], z: Float[Tensor, "*#batch latent"]
     ) -> Float[Tensor, "*batch numbers"]:
+        """Return the component's raw parameters, (*batch, numbers), for each z."""
         raw = raw.to(z.dtype).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
         features, shared, turned = raw.split(self.parts, -1)
         spread = self.spread + turned.unflatten(-1, self.spread.shape)

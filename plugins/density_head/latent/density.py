@@ -26,7 +26,7 @@ from plugins.density_head.latent.monte_carlo import (
 CHUNK = 2**22
 """Largest number of hidden activations held at once without gradient (16 MiB in float32)."""
 MODERATE = {"name": "von_mises", "floor": 1.0}
-"""Settings of a component that cannot become uniform alone: several together can, and each keeps learning a direction."""
+"""Settings of a component that cannot become uniform alone: several together can, and each still learns a direction."""
 
 
 class Latent(ABC):
@@ -74,6 +74,7 @@ class Latent(ABC):
 
     @property
     def items(self) -> int:
+        """Number of items of the flattened batch."""
         return self.center.shape[:-1].numel()
 
     def full_precision(self) -> torch.autocast:
@@ -127,6 +128,7 @@ class LatentDensity(Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
+        """Support of the density."""
         return self._example.support  # pyright: ignore[reportReturnType]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
@@ -140,10 +142,12 @@ class LatentDensity(Distribution):
             return sampled_mixture(self.latent, self._mixture_points, self._fixed)
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, nats, (*sample, *batch)."""
         return estimate(self, value).log_mean
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        """Return samples, (*sample, *batch, *event)."""
         shape = torch.Size(sample_shape)
         if shape.numel() == 0 or self.batch_shape.numel() == 0:
             return self._example.sample(shape)
@@ -153,9 +157,11 @@ class LatentDensity(Distribution):
 
     @property
     def mode(self) -> Tensor:
+        """Value of highest density of `mixture`."""
         return self.mixture.mode
 
     def entropy(self) -> Tensor:
+        """Return the entropy of `mixture`, nats, (*batch)."""
         return self.mixture.entropy()
 
 

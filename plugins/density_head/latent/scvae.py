@@ -42,6 +42,7 @@ class Networks(Latent):
     size: int
 
     def numbers(self, noise: Tensor) -> Tensor:
+        """Return the component's raw parameters at z of the noise, (*batch, sample, number)."""
         return self._decoded(noise.movedim(0, 1).reshape(*self.raw.shape[:-1], len(noise), noise.shape[-1]))
 
     def _decoded(self, z: Float[Tensor, "*batch sample latent"]) -> Float[Tensor, "*batch sample number"]:
@@ -49,15 +50,18 @@ class Networks(Latent):
         return torch.cat([self.decode(raw, part) for part in z.split(self.at_once(z.shape[-2]), -2)], -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
+        """Return the component's log-density at each z, nats (eq. 3.21)."""
         raw = self.raw.reshape(-1, self.raw.shape[-1])[items]
         return self.component(self.decode(raw, noise)).log_prob(value)
 
     def sample(self, count: int) -> Tensor:
+        """Return `count` values of each item, each with a new z."""
         like = self.center
         z = torch.randn(*like.shape[:-1], count, like.shape[-1], dtype=like.dtype, device=like.device)
         return self.component(self._decoded(z)).sample().movedim(like.dim() - 1, 0)
 
     def tempered(self, temperature: Tensor) -> "Networks":
+        """Return a copy with tempered components."""
         return replace(self, component=lambda raw: tempered(self.component(raw), temperature))
 
 
@@ -108,6 +112,7 @@ class SCVAEHead(DensityHead):
         self.size = self.decoder.size
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         kind = self.decoder.from_latent.weight.dtype
         if self.training:
@@ -131,7 +136,8 @@ class SCVAEHead(DensityHead):
         return self.decoder(raw.unsqueeze(-2), z)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats (eq. 3.22)."""
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""

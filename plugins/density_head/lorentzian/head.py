@@ -67,6 +67,7 @@ class LorentzianHead(DensityHead, Fitted):
         """Do nothing, since each spectrum is fitted on its own."""
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         found = fit(raw.reshape(-1, self.size), self.offsets, self.wanted, most=self.steps)
         zero = (raw * 0).sum(-1, keepdim=True)
@@ -74,6 +75,7 @@ class LorentzianHead(DensityHead, Fitted):
         return density(found, self.wanted.told, raw.shape[:-1], zero)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats."""
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:

@@ -14,7 +14,7 @@ from framework.heads.parameters import require_finite, require_trained
 from framework.target import Target
 
 MODERATE = {"name": "von_mises", "floor": 1.0}
-"""Settings of a component that cannot become uniform alone: several together can, and each keeps learning a direction."""
+"""Settings of a component that cannot become uniform alone: several together can, and each still learns a direction."""
 
 
 class MixtureHead(DensityHead):
@@ -55,6 +55,7 @@ class MixtureHead(DensityHead):
             self.spread = nn.Parameter(torch.randn(components, component.size))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Mixture:
+        """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         own = self.components * self.component.size
         logits, apart, common = raw.tensor_split([self.components, self.components + own], -1)
@@ -67,7 +68,8 @@ class MixtureHead(DensityHead):
         return Mixture(logits, self.component(numbers))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats."""
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""

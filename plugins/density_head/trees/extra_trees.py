@@ -107,6 +107,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         load_any_shape(self, ExtraTreesHead._require, ExtraTreesHead._open)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        """Grow the trees from all training samples."""
         from plugins.density_head.trees.growing import (
             grown,
         )  # scikit-learn, which a stored forest does not need
@@ -131,6 +132,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         self._open()
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         raw = require_fitted(raw, self.size, by="density_head extra_trees")
         batch = raw.shape[:-1]
         root = self.root[: max(1, self.trees)]
@@ -150,10 +152,12 @@ class ExtraTreesHead(DensityHead, Fitted):
         return Mixture(means.new_zeros(means.shape[:-1]), components)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats."""
         return -self(raw).log_prob(target)
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Fit the widths by maximum likelihood; do nothing for classes."""
         if self.classes:
             return
         if len(raw) == 0:

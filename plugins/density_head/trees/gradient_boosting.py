@@ -113,6 +113,7 @@ class XGBoostHead(DensityHead, Fitted):
         load_any_shape(self, XGBoostHead._require, XGBoostHead._open)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
+        """Grow the trees from all training samples."""
         options: dict[str, Any] = {
             **self.options,
             "seed": seed % 2**31,
@@ -132,6 +133,7 @@ class XGBoostHead(DensityHead, Fitted):
             self._measure_width(features, target)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         raw = require_fitted(raw, self.size, by="density_head xgboost")
         sums = self._sums(raw.reshape(-1, self.size)).to(raw).reshape(*raw.shape[:-1], self.numbers)
         sums = with_gradient_of_0(sums, raw)
@@ -141,10 +143,12 @@ class XGBoostHead(DensityHead, Fitted):
         return IndependentNormals(mean, scale)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats."""
         return -self(raw).log_prob(target)
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Set the standard deviations to those of the residuals; do nothing for classes."""
         if self.classes:
             return
         if len(raw) == 0:

@@ -1,0 +1,1 @@
+"""A uniform floor under another head's density."""

@@ -52,16 +52,20 @@ class Floored(Distribution):
 
     @property
     def support(self) -> constraints.Constraint | None:
+        """Support of the density."""
         return self.density.support
 
     @property
     def mode(self) -> Tensor:
+        """Value of highest density, which is that of p."""
         return self.density.mode
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
+        """Return every class, as the density p does."""
         return self.density.enumerate_support(expand)
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, nats, (*sample, *batch)."""
         return self.floored(value, self.density.log_prob(value))[0]
 
     def floored(self, value: Tensor, log_prob: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,6 +76,7 @@ class Floored(Distribution):
 
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        """Return samples, (*sample, *batch, *event)."""
         drawn = self.density.sample(torch.Size(sample_shape))
         below = self.floor.sample(torch.Size(sample_shape)).to(drawn.dtype)
         chance = torch.rand(drawn.shape[: drawn.dim() - len(self.event_shape)], device=drawn.device)

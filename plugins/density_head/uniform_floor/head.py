@@ -60,10 +60,12 @@ class UniformFloorHead(DensityHead):
         self._law(torch.zeros(1, self.size))  # raises here if there is no uniform density
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
+        """Return the density for raw parameters."""
         density = self.component(raw)
         return Floored(density, self.weight) if self.weight > 0 else density
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the component's loss with the floor added, nats."""
         if self.weight == 0:
             return self.component.loss(raw, target)
         # the loss of a variational component is a bound; the floor is added to it as to a density
@@ -77,4 +79,4 @@ class UniformFloorHead(DensityHead):
             return uniform(self.component(raw))
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        """Do nothing, since all parameters are trained."""

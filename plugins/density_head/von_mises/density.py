@@ -60,6 +60,7 @@ class VonMises(Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
+        """Support of the density."""
         return circular
 
     @property
@@ -69,16 +70,20 @@ class VonMises(Distribution):
 
     @property
     def mode(self) -> Tensor:
+        """Angles of highest density, which are the mean directions."""
         return self.location
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density, nats, (*sample, *batch)."""
         return functions.log_prob(value, self.location, self.concentration).sum(-1)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+        """Return samples, (*sample, *batch, *event)."""
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
         return functions.sample(self.location.expand(shape), self.concentration.expand(shape))
 
     def entropy(self) -> Tensor:
+        """Return the entropy, nats, (*batch)."""
         return functions.entropy(self.concentration).sum(-1)
 
 

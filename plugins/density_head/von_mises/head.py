@@ -72,6 +72,7 @@ class VonMisesHead(DensityHead):
             require_state(self, concentration=FROM_0)
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> VonMises:
+        """Return the density for raw parameters."""
         number = self._per_angle(raw)
         mean, length = polar(number[..., 0], number[..., 1])
         if self.predicted:
@@ -80,6 +81,7 @@ class VonMisesHead(DensityHead):
         return VonMises(mean, self.concentration.to(mean).expand_as(mean))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
+        """Return the negative log-likelihood of each sample, nats; with a fixed concentration that for κ = 1."""
         density = self(raw)
         if not self.predicted:  # the cosine loss does not change with calibration
             density = VonMises(density.mean, torch.ones_like(density.mean))
@@ -87,6 +89,7 @@ class VonMisesHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
+        """Fit a fixed concentration by maximum likelihood; do nothing if it is predicted."""
         if self.predicted:
             return
         if len(raw) == 0:

@@ -1,0 +1,1 @@
+"""Basis point sets as an encoder of point clouds."""

@@ -1,0 +1,1 @@
+"""An encoder that chooses a fixed number of points of each cloud."""

@@ -53,6 +53,7 @@ class Adversarial(Objective):
         self.epsilon = epsilon
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        """Return the weighted penalty of a batch."""
         inputs = as_floats(batch["input"], predictor)
         # x' is not part of the training distribution, so that it must not enter the running moments
         with flagged(predictor, BATCH_NORM, "track_running_stats", False):

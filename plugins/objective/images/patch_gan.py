@@ -57,6 +57,7 @@ class PatchGAN(Objective):
         self.rival = Rival(learning_rate=learning_rate, schedule=schedule)
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        """Return the weighted penalty of a batch."""
         images, wanted = predicted_images(predictor, batch)
         lead = images.shape[:-3]
         false = images.reshape(-1, *images.shape[-3:]).movedim(-1, 1)

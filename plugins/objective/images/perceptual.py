@@ -44,6 +44,7 @@ class FeatureDistance(Objective):
         """Name of the distance in the journal."""
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        """Return the weighted penalty of a batch."""
         images, true = predicted_images(predictor, batch)
         lead = images.shape[:-3]
         found = self.network(images.reshape(-1, *images.shape[-3:]).movedim(-1, 1))
@@ -123,6 +124,7 @@ class Perceptual(FeatureDistance):
 
     @property
     def term(self) -> str:
+        """Name of the distance in the journal."""
         return "perceptual"
 
 
@@ -159,4 +161,5 @@ class RandomFeatures(FeatureDistance):
 
     @property
     def term(self) -> str:
+        """Name of the distance in the journal."""
         return "random_features"

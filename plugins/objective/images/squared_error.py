@@ -37,6 +37,7 @@ class SquaredError(Objective):
         self.weight = weight
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        """Return the weighted penalty of a batch."""
         images, true = predicted_images(predictor, batch)
         mean = each_alone((images - true).square().mean((-3, -2, -1))).sum() / max(1, len(images))
         self.told = {"squared_error": mean.detach()}

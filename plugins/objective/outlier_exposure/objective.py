@@ -86,6 +86,7 @@ class OutlierExposure(Objective):
             self.split = outliers.splits().train
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
+        """Return the weighted penalty of a batch."""
         inputs = batch["input"]
         count = rows_each(predictor, len(inputs)) if self.count is None else self.count
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)

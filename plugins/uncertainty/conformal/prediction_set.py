@@ -223,6 +223,7 @@ class PredictionSet(Mixture, ValueSet):
         return self._ends.intervals
 
     def parts(self) -> list[list[int]] | list[list[tuple[float, float]]] | None:
+        """Return the labels or the intervals of each set; None for several numbers."""
         if self._classes:
             labels = self.labels().reshape(-1, len(self._log_labels))
             return [row.nonzero().flatten().tolist() for row in labels]

@@ -95,15 +95,19 @@ class Conformal(Uncertainty):
         require_state(self, threshold=(-math.inf, math.inf))
 
     def forward(self, inputs: Tensor) -> PredictionSet:
+        """Return the density for each input with its prediction set."""
         return PredictionSet(self.model(inputs), self.threshold, self.score, 1 - self.miscoverage)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the wrapped model's loss of each sample, nats."""
         return self.model.loss(inputs, target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the wrapped model's densities in training."""
         return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the wrapped model on one half of the batches, and fit the threshold to the other."""
         theirs, mine = halves(repeatable(batches, by="conformal"))
         if not mine:
             raise UserError(

@@ -63,6 +63,7 @@ class Ensemble(Uncertainty, Joining, Several):
             self.apart.extend(built)
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the mixture of the densities of the members in use."""
         if not 1 <= self.members <= self.trained:
             raise ConfigError(
                 f"members = {self.members} of an ensemble of {self.trained}: wanted a number from 1 to {self.trained}."
@@ -77,6 +78,7 @@ class Ensemble(Uncertainty, Joining, Several):
         return equal_mixture(components, self, inputs.device)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the loss of each sample, nats, such that each member trains as it would alone."""
         if self.own_batches:
             return of_its_own(self._own_losses(inputs, target), self.trained)
         if self.together is None:
@@ -111,12 +113,14 @@ class Ensemble(Uncertainty, Joining, Several):
         return self.together.own(inputs.unflatten(0, (self.trained, -1)))
 
     def clip_each(self, most: float) -> None:
+        """Shorten each member's gradient to the norm `most`."""
         for member in self.apart:
             nn.utils.clip_grad_norm_(member.parameters(), most)
         if self.together is not None:
             self.together.clip_each(most, list(self.heads) if len(self.heads) > 1 else [])
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the members' densities in training, batch_shape (batch, member), or (batch,) for one."""
         if self.together is not None:
             own = self.own_batches
             return self._densities(self._own_raw(inputs).movedim(0, 1) if own else self.together(inputs))
@@ -126,6 +130,7 @@ class Ensemble(Uncertainty, Joining, Several):
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate each member."""
         seen = list(batches)
         if self.together is None:
             for member in self._apart():
@@ -138,9 +143,11 @@ class Ensemble(Uncertainty, Joining, Several):
 
     @classmethod
     def parameters_of(cls, count: int) -> dict[str, Any]:
+        """Return the constructor arguments of an ensemble of `count` members."""
         return {"members": count}
 
     def join(self, members: Sequence[Predictor]) -> None:
+        """Copy the state of separately trained members into this ensemble."""
         if len(members) != self.trained:
             raise ConfigError(
                 f"an ensemble of {self.trained} was given {len(members)} members; wanted as many."

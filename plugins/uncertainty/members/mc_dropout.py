@@ -78,6 +78,7 @@ class MCDropout(Uncertainty):
             )
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the density in training, and the mixture over dropout masks in evaluation."""
         if self.training:
             return self.model(inputs)
         if self.samples < 1:
@@ -87,12 +88,15 @@ class MCDropout(Uncertainty):
         return equal_mixture(components, self.model, inputs.device)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the wrapped model's loss of each sample, nats."""
         return self.model.loss(inputs, target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the wrapped model's densities in training."""
         return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the wrapped model."""
         self.model.calibrate(batches)
 
     def _components(self, inputs: Tensor) -> Distribution:

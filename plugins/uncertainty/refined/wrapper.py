@@ -61,6 +61,7 @@ class Refined(Uncertainty):
         self.register_buffer("offsets", torch.tensor(offsets_of(offsets), dtype=torch.float64), False)
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the density of the fit that starts from the wrapped model's prediction."""
         start = self.model(inputs)
         if self.steps == 0:
             return start
@@ -77,10 +78,13 @@ class Refined(Uncertainty):
         return density(found, wanted.told, start.batch_shape, zero)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the wrapped model's loss of each sample, nats."""
         return self.model.loss(inputs, target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the wrapped model's densities in training."""
         return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the wrapped model."""
         self.model.calibrate(batches)

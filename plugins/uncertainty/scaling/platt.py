@@ -73,6 +73,7 @@ class Platt(Uncertainty):
         require_state(self, slope=(0.0, STEEPEST), biases=FINITE)
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the rescaled class probabilities for each input."""
         density = self.model(inputs)
         if self.slope == 1 and not self.biases.any():
             return density
@@ -81,12 +82,15 @@ class Platt(Uncertainty):
         return RescaledClasses(logits.log_softmax(-1).to(log_prob.dtype), density, self.slope)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the wrapped model's loss of each sample, nats."""
         return self.model.loss(inputs, target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the wrapped model's densities in training."""
         return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the wrapped model, then fit slope and biases."""
         seen = repeatable(batches, by="platt")
         self.model.calibrate(seen)
         found = densities(self.model, seen)

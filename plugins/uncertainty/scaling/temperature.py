@@ -68,15 +68,19 @@ class Temperature(Uncertainty):
         require_state(self, temperature=(lower, upper))
 
     def forward(self, inputs: Tensor) -> Distribution:
+        """Return the tempered density for each input."""
         return temper(self.model(inputs), self.temperature)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
+        """Return the wrapped model's loss of each sample, nats."""
         return self.model.loss(inputs, target)
 
     def training_densities(self, inputs: Tensor) -> Distribution:
+        """Return the wrapped model's densities in training."""
         return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
+        """Calibrate the wrapped model, then fit the temperature."""
         seen = repeatable(batches, by="temperature")
         self.model.calibrate(seen)
         found = fit(densities(self.model, seen), seen, self.lower, self.upper)
