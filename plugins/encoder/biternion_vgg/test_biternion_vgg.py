@@ -9,7 +9,7 @@ from plugins.encoder.biternion_vgg.encoder import BiternionVGG
 
 
 def by_hand(encoder, images):
-    """Beyer's layers in NumPy and SciPy, with ReLU before the pooling, one image at a time."""
+    """Return the output of Beyer's layers in NumPy and SciPy, with ReLU before the pooling, image by image."""
     state = {name: value.double().numpy() for name, value in encoder.state_dict().items()}
     convolutions = sorted({int(name.split(".")[1]) for name in state if name.endswith("running_var")})
     rows = []
@@ -44,7 +44,7 @@ def test_agrees_with_numpy(shape, channels):
     torch.manual_seed(0)
     config = resolve("encoder", {"name": "biternion_vgg", "channels": channels, "features": 20})
     encoder = build("encoder", config, input_shape=shape)
-    encoder(torch.rand(8, *shape) * 2 - 1)  # gives the running moments something to hold
+    encoder(torch.rand(8, *shape) * 2 - 1)  # moves the running moments away from their initial values
     images = torch.rand(2, *shape)
     found = encoder.eval()(images)
     assert found.shape == (2, 20)

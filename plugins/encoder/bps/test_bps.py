@@ -31,13 +31,13 @@ def batch_of(lengths, columns=3, dtype=torch.float64):
 
 
 def by_hand(cloud, points):
-    """Distance, delta and index of the nearest point of one normalised cloud, a loop over everything (eq. 6.4-6.5)."""
+    """Return distance, delta and index of the nearest point of one normalised cloud, by loops (eq. 6.4-6.5)."""
     found = []
     for place in points:
         best, index = math.inf, -1
         for number, point in enumerate(cloud[:, :3]):
             distance = math.dist(place, point)
-            if distance < best:  # so that the first of equally near ones stays
+            if distance < best:  # so that the first of equally near points stays
                 best, index = distance, number
         found.append((best, cloud[index, :3] - place, index))
     distances, deltas, indices = zip(*found, strict=True)
@@ -113,7 +113,7 @@ def test_exactly_as_many_points_of_a_lattice_lie_in_the_ball(strategy, count):
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
     distance[np.diag_indices(count)] = math.inf
     edge = distance.min()
-    # whoever is a step away in the ball is there too, so that none was left out
+    # every lattice point one step away in the ball is there too, so that none was left out
     for move in MOVES[strategy]:
         for sign in (1, -1):
             for other in points + sign * edge * np.array(move):
@@ -154,7 +154,7 @@ def test_features_agree_with_loops(strategy, normalise, dtype):
 coordinate = st.floats(-1, 1, width=32)
 WILD = st.one_of(
     st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=20),
-    st.integers(1, 20).map(lambda count: [(0.3, -0.2, 0.7)] * count),  # all in one place
+    st.integers(1, 20).map(lambda count: [(0.3, -0.2, 0.7)] * count),  # all at one position
     st.lists(coordinate, min_size=1, max_size=20).map(
         lambda along: [(t, 2 * t, -t) for t in along]
     ),  # on a line
@@ -179,7 +179,7 @@ def test_wild_clouds(cloud, scale, offset, strategy, count, normalise, dtype):
     found = encode(clouds, prepared(points), ["distance", "delta"], normalise)
     local = normalised(clouds, normalise).clouds[0].double().numpy()
     distance, _, _ = by_hand(local, points.double().numpy())
-    size = max(1.0, np.abs(local).max())  # of far outliers
+    size = max(1.0, np.abs(local).max())  # the largest norm with far outliers
     limit = 2.5e-7 if dtype == torch.float32 else 1e-14
     np.testing.assert_allclose(found.features["distance"][0].numpy(), distance, rtol=0, atol=limit * size)
     length = found.features["delta"][0].double().norm(dim=-1).numpy()
@@ -235,7 +235,7 @@ def test_gradients_agree_with_finite_differences(normalise, rotation_invariant):
 
 @pytest.mark.parametrize("cloud", [torch.ones(1, 5, 3), torch.tensor([[[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]])])
 def test_gradients_of_degenerate_clouds_are_finite(cloud):
-    made = prepared(torch.zeros(1, 3))  # a basis point on a point, besides
+    made = prepared(torch.zeros(1, 3))  # the basis point coincides with a point
     clouds = cloud.clone().requires_grad_()
     found = encode(clouds, made, ["distance", "delta"], rotation_invariant=True)
     channels(found).sum().backward()
@@ -291,7 +291,7 @@ def test_single_points_are_joined_with_their_cloud_and_do_not_depend_on_its_plac
 
 
 def turned(cloud, seed):
-    """A rotation of coordinates and normals."""
+    """Return rotated coordinates and normals."""
     turn = torch.from_numpy(Rotation.random(rng=seed).as_matrix()).to(cloud.dtype)
     return torch.cat([cloud[..., :3] @ turn, cloud[..., 3:6], cloud[..., 6:9] @ turn, cloud[..., 9:]], -1)
 
@@ -309,7 +309,7 @@ def test_a_rotation_changes_nothing_where_that_is_asked_for(dtype):
     wanted = invariant(clouds, made)
     for seed in range(5):
         found = invariant(turned(clouds, seed), made)
-        # where another point has become the nearest, by rounding, all but the distance jumps
+        # if rounding makes another point the nearest, all features except the distance jump
         same = (found - wanted).abs().amax(1) <= (1e-5 if dtype == torch.float32 else 1e-12)
         assert same.double().mean() > (0.995 if dtype == torch.float32 else 1 - 1e-9)
         torch.testing.assert_close(
@@ -341,14 +341,14 @@ def test_a_mirrored_cloud_is_another():
 
 
 def shape(name, seed=0):
-    """300 points of which no axis has a mirror plane but where the name says so."""
+    """Return 300 points without a mirror plane, unless the name says otherwise."""
     cloud = (numbers(300, 3, seed=seed).abs() - 0.3) * torch.tensor([3.0, 2, 1], dtype=torch.float64)
     kind, _, thickness = name.partition(" ")
     if kind in ("bar", "even bar"):
         cloud[:, 1:] = 0
     if kind == "sheet":
         cloud[:, 2] *= float(thickness or 0)
-    if kind == "tilted":  # in a plane that is not one of the axes', as rounding then tells
+    if kind == "tilted":  # in a plane that is not along the axes, so that rounding matters
         cloud[:, 2] = 0.3 * cloud[:, 0] - 0.7 * cloud[:, 1]
     for axis in (0,) if kind.startswith("even") else (0, 1) if kind == "twice-even" else ():
         cloud = torch.cat([cloud, cloud * (1 - 2.0 * torch.eye(3, dtype=torch.float64)[axis])])
@@ -357,7 +357,7 @@ def shape(name, seed=0):
     return cloud
 
 
-# what is flat ends at a thickness of 3e-5: below, an even sheet's upper side may be its lower
+# flat means thinner than 3e-5: the two sides of a thinner even sheet are not told apart
 FLAT = ["sheet", "sheet 1e-9", "sheet 1e-7", "sheet 1e-6", "tilted", "bar"]
 EVEN = [
     "even-bar",
@@ -388,7 +388,7 @@ def test_no_rotation_of_any_shape_changes_its_code(name, seed, dtype):
 
 
 def copies(group, count, stretch=(1.0, 1.0, 1.0), mirrored=False):
-    """Points that nothing distinguishes but for a symmetry group of rotations, and x → -x where that is asked for."""
+    """Return points that only a symmetry group of rotations maps to each other, and x → -x if requested."""
     points = (numbers(count, 3).abs() - 0.3) * torch.tensor(stretch, dtype=torch.float64)
     turns = torch.from_numpy(Rotation.create_group(group).as_matrix())
     cloud = torch.cat([points @ turn.T for turn in turns])
@@ -396,7 +396,7 @@ def copies(group, count, stretch=(1.0, 1.0, 1.0), mirrored=False):
 
 
 def lattice(stretch):
-    """A ball of lattice points, stretched to an ellipsoid."""
+    """Return a ball of lattice points, stretched to an ellipsoid."""
     axis = torch.linspace(-1, 1, 9, dtype=torch.float64)
     points = torch.cartesian_prod(axis, axis, axis)
     return points[points.norm(dim=1) <= 1 + 1e-9] * torch.tensor(stretch, dtype=torch.float64)
@@ -427,7 +427,7 @@ SYMMETRIC = {
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", SYMMETRIC)
 def test_symmetric_clouds_have_one_code_whatever_their_rotation(name, dtype):
-    """Where second or third moments determine no axes; and whatever the order of the points."""
+    """Check clouds whose second or third moments determine no axes, with points in any order."""
     cloud = SYMMETRIC[name]
     turned = torch.cat([cloud[None], cloud @ rotations(30, 1)]).to(dtype)
     order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))
@@ -451,7 +451,7 @@ def test_a_mirror_image_is_another_shape_where_no_rotation_leads_to_it(name):
         if name in THICK and not name.startswith("even"):
             thickness = float(name.partition(" ")[2] or 1)
             assert (one - other).abs().max() > 0.05 * thickness
-        else:  # up to its thickness, which is at most 1e-6 of what is flat
+        else:  # up to the thickness, which is at most 1e-6 of the extent of a flat cloud
             torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
 
 
@@ -461,7 +461,7 @@ def test_a_mirror_image_is_another_shape_where_no_rotation_leads_to_it(name):
 @pytest.mark.parametrize("norm", [0.1, 0.99, 1.0, 1.01, 1.5, 1.8])
 @pytest.mark.parametrize("far", [0, 20])
 def test_a_cloud_that_was_normalised_before_has_a_frame_whatever_its_norms(far, norm, radius, name, dtype):
-    """From a shell, whose points are all beyond 1 or all within, to one with outliers that a robust one left there."""
+    """Check normalised clouds from a shell, with all points beyond 1 or all within, to one with outliers."""
     cloud = shape(name)
     cloud = cloud * norm * radius / cloud.norm(dim=1, keepdim=True)
     outliers = torch.tensor([[1e3, -2e3, 5e3]], dtype=torch.float64).expand(far, 3)
@@ -471,7 +471,9 @@ def test_a_cloud_that_was_normalised_before_has_a_frame_whatever_its_norms(far, 
     found = encode(clouds, made, normalise="none", rotation_invariant=True)
     assert found.frame is not None
     lengths = (clouds[:, :300].double() @ found.frame).square().sum(1)
-    assert (lengths.diff(dim=1) <= 1e-6 * lengths[:, :1]).all()  # the longest axis first, of the shell alone
+    assert (
+        lengths.diff(dim=1) <= 1e-6 * lengths[:, :1]
+    ).all()  # the longest axis of the shell alone is first
     distance = found.features["distance"]
     limit = (1e-5 if dtype == torch.float32 else 1e-10) * radius
     torch.testing.assert_close(distance, distance[:1].expand_as(distance), rtol=0, atol=limit)
@@ -484,7 +486,7 @@ def test_frames_have_derivatives_of_second_order(name):
     clouds = (0.99 * clouds).requires_grad_()
     sign = frame(clouds.detach())
 
-    def axes(clouds):  # of a mirror plane the sign is noise's
+    def axes(clouds):  # noise decides the sign normal to a mirror plane
         found = frame(clouds)
         return found * (found.detach() * sign).sum(1, keepdim=True).sign()
 
@@ -557,7 +559,7 @@ def test_a_basis_is_prepared_once_and_anew_when_its_numbers_change_in_place():
     clouds, made = batch_of([30]), encoder(points=16)
     first = made(clouds)
     assert made.prepared() is made.prepared()
-    made.basis.data.mul_(0.5)  # unseen by autograd's count of changes
+    made.basis.data.mul_(0.5)  # autograd's version counter does not see this change
     halved = encoder(points=16, radius=0.5)(clouds)
     torch.testing.assert_close(made(clouds), halved, rtol=0, atol=1e-6)
     assert not torch.equal(made(clouds), first)

@@ -8,7 +8,7 @@ from plugins.encoder.dense_blocks.encoder import DenseBlocks
 
 
 def by_hand(encoder, inputs):
-    """The blocks in NumPy, float64: linear, (x - mean) / √(var + ε), ReLU; then input and output side by side."""
+    """Return the blocks in NumPy, float64: linear, (x - mean) / √(var + ε), ReLU, concatenated to the input."""
     numbers = inputs.reshape(len(inputs), -1).astype(np.float64)
     for block in encoder.blocks:
         inner = numbers
@@ -35,7 +35,9 @@ def test_agrees_with_numpy(shape, blocks, layers, batch_norm, bottleneck, dtype,
     config = {"blocks": blocks, "layers": layers, "width": 12, "bottleneck": bottleneck}
     part = resolve("encoder", {"name": "dense_blocks", "batch_norm": batch_norm, "dropout": 0.3, **config})
     encoder = build("encoder", part, input_shape=shape).to(dtype)
-    encoder(torch.randn(50, *shape, dtype=dtype) * 3 + 1)  # gives the running moments something to hold
+    encoder(
+        torch.randn(50, *shape, dtype=dtype) * 3 + 1
+    )  # moves the running moments away from their initial values
     inputs = torch.randn(6, *shape, dtype=dtype)
     found = encoder.eval()(inputs)
     assert found.shape == (6, *encoder.output_shape)

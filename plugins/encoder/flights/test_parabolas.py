@@ -1,4 +1,4 @@
-"""Parabolas through the last frames against NumPy's weighted least squares."""
+"""Tests of parabolas through the last frames against NumPy's weighted least squares."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from plugins.encoder.flights.parabolas_compiled import parabolas
 
 
 def test_parabolas_are_those_of_weighted_least_squares() -> None:
-    """With noise, holes, outliers and a bounce; each step by NumPy's solver."""
+    """Compare with NumPy's solver for each step, with noise, missing frames, outliers and a bounce."""
     generator = np.random.default_rng(0)
     frames, noise, spans = 20, 0.003, np.array([20, 14, 10, 7])
     times = 0.016 * (np.arange(frames) - frames + 1) + generator.uniform(-1e-3, 1e-3, (30, frames))

@@ -1,4 +1,4 @@
-"""What occupancy and truncated distances have in common."""
+"""Tests of what occupancy and truncated distances have in common."""
 
 import pytest
 import torch

@@ -25,7 +25,7 @@ def batch_of(lengths, columns=3, dtype=torch.float64):
 
 
 def by_hand(cloud, side):
-    """A loop over points: the number of the cell, lower faces included, and at the last also the upper."""
+    """Return the occupancy by a loop over points: lower faces included, and the upper face of the last cell too."""
     flags = np.zeros((side, side, side))
     for point in cloud:
         place = [math.floor((x + 1) / 2 * side) for x in point]

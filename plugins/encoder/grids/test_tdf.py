@@ -25,7 +25,7 @@ def batch_of(lengths, columns=3, dtype=torch.float64):
 
 
 def by_hand(cloud, side, truncation):
-    """Every cell's distance from every point, cut off (§6.5.1)."""
+    """Return every cell's truncated distance from the points, by all pairs (§6.5.1)."""
     limit = truncation * 2 / side
     axis = [-1 + (2 * number + 1) / side for number in range(side)]
     centres = np.array([[x, y, z] for x in axis for y in axis for z in axis])
@@ -48,7 +48,7 @@ def test_agrees_with_a_loop(side, truncation, dtype):
         wanted = by_hand(local[number, :length], side, truncation)
         limit = (
             1e-5 if dtype == torch.float32 else 1e-12
-        )  # as a share of the truncation, of which cells have many
+        )  # as a share of the truncation, which is many cells wide
         np.testing.assert_allclose(found[number].flatten().numpy(), wanted, rtol=0, atol=limit)
 
 

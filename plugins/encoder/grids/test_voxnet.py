@@ -14,7 +14,7 @@ def encoder(shape, **config):
 
 
 def convolved(grid, kernel, bias, stride, padding):
-    """Correlation by SciPy, one filter at a time; of stride 2 every second cell."""
+    """Return the correlation by SciPy, one filter at a time; every second cell for stride 2."""
     grid = np.pad(grid, [(0, 0)] + [(padding, padding)] * 3)
     found = np.stack([correlate(grid, filters, "valid", method="direct")[0] for filters in kernel])
     return found[:, ::stride, ::stride, ::stride] + bias[:, None, None, None]
@@ -27,7 +27,7 @@ def pooled(grid):
 
 
 def by_hand(made, grid):
-    """The layers in NumPy and SciPy, one grid, float64."""
+    """Return the output of the layers in NumPy and SciPy for one grid, float64."""
     grid = grid.astype(np.float64)
     for layer in made.convolutions:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
@@ -62,7 +62,9 @@ def by_hand(made, grid):
 )
 def test_agrees_with_scipy(shape, config):
     made = encoder(shape, **config).double()
-    made(torch.randn(6, *shape, dtype=torch.float64) + 0.5)  # gives the running moments something to hold
+    made(
+        torch.randn(6, *shape, dtype=torch.float64) + 0.5
+    )  # moves the running moments away from their initial values
     with torch.no_grad():
         for parameter in made.parameters():
             parameter.add_(0.05)
@@ -76,7 +78,7 @@ def test_agrees_with_scipy(shape, config):
 
 
 def parameters(made, classes=40):
-    """With the last linear layer, as tables count them."""
+    """Return the number of parameters with the last linear layer, as tables count them."""
     count = sum(parameter.numel() for parameter in made.parameters())
     return count + (made.output_shape[0] + 1) * classes
 

@@ -12,7 +12,7 @@ from plugins.encoder.inception_resnet_v2.layers import ConvNorm, Residual, mixed
 
 
 def known(state):
-    """Weights that depend on their names' order and shapes alone."""
+    """Return weights that depend on the order of their names and on their shapes alone."""
     generator, found = np.random.default_rng(0), {}
     for name in sorted(state):
         shape = tuple(state[name].shape)
@@ -34,7 +34,7 @@ def known(state):
 
 @pytest.fixture(scope="module")
 def encoder():
-    """One for all tests that change nothing: building it takes a second."""
+    """Return one encoder for all tests that change nothing: building it takes a second."""
     torch.manual_seed(0)
     return build("encoder", resolve("encoder", "inception_resnet_v2"), input_shape=(3, 107, 75)).eval()
 
@@ -42,7 +42,7 @@ def encoder():
 def test_names_and_shapes_are_timms(encoder):
     state = encoder.state_dict()
     text = "\n".join(f"{name} {tuple(tensor.shape)}" for name, tensor in sorted(state.items()))
-    # of timm 1.0.31's inception_resnet_v2 without classif.*, computed from that package
+    # computed from timm 1.0.31's inception_resnet_v2 without classif.*
     assert (
         hashlib.sha256(text.encode()).hexdigest()
         == "b89cce2f5e335169473effef31dffea2f11dc7e368e9a39fe5b6b8c2eef27b5f"

@@ -8,7 +8,7 @@ from plugins.encoder.mlp.encoder import MLP
 
 
 def by_hand(encoder, inputs):
-    """The layers in NumPy: linear, (x - mean) / √(var + ε) with the running moments, ReLU."""
+    """Return the layers in NumPy: linear, (x - mean) / √(var + ε) with the running moments, ReLU."""
     state = {name: value.double().numpy() for name, value in encoder.state_dict().items()}
     numbers = inputs.reshape(len(inputs), -1).astype(np.float64)
     for index, layer in enumerate(encoder.layers):
@@ -36,7 +36,7 @@ def test_agrees_with_numpy(shape, widths, batch_norm, activation, units):
     kinds = [type(layer).__name__ for layer in encoder.layers]
     order = {False: [units], True: ["BatchNorm1d", units], "after_relu": [units, "BatchNorm1d"]}[batch_norm]
     assert kinds == ["Linear", *order, "Dropout"] * len(widths)
-    encoder(torch.randn(50, *shape) * 3 + 1)  # gives the running moments something to hold
+    encoder(torch.randn(50, *shape) * 3 + 1)  # moves the running moments away from their initial values
     inputs = torch.randn(6, *shape)
     found = encoder.eval()(inputs)
     assert found.shape == (6, *encoder.output_shape)
@@ -65,7 +65,7 @@ def test_dropout_acts_in_training_alone(dropout):
 
 
 def test_each_layer_has_its_dropout():
-    """Thesis §6.5.3: 0.8 and 0.4."""
+    """Check the probabilities of thesis §6.5.3: 0.8 and 0.4."""
     encoder = MLP((4,), widths=[3, 2], dropout=[0.8, 0.4])
     assert [layer.p for layer in encoder.layers if isinstance(layer, torch.nn.Dropout)] == [0.8, 0.4]
     with pytest.raises(ConfigError, match="3 probabilities for 2 layers"):

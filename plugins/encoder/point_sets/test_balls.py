@@ -1,4 +1,4 @@
-"""Points within balls against a loop over all pairs."""
+"""Tests of points within balls against a loop over all pairs."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from plugins.encoder.point_sets.balls import within
 
 CLOUD = st.lists(st.tuples(*[st.sampled_from([-1.5, -0.5, 0.0, 0.5, 1.0])] * 3), min_size=1, max_size=12)
-"""Clouds of equal points, and of distances that are the radius."""
+"""Clouds with equal points, and with distances equal to the radius."""
 
 
 def by_hand(clouds, centroids, radius, most):

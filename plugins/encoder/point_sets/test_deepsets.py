@@ -18,7 +18,7 @@ def encoder(shape=(50, 3), **config):
 
 
 def by_hand(made, cloud, activation):
-    """One cloud (points, columns) point by point in NumPy, float64, normalised as eq. 6.2."""
+    """Return the features of one cloud (points, columns) by loops in NumPy, float64, normalised as eq. 6.2."""
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()

@@ -1,4 +1,4 @@
-"""Points of clouds one after the other, and the largest numbers over each, against loops over clouds."""
+"""Tests of the concatenated points of clouds, and of maxima over each, against loops over clouds."""
 
 import pytest
 import torch

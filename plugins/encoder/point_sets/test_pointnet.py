@@ -15,12 +15,12 @@ SMALL = {"point_widths": [8, 10, 8, 12], "widths": [12, 8], "dropout": 0.0}
 def encoder(shape=(50, 3), **config):
     torch.manual_seed(0)
     made = build("encoder", resolve("encoder", {"name": "pointnet", **SMALL, **config}), input_shape=shape)
-    made(torch.randn(12, *shape))  # gives the running moments something to hold
+    made(torch.randn(12, *shape))  # moves the running moments away from their initial values
     return made.eval()
 
 
 def passed(layers, numbers):
-    """Linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
+    """Return linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
     for layer in layers:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
         if isinstance(layer, torch.nn.Linear):
@@ -40,7 +40,7 @@ def matrix(made, points):
 
 
 def by_hand(made, cloud):
-    """One cloud (points, columns) in NumPy, float64, normalised as eq. 6.2."""
+    """Return the features of one cloud (points, columns) in NumPy, float64, normalised as eq. 6.2."""
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()

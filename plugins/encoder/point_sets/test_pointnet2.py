@@ -20,12 +20,12 @@ BALLS = {  # radius, neighbours of each scale of each level, in SMALL's units; Q
 def encoder(shape=(150, 3), **config):
     torch.manual_seed(0)
     made = build("encoder", resolve("encoder", {"name": "pointnet2", **SMALL, **config}), input_shape=shape)
-    made(torch.randn(6, *shape) / 3)  # gives the running moments something to hold
+    made(torch.randn(6, *shape) / 3)  # moves the running moments away from their initial values
     return made.eval()
 
 
 def passed(layers, numbers):
-    """Linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
+    """Return linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
     for layer in layers:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
         if isinstance(layer, torch.nn.Linear):
@@ -39,7 +39,7 @@ def passed(layers, numbers):
 
 
 def spread(places, start):
-    """The order in which each is as far as can be from those before it, all distances anew at each step."""
+    """Return an order in which each point is as far as possible from those before it, by all distances."""
     order = [start]
     while len(order) < len(places):
         distance = np.linalg.norm(places[:, None] - places[order], axis=-1).min(1)
@@ -49,7 +49,7 @@ def spread(places, start):
 
 
 def by_hand(made, cloud, balls):
-    """One cloud (points, columns) ball by ball in NumPy, float64, normalised as eq. 6.2."""
+    """Return the features of one cloud (points, columns) ball by ball in NumPy, float64, normalised as eq. 6.2."""
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
@@ -105,7 +105,7 @@ def test_agrees_with_numpy_on_clouds_of_any_size(grouping, columns, config):
     ],
 )
 def test_parameters_of_the_published_networks(grouping, chains, total, megabytes):
-    """Of the two the multi-scale one has Table 6.2's parameters; Table 6.3's 5.8 MB are nearer to the other."""
+    """Check that the multi-scale network has Table 6.2's parameters; Table 6.3's 5.8 MB are nearer the other's."""
     made = PointNet2((1024, 3), grouping=grouping)
     weights = sum(before * after for chain in chains for before, after in itertools.pairwise(chain))
     moments = sum(sum(chain[1:]) for chain in chains)
@@ -156,7 +156,7 @@ def test_of_a_lattice_the_order_decides_and_padding_does_not(grouping):
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
 @pytest.mark.parametrize("number", [5, 19, 150])
 def test_points_that_all_come_twice_change_nothing(grouping, number):
-    """They come last, and only fill what would be filled anyway."""
+    """Check duplicated points, which come last in the order and only fill places that would be filled anyway."""
     made = encoder((300, 3), grouping=grouping).double()
     cloud = torch.randn(number, 3, dtype=torch.float64)
     twice = torch.cat([cloud, cloud[torch.randperm(number)]])

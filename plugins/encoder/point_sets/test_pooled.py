@@ -1,4 +1,4 @@
-"""The largest numbers over each cloud without those of every point, against those of every point."""
+"""Tests of maxima over each cloud without the outputs of every point, against those of every point."""
 
 import copy
 
@@ -16,7 +16,7 @@ NUMBERS = {"even": (70, 70, 70), "uneven": (90, 1, 150, 40), "one": (80,)}
 
 
 def network(columns=5, channels=24, dtype=torch.float64):
-    """Norms whose factors have both signs and whose running moments hold something."""
+    """Return a network whose norms have factors of both signs and moved running moments."""
     torch.manual_seed(0)
     made = layers(columns, [6, channels]).to(dtype)
     for layer in made:
@@ -32,7 +32,7 @@ def plain(made, values, counts):
 
 
 def outcome(function, made, values, counts):
-    """Value, gradients of the inputs and of all parameters, and what the norms have come to hold."""
+    """Return the value, gradients of the inputs and of all parameters, and the norms' buffers afterwards."""
     made, values = copy.deepcopy(made), values.clone().requires_grad_()
     found = function(made, values, counts)
     (found * torch.arange(1.0, found.numel() + 1, dtype=found.dtype).view_as(found).cos()).sum().backward()
@@ -71,7 +71,7 @@ def test_momentum_of_a_cumulative_average_and_norms_without_running_moments():
 
 
 def test_a_variance_that_the_covariance_does_not_show_is_taken_from_every_point():
-    """A channel that sees the small difference of two large numbers; float32."""
+    """Check a channel that reads the small difference of two large numbers, in float32."""
     torch.manual_seed(0)
     made = layers(2, [8])
     with torch.no_grad():
@@ -119,7 +119,7 @@ def test_rows_that_attain_the_largest_product():
 
 @pytest.mark.parametrize("config", [{"variant": "full"}, {"variant": "vanilla"}], ids=str)
 def test_pointnet_learns_what_it_would_from_every_point(config, monkeypatch):
-    """Gradients of a whole network in training, with clouds of any size; none passes `attaining` in vain."""
+    """Compare gradients of a whole network in training with and without the shortcut, for clouds of any size."""
     torch.manual_seed(0)
     made = PointNet((300, 3), point_widths=[8, 8, 8, 32], widths=[12, 8], dropout=0.0, **config).double()
     clouds = torch.randn(6, 300, 3, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Projected points against a loop over points in plain Python, exact fractions, and the framework's camera."""
+"""Tests of projected points against a loop over points, exact fractions, and the framework's camera."""
 
 import math
 from fractions import Fraction
@@ -30,7 +30,7 @@ def encoder(shape=(40, 6), columns=(), **config):
 
 
 def every_way(clouds: Tensor, view: View) -> list[Tensor]:
-    """In one compiled pass, by an index for the gradient, and in plain torch."""
+    """Return the results of one compiled pass, of an index for the gradient, and of plain torch."""
     return [
         project(clouds, view),
         project(clouds.clone().requires_grad_(), view).detach(),
@@ -39,7 +39,7 @@ def every_way(clouds: Tensor, view: View) -> list[Tensor]:
 
 
 def by_hand(cloud: list[list[float]], view: View, kind: type) -> np.ndarray:
-    """Each point of each level apart, with the camera of that level: its places are u' = (u + 1/2) / 2^level - 1/2."""
+    """Project each point of each level on its own, with that level's camera: u' = (u + 1/2) / 2^level - 1/2."""
     nearest, farthest = view.limits
     picture = np.ones((4 * view.levels, view.height, view.width), kind)
     for level in range(view.levels):
@@ -65,11 +65,11 @@ DEPTHS = [2.0] * 24 + [2.0 + 1e-12] * 12 + [1.0, 3.7, 4.999999, 5.0, 0.999999, 0
 DEPTHS += [-3e38, math.nan, math.inf, -math.inf]
 STRAY = [0.0] * 48 + [math.nan, math.inf, -math.inf, 1e30, -3e38, 1e-40, -1e-12]
 PARTS, SCENES = 5, 8
-"""Bytes that say what a point is like, which are drawn in less time than numbers; scenes in a batch."""
+"""Number of bytes that describe a point, and number of scenes in a batch; bytes are drawn faster than numbers."""
 
 
 def cloud_of(said: bytes, height: int, width: int, kind: type) -> np.ndarray:
-    """Points behind and beyond, on edges of pixels and of the image, equally far, several in a pixel, not finite."""
+    """Return points behind, beyond, on edges of pixels and image, equally far, several in a pixel, not finite."""
     cloud = np.ones((len(said) // PARTS, 6))
     for point in range(len(cloud)):
         across, down, depth, stray, no_color = said[PARTS * point : PARTS * (point + 1)]
@@ -101,14 +101,14 @@ def test_projections_are_those_of_a_loop_over_points(said, height, width, levels
 
 @pytest.mark.parametrize("size", [(33, 21), (8, 12), (1, 1)])
 def test_float32_points_are_seen_where_exact_fractions_say(size):
-    """On edges of pixels, and one rounding to either side of them."""
+    """Check points on edges of pixels, and one rounding to either side of them."""
     (height, width), count = size, 400
     generator = torch.Generator().manual_seed(0)
     depth = 1 + 4 * torch.rand(count, generator=generator)
     halves = torch.randint(-2, 2 * width + 3, (count,), generator=generator)
     across = ((halves.double() / 2 - width / 2) * depth.double() / height).float()
     aside = torch.randint(-1, 2, (count,), generator=generator)
-    aside[across == 0] = 0  # what is next to 0 no float64 tells from it, half an image away
+    aside[across == 0] = 0  # half an image away, float64 cannot tell the neighbours of 0 from 0
     across = torch.where(aside == 0, across, across.nextafter(aside * math.inf))
     rest = torch.tensor([0.25, 0.5, 0.75]).expand(count, 3)
     clouds = torch.cat([torch.stack([across, torch.zeros(count), depth], 1), rest], 1)[:, None]
@@ -150,7 +150,9 @@ def test_a_camera_sees_points_where_the_encoder_shows_its_canonical_points():
         camera = Camera(turned, torch.tensor([0.0, 0, 3]), focal, principal, height, width)
         world, color = 2 * some(30, 3) - 1, some(30, 3)
         pixels, depth = camera.projected(world)
-        clear = ((pixels - pixels.floor() - 0.5).abs() > 1e-6).all(1)  # of edges, which rounding may decide
+        clear = ((pixels - pixels.floor() - 0.5).abs() > 1e-6).all(
+            1
+        )  # away from edges, where rounding may decide
         world, color, pixels, depth = world[clear], color[clear], pixels[clear].round().long(), depth[clear]
         found = encoder((30, 6), height=height, width=width)(
             torch.cat([camera.canonical(world), color], 1)[None]

@@ -1,4 +1,4 @@
-"""Surfaces between points against loops over pixels, and all ways against each other, to the bit."""
+"""Tests of surfaces between points against loops over pixels, and of all ways against each other, to the bit."""
 
 import math
 
@@ -15,7 +15,7 @@ LIMITS = (1.0, 5.0)
 
 
 def by_hand(picture, focal, radius):
-    """Every pixel from the definition."""
+    """Return every pixel from the definition."""
     picture = picture.astype(np.float64)
     height, width = picture.shape[1:]
     seen = [(row, column) for row in range(height) for column in range(width) if picture[3, row, column] < 1]
@@ -50,7 +50,7 @@ def by_hand(picture, focal, radius):
 
 
 def scene(said, height, width, kind=np.float64):
-    """Points on a near and a far surface, from bytes; a third of the pixels shows one."""
+    """Return points on a near and a far surface, from bytes; a third of the pixels shows one."""
     picture = np.ones((4, height, width), kind)
     for place, byte in enumerate(said[: height * width]):
         if byte % 3 == 0:
@@ -77,7 +77,7 @@ def test_a_dense_surface_is_itself_and_nothing_stays_nothing():
     dense[:, 3] = 0.5
     found = splatted(dense, LIMITS, 100.0, 5)
     assert (found[:, 4] == 0).all()
-    # of a standard deviation of 0.45 pixels: all others together weigh 0.37 of the pixel's own point
+    # with a standard deviation of 0.45 pixels, all others together weigh 0.37 of the pixel's own point
     torch.testing.assert_close(found[:, :4], dense, rtol=0, atol=0.37 / 1.37)
     flat = torch.full((1, 4, 12, 9), 0.25)
     torch.testing.assert_close(splatted(flat, LIMITS, 100.0, 5)[:, :4], flat)

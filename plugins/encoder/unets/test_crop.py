@@ -14,7 +14,7 @@ SUBJECTS = {
     "nothing": (0, 0, 0, 0),
 }
 REACH = 64
-"""A pixel of a small network acts on no map of any level farther away: 33 pixels (unet), 55 (slim)."""
+"""Largest distance, pixels, at which a pixel of a small network affects a map of any level: 33 (unet), 55 (slim)."""
 
 
 @pytest.mark.parametrize("box", SUBJECTS.values(), ids=SUBJECTS)

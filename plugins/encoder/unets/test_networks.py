@@ -12,7 +12,7 @@ STRIDE = {"unet": 4, "slim": 8}
 
 
 def network(name, shape, **config):
-    """In evaluation, with running moments, gains and offsets of no special value."""
+    """Return a network in evaluation, with running moments, gains and offsets of no special value."""
     torch.manual_seed(0)
     made = build("encoder", resolve("encoder", {"name": name, **SMALL[name], **config}), input_shape=shape)
     with torch.no_grad():
@@ -25,7 +25,10 @@ def network(name, shape, **config):
 
 
 def pictures(count, shape, *boxes):
-    """Random pixels in a box (top, bottom, left, right) each, the last box in all that remain; 1 elsewhere."""
+    """Return images with random pixels in a box (top, bottom, left, right) each and 1 elsewhere.
+
+    All images after the last box have that box.
+    """
     generator = torch.Generator().manual_seed(1)
     found = torch.ones(count, *shape)
     for index in range(count):
@@ -36,10 +39,10 @@ def pictures(count, shape, *boxes):
 
 
 class Plain:
-    """The networks in their textbook form, on pictures as they are.
+    """The networks in their textbook form, on unchanged images.
 
-    `white`, (1, channels, 1, 1), is what a layer holds in the middle of an image of ones. Maps continue with it beyond
-    their border, and running moments are of differences from it.
+    `white`, (1, channels, 1, 1), is the value of a layer in the middle of an image of ones. Maps continue with it
+    beyond their border, and running moments are those of differences from it.
     """
 
     def __init__(self, made, name):
@@ -110,7 +113,7 @@ def padded(maps, white, around):
 @pytest.mark.parametrize("size", [(13, 10), (16, 24), (1, 1), (1, 9)])
 @pytest.mark.parametrize("name", SMALL)
 def test_agrees_with_a_plain_network(name, size, dtype, limit):
-    """Folded, and with the answer to white beyond its borders, whatever the size of the picture."""
+    """Compare folded networks, padded with their value on white, for images of any size."""
     made = network(name, (4, *size), scales=3, crop=None).to(dtype)
     inputs = pictures(
         3, (4, *size), (0, 1, 0, 5), (0, 0, 0, 0), (0, *size, 0)[:0] or (0, size[0], 0, size[1])
@@ -125,7 +128,7 @@ def test_agrees_with_a_plain_network(name, size, dtype, limit):
 @pytest.mark.parametrize("normalisation", ["batch", "renorm"])
 @pytest.mark.parametrize("size", [3, 2])
 def test_a_layer_in_training_is_normalised_as_published(normalisation, size):
-    """Renormalised as of Ioffe 2017, Algorithm 1, with the running moments of the batches before."""
+    """Compare with Ioffe 2017, Algorithm 1, with the running moments of the batches before."""
     torch.manual_seed(0)
     layer = Layer(3, 5, size, normalisation).double()
     gain, offset = layer.gain.data.uniform_(0.5, 2), layer.offset.data.normal_()
@@ -137,7 +140,7 @@ def test_a_layer_in_training_is_normalised_as_published(normalisation, size):
         mean, variance = raw.flatten(1).mean(1), raw.flatten(1).var(1, correction=0)
         deviation = (variance + EPSILON).sqrt()
         ratio, moved = torch.ones(5).double(), torch.zeros(5).double()
-        if normalisation == "renorm" and seen:  # the mean of all batches at first
+        if normalisation == "renorm" and seen:  # at first the moments are the mean of all batches
             usual = (torch.stack([spread for _, spread in seen]).mean(0) + EPSILON).sqrt()
             ratio = (deviation / usual).clamp(1 / 3, 3)
             moved = ((mean - torch.stack([middle for middle, _ in seen]).mean(0)) / usual).clamp(-5, 5)
@@ -150,7 +153,7 @@ def test_a_layer_in_training_is_normalised_as_published(normalisation, size):
 
 @pytest.mark.parametrize("normalisation", ["batch", "renorm", "group"])
 def test_gradients_of_a_layer_in_training(normalisation):
-    """Of batch norm and group norm against differences; the correction of `renorm` is a constant, by definition."""
+    """Compare batch norm and group norm with differences; the correction of `renorm` is a constant by definition."""
     torch.manual_seed(0)
     layer = Layer(2, 4, 3, normalisation).double()
     maps = torch.randn(2, 2, 4, 4).double()
@@ -193,7 +196,7 @@ def test_group_norm_is_torchs():
     raw = functional.conv2d(maps, layer.weight, padding=1)
     padded = functional.group_norm(raw, 8, layer.gain, layer.offset)
     found = layer(maps)
-    change = found.flatten(2).diff() - padded.relu().flatten(2).diff()  # but for one number a channel
+    change = found.flatten(2).diff() - padded.relu().flatten(2).diff()  # equal up to one constant per channel
     assert change.abs().max() < 1e-5
     torch.testing.assert_close(layer.folded(torch.float32)(maps), found)
 
@@ -286,7 +289,7 @@ def test_a_config_out_of_range_is_refused(name, config):
 
 
 def test_the_reference_has_the_published_size():
-    """Channels 32 to 512 at five levels; two convolutions a level and way, one behind each interpolation."""
+    """Check channels 32 to 512 at five levels, two convolutions a level and way, one after each interpolation."""
     torch.manual_seed(0)
     made = build("encoder", resolve("encoder", {"name": "unet"}), input_shape=(4, 410, 308))
     assert [layer.weight.shape[0] for layer in made.layers][:10] == [
@@ -307,7 +310,7 @@ def test_the_reference_has_the_published_size():
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_residual_network_answers_its_input_until_it_has_learnt(name):
-    """White where nothing is, cropped or not; then what it adds is what the head says."""
+    """Check white on empty ground, cropped or not; then the network adds the head's output."""
     config = resolve("encoder", {"name": name, **SMALL[name], "residual": True, "scales": 1})
     made = build("encoder", config, input_shape=(4, 21, 18))
     picture = pictures(2, (4, 21, 18), (5, 12, 3, 9), (0, 0, 0, 0))
