@@ -1,4 +1,4 @@
-"""The Bernoulli image head beyond its contract: against torch's Bernoulli, its calibration, its masks."""
+"""Tests of the Bernoulli image head beyond its contract: torch's Bernoulli, calibration and masks."""
 
 import pytest
 import torch
@@ -76,7 +76,7 @@ def test_the_loss_is_the_cross_entropy_a_number_and_calibration_finds_the_likeli
     generator = torch.Generator().manual_seed(0)
     truth = 2 * torch.randn(64, 20, generator=generator)
     target = truth.sigmoid().bernoulli(generator=generator).unflatten(1, (4, 5, 1))
-    raw = (-3 * truth).sigmoid()  # white where it is 0; three times too sure
+    raw = (-3 * truth).sigmoid()  # white where the truth is 0; log-odds three times too large
     head = BernoulliImageHead(TARGET)
     cut = raw.clamp(SMALLEST, 1 - SMALLEST).double()
     wanted = torch.nn.functional.binary_cross_entropy(
@@ -90,6 +90,6 @@ def test_the_loss_is_the_cross_entropy_a_number_and_calibration_finds_the_likeli
         head.factor.fill_(factor)
         losses[factor] = -float(head(raw).log_prob(target).double().mean())
     assert min(losses, key=losses.__getitem__) == fitted and fitted == pytest.approx(0.4, abs=0.1)
-    torch.testing.assert_close(head.loss(raw, target), wanted.float())  # whatever was fitted
+    torch.testing.assert_close(head.loss(raw, target), wanted.float())  # independent of the calibration
     with pytest.raises(ValueError, match="got none of it"):
         head.calibrate(raw[:0], target[:0])

@@ -48,7 +48,7 @@ def test_a_mixture_averages_probabilities_and_not_logits():
 
 
 def test_the_likeliest_class_of_a_mixture_need_not_be_one_of_its_components():
-    # two components are sure of different classes, both hold 0.45 for a third
+    # two components prefer different classes, and both give 0.45 to a third class
     probabilities = torch.tensor([[[0.5, 0.05, 0.45], [0.05, 0.5, 0.45]]])
     density = Mixture(
         torch.zeros(1, 2), head("categorical", Target("class", ("a", "b", "c")))(probabilities.log())

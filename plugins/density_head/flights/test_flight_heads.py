@@ -1,4 +1,4 @@
-"""Heads that predict flights: coverage of simulated ones, constants that are found, and what is refused."""
+"""Tests of heads that predict flights: coverage of simulated flights, identified constants, and refusals."""
 
 from dataclasses import fields
 from typing import Literal

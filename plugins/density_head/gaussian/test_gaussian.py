@@ -22,7 +22,7 @@ def head(config=None, target=THREE):
 
 @pytest.fixture
 def full():
-    """A batch of full Gaussians in float64, and their covariances by inversion."""
+    """Return a batch of full Gaussians in float64, and their covariances by inversion."""
     torch.manual_seed(0)
     density = head({"covariance": "full"}).double()(torch.randn(5, 9, dtype=torch.float64))
     inverse = np.linalg.inv(np.eye(3) - density.coefficients.numpy())
@@ -73,11 +73,11 @@ def test_calibration_maximises_the_likelihood(covariance):
     before = made.loss(raw, target)
     made.calibrate(raw, target)
     residual = (target - raw).numpy()
-    wanted = residual.T @ residual / 400  # maximum likelihood of a covariance about a known mean
+    wanted = residual.T @ residual / 400  # maximum likelihood of a covariance around a known mean
     wanted = wanted if covariance == "full" else np.diag(np.diag(wanted))
     best = stats.multivariate_normal(np.zeros(3), wanted).logpdf(residual)
     np.testing.assert_allclose(made(raw).log_prob(target).numpy(), best, rtol=1e-9)
-    assert torch.equal(made.loss(raw, target), before)  # squared error does not change with it
+    assert torch.equal(made.loss(raw, target), before)  # squared error does not change with calibration
 
 
 def test_calibration_on_perfect_collinear_and_no_data():
@@ -85,7 +85,7 @@ def test_calibration_on_perfect_collinear_and_no_data():
     raw = torch.randn(20, 3)
     made.calibrate(raw, raw)
     assert torch.allclose(made.scale, torch.full((3,), 1e-4, dtype=torch.float64))
-    made.calibrate(raw, raw + torch.randn(20, 1))  # all three off by the same
+    made.calibrate(raw, raw + torch.randn(20, 1))  # all three numbers have the same error
     assert made(raw).log_prob(raw).isfinite().all()
     with pytest.raises(ValueError, match="got none"):
         made.calibrate(raw[:0], raw[:0])
@@ -131,7 +131,7 @@ def test_a_config_out_of_range_is_refused(config):
 
 @pytest.mark.parametrize("numbers", [2, 3, 20, 100])
 def test_a_covariance_is_a_number_or_refused(numbers):
-    """At raw numbers of any size: never an infinite or missing standard deviation, draw or marginal in silence."""
+    """Check raw parameters of any size: infinite or NaN deviations, samples or marginals always raise an error."""
     target = Target("real", tuple(f"x{i}" for i in range(numbers)))
     made = build(
         "density_head", resolve("density_head", {"name": "gaussian", "covariance": "full"}), target=target
@@ -143,7 +143,7 @@ def test_a_covariance_is_a_number_or_refused(numbers):
                 density.log_prob(torch.zeros(1, numbers, dtype=dtype)).isfinite()
                 and density.entropy().isfinite()
             )
-            # the largest: σ (1 + φ)^(n - 1) of equal coefficients
+            # the largest deviation: σ (1 + φ)^(n - 1) for equal coefficients
             log_largest = math.log10(density.scale.max()) + (numbers - 1) * math.log10(
                 1 + density.coefficients.max()
             )
@@ -159,7 +159,7 @@ def test_a_covariance_is_a_number_or_refused(numbers):
 
 
 def test_mixed_precision_does_not_round_the_covariance():
-    """Densities, draws and slopes under autocast are those of float32."""
+    """Compare densities and samples under autocast with those in float32."""
     torch.manual_seed(0)
     made = head({"covariance": "full"})
     raw = torch.randn(50, made.size)

@@ -1,4 +1,4 @@
-"""A learned density about the encoder's mean: where it starts, and that the target's unit does not matter."""
+"""Tests of a learned density around the encoder's mean: its initial value, and independence of the target's unit."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def test_a_hybrid_does_not_care_for_the_targets_unit(component: str) -> None:
             config["component"] |= {"component": {"name": "gaussian"}}
         torch.manual_seed(0)
         head = build("density_head", resolve("density_head", config), target=target).eval()
-        # what is read of the mean is in the target's unit; here it is read as it is
+        # the mean is read in the target's unit, which is not standardised here
         torch.nn.init.zeros_(head.network[0].weight[:, :2].detach())
         raw = torch.tensor([[3.2, 15.0, -5.0, 0.0, 0.4], [2.9, -30.0, -2.0, 3.0, 7.0]])
         torch.manual_seed(1)

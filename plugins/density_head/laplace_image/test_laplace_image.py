@@ -1,4 +1,4 @@
-"""The Laplace image head beyond its contract: against torch's Laplace, its loss, its calibration, its image."""
+"""Tests of the Laplace image head beyond its contract: torch's Laplace, loss, calibration and image."""
 
 import pytest
 import torch
@@ -65,7 +65,7 @@ def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean(
 
 @pytest.mark.parametrize("white", [1.0, 1 - 2**-24])
 def test_the_loss_is_the_distance_a_number_and_the_foreground_counts_more(white: float) -> None:
-    """Also where white has lost a bit on its way through light: 0.99999994."""
+    """Check the loss, also where white has lost a bit in the conversion to linear RGB: 0.99999994."""
     raw = torch.rand(2, 60)
     target = torch.full((2, 4, 5, 3), white)
     target[:, :2] = 0.25
@@ -112,7 +112,7 @@ def test_balanced_locations_are_learned_as_by_the_distance_and_scales_as_by_like
 
 @pytest.mark.parametrize("mass", [0.5, 0.9])
 def test_intervals_are_fitted_to_what_is_not_background(mass: float) -> None:
-    """A background that is right to a thousandth of its scale: the likeliest factor forgets the others."""
+    """Check a background with errors of a thousandth of its scale, which makes the likeliest factor too small."""
     torch.manual_seed(0)
     target = torch.full((6, 4, 5, 3), 1 - 2**-24)
     target[:, 0] = torch.rand(6, 5, 3) / 2
@@ -141,7 +141,10 @@ def test_light_and_numbers_are_inverse() -> None:
 
 
 def test_the_entropy_of_members_of_large_images_is_drawn_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Never more numbers at once than the bound; far apart it is the mean entropy and that of the choice."""
+    """Check that no more numbers than the bound are held, and the entropy of distant members.
+
+    It is the mean entropy of the members plus that of the choice among them.
+    """
     members = LaplaceImage(
         torch.tensor([0.0, 50.0]).double().reshape(1, 2, 1, 1, 1).expand(1, 2, 20, 20, 3),
         torch.tensor(0.1).double(),

@@ -30,7 +30,7 @@ from plugins.density_head.latent.rows import ONE, SMALL, TWO
 
 
 def test_each_network_may_have_a_backbone_of_its_own():
-    """Thesis §3.6.1: each part of the raw numbers depends on its own, the loss on the raw numbers alone."""
+    """Check thesis §3.6.1: each part of the raw parameters has its own backbone; the loss depends on them alone."""
     config = {
         "data": "moons",
         "density_head": {"name": "cvae", **SMALL, "backbones": "each"},
@@ -65,7 +65,7 @@ def test_each_network_may_have_a_backbone_of_its_own():
 
 
 def resolve_all_parts(config):
-    """What `build_predictor` reads."""
+    """Resolve the parts that `build_predictor` reads."""
     encoders = [resolve("encoder", one) for one in config["encoder"].values()]
     return {
         "encoder": encoders,
@@ -101,7 +101,7 @@ class NormalHead(DensityHead):
 
 
 class CategoricalHead(NormalHead):
-    """Class probabilities."""
+    """A head of class probabilities."""
 
     def __init__(self, target):
         super().__init__(target)
@@ -134,7 +134,7 @@ def test_targets_that_are_not_angles(target, component):
 def test_the_mixture_is_a_density_that_samples_follow(target):
     made = head(target=target).double().eval()
     with torch.no_grad():
-        density = made(raws(made, 3).double())  # κ that the grids resolve
+        density = made(raws(made, 3).double())  # κ small enough for the grids
         checks = [(integral, 1e-6), (samples_follow_log_prob, 5.0)]
         checks += [(marginals, 1e-6)] if target is TWO else [(median_is_best, 5.0)]
         for check, limit in checks:
@@ -151,13 +151,13 @@ def toy():
     made.requires_grad_(False)
     raw = raws(made, 3).double()
     networks = made.networks(raw)
-    # not so far out that a few rare z make up the integral
+    # not so far out that a few rare z dominate the integral
     value = networks.component(networks.decode(networks.prior.mean)).mode + 0.3
     return made, networks, raw, value
 
 
 def truth(networks, value):
-    """log ∫ p(φ|x,z) p(z|x) dz by the trapezium rule over ±10 standard deviations."""
+    """Return log ∫ p(φ|x,z) p(z|x) dz by the trapezium rule over ±10 standard deviations."""
     standard = torch.linspace(-10, 10, 4001, dtype=torch.float64)[:, None, None]
     z = networks.prior.mean + networks.prior.log_scale.exp() * standard
     weight = Normal(0, 1).log_prob(standard[..., 0]) + math.log(20 / 4000)

@@ -1,4 +1,4 @@
-"""The decoder of latent-variable heads, against the same sums written out one sample at a time."""
+"""Tests of the decoder of latent-variable heads against its sums written out one sample at a time."""
 
 import torch
 

@@ -29,12 +29,12 @@ TRUTH = -FALL * 0.16 / (2 * (1 + FALL)) - torch.log1p(FALL) / 2  # log E w, by c
 
 
 def bump(z, items):
-    """log w(z) = -a (t - 0.4)²/2 of items with different a, t ~ N(0, 1) in the direction (1, 1, …)."""
+    """Return log w(z) = -a (t - 0.4)²/2 of items with different a, t ~ N(0, 1) in the direction (1, 1, …)."""
     return -FALL[items] * (z.sum(-1) / z.shape[-1] ** 0.5 - 0.4).square() / 2
 
 
 def sampled(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
-    """As a density does it: to a tolerance by points of heavier tails."""
+    """Return the estimate as a density computes it: to a tolerance by points of heavier tails."""
     torch.manual_seed(seed)
     points = NormalPoints(ITEMS, effort.replicates, dimensions, dtype=torch.float64, device=CPU)
 
@@ -73,7 +73,7 @@ def test_the_quantile_agrees_with_40_digits_and_is_never_infinite():
     found = normal_quantile(torch.tensor(places, dtype=torch.float64))
     with mpmath.workdps(40):
         for z, place in zip(found.tolist(), places, strict=True):
-            # through Φ, relative to the smaller tail: a rounding of the place near 1 is not z's error
+            # compared through Φ, relative to the smaller tail: rounding of a position near 1 is no error of z
             tail, back = (
                 (mpmath.mpf(place), mpmath.ncdf(z))
                 if place <= 0.5
@@ -98,7 +98,7 @@ def test_points_are_normal_apart_and_the_same_in_both_precisions():
     torch.manual_seed(3)
     kept = NormalPoints(500, 4, 2, dtype=torch.float32, device=CPU, kept=40)
     some = torch.tensor([7, 7, 0])
-    for start, count in ((0, 40), (10, 7), (30, 34)):  # held and computed anew
+    for start, count in ((0, 40), (10, 7), (30, 34)):  # kept and recomputed
         assert torch.equal(kept(some, start, count), z[:, start : start + count, some].float())
 
 
@@ -233,7 +233,7 @@ def test_the_tolerance_is_reached(tolerance):
     samples = torch.stack([one.samples for one in found])
     assert samples.min() >= 64
     assert (samples & (samples - 1) == 0).all()  # doubled
-    assert samples[:, -1].double().mean() > samples[:, 0].double().mean()  # narrow weights take more
+    assert samples[:, -1].double().mean() > samples[:, 0].double().mean()  # narrow weights need more samples
 
 
 @pytest.mark.parametrize("dimensions, highest", [(1, 25.0), (2, 25.0), (4, 9.0)])
@@ -249,8 +249,10 @@ def test_shares_have_the_mean_1_and_points_come_far_out(dimensions, highest):
 @pytest.mark.parametrize("dimensions", [1, 2])
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])
 def test_the_told_error_is_the_error_however_samples_were_chosen(dimensions, tolerance):
-    """Weights like those of a decoder, and of an importance sampler whose proposal is far too narrow: told within 15 %
-    of the root mean square, and about 1 % beyond three standard errors."""
+    """Compare estimated and actual errors of weights like those of a decoder, and of a far too narrow proposal.
+
+    The root mean square is within 15 % of the estimated one, and about 1 % lie beyond three standard errors.
+    """
 
     def narrow_proposal(z, items):
         # posterior of variance 1, proposed with 1/2 … 1/7: exp(z²/2 (1 - s²)) s^d, with mean 1
@@ -272,7 +274,10 @@ def test_the_told_error_is_the_error_however_samples_were_chosen(dimensions, tol
 @pytest.mark.parametrize("height", [5.0, 20.0, 60.0])
 @pytest.mark.parametrize("border", [3.0, 4.0, 5.0])
 def test_a_rare_event_is_found_or_told(height, border):
-    """Weights 1 up to a border, e^height above: log(1 + P (e^height - 1)), to a fifth of the tolerance or told."""
+    """Check weights 1 up to a border and e^height above: log(1 + P (e^height - 1)).
+
+    The estimate is right to four standard errors and a fifth of the tolerance, or it is reported as unresolved.
+    """
     rare = math.log1p(float(mpmath.ncdf(-border)) * math.expm1(height))
     honest = []
     for seed in range(5):
@@ -300,7 +305,7 @@ def test_what_cannot_be_resolved_is_given_up_and_said(monkeypatch):
     assert found.unresolved.all()
     assert found.log_mean[3] == -math.inf
     assert found.log_mean[5].isnan()
-    assert found.samples[5] == 256  # nothing can mend it
+    assert found.samples[5] == 256  # more samples cannot help
     good = torch.tensor([item for item in range(ITEMS) if item not in (3, 5)])
     torch.testing.assert_close(found.log_mean[good], TRUTH[good], rtol=0, atol=0.2)
 

@@ -23,8 +23,11 @@ def raws(made, *batch):
 
 
 def integral(made, raw, value):
-    """log ∫ p(φ|x,z) N(z; 0, 1) dz and log ∫ p² N dz, one latent dimension, by the trapezium rule over ±9: the
-    rectifiers' kinks cost Gauss-Hermite quadrature 0.03 nats."""
+    """Return log ∫ p(φ|x,z) N(z; 0, 1) dz and log ∫ p² N dz for one latent dimension.
+
+    They are computed by the trapezium rule over ±9: the kinks of the rectifiers cost Gauss-Hermite quadrature 0.03
+    nats.
+    """
     z = torch.linspace(-9, 9, 10_001, dtype=torch.float64)[:, None].expand(len(raw), -1, 1)
     at_points = made.component(made.decode(raw, z)).log_prob(value[:, None])
     weight = -z[..., 0].square() / 2 + math.log(18 / 10_000) - math.log(2 * math.pi) / 2
@@ -48,7 +51,7 @@ def test_the_tolerance_is_reached():
     with torch.no_grad():
         truth, _ = integral(made, raw, value)
         for tolerance in (0.1, 0.01, 0.001):
-            made.tolerance = tolerance  # at any time
+            made.tolerance = tolerance  # it may be set at any time
             found = []
             for seed in range(5):
                 torch.manual_seed(seed)

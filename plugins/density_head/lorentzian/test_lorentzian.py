@@ -1,4 +1,4 @@
-"""What the head of Lorentzian lines keeps, and which targets it refuses."""
+"""Tests of the state of the head of Lorentzian lines, and of the targets that it refuses."""
 
 import pytest
 

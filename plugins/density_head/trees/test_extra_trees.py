@@ -26,7 +26,7 @@ def head(target, **config):
 
 
 def fitted(target, count=300, size=6, seed=0, **config):
-    """A head and what it was fitted to: features that say something about the target."""
+    """Return a head and its training data: features that are informative about the target."""
     generator = torch.Generator().manual_seed(seed)
     features = torch.randn(count, size, generator=generator)
     if target.kind == "class":
@@ -40,7 +40,7 @@ def fitted(target, count=300, size=6, seed=0, **config):
 
 
 def shares(made, features):
-    """The forest's own, before smoothing."""
+    """Return the forest's shares of classes before smoothing."""
     leaf = leaves(
         features, *(part.numpy() for part in (made.feature, made.threshold, made.branch, made.root))
     )

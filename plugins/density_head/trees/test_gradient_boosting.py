@@ -17,7 +17,7 @@ def head(target, **config):
 
 
 def fitted(target, seed=0, **config):
-    """A head and what it was fitted to: features that say something about the target."""
+    """Return a head and its training data: features that are informative about the target."""
     generator = torch.Generator().manual_seed(seed)
     features = torch.randn(300, 5, generator=generator)
     if target.kind == "class":

@@ -1,4 +1,4 @@
-"""What heads without gradient share: normal densities also of an empty batch, state of any shape, refusals."""
+"""Tests of heads without gradient: normal densities also of an empty batch, state of any shape, refusals."""
 
 import copy
 
@@ -67,7 +67,7 @@ def test_a_gradient_is_0_where_it_is_asked_for(shape):
 
 
 class Sized(torch.nn.Module):
-    """Holds numbers of any count."""
+    """A module with a buffer of any size."""
 
     def __init__(self, count):
         super().__init__()
@@ -100,7 +100,7 @@ STORED = {
     },
     "xgboost": {"model": torch.uint8, "width": torch.float64, "read": torch.int64},
 }
-"""What checkpoints hold of each: old ones must load for good."""
+"""Names and dtypes of the stored arrays of each head: old checkpoints must always load."""
 
 
 def head(name, target):
@@ -109,7 +109,7 @@ def head(name, target):
 
 
 def fitted(name, target):
-    """A head and what it was fitted to: features that say something about the target."""
+    """Return a head and its training data: features that are informative about the target."""
     features = torch.randn(300, 5, generator=torch.Generator().manual_seed(0))
     wanted = features[:, :2] @ torch.tensor([[1.0, 0.5], [-1.0, 2.0]])
     if target.kind == "class":
@@ -134,7 +134,7 @@ def test_its_state_is_plain_tensors_that_another_head_takes(name, target):
 
 
 def test_a_forest_written_by_hand_is_read():
-    """One tree: class 3 where the first of two features is at most 1/2, else one sample each of classes 0 and 1."""
+    """Check one tree: class 3 if the first of two features is at most 1/2, else one sample each of classes 0 and 1."""
     numbers = {"feature": [0, -1, -1], "branch": [[1, 2], [0, 0], [1, 1]], "root": [0]}
     numbers |= {"start": [0, 1, 3], "label": [3, 0, 1], "count": [9, 1, 1], "threshold": [0.5, 0.0, 0.0]}
     state = {key: torch.tensor(value, dtype=STORED["extra_trees"][key]) for key, value in numbers.items()}

@@ -1,4 +1,4 @@
-"""Stored arrays that are no forest, and bytes that are no model, are refused before compiled code sees them."""
+"""Tests that stored arrays that are no forest, and bytes that are no model, are refused before compiled code runs."""
 
 import struct
 
@@ -15,7 +15,7 @@ ASKED = torch.randn(40, 5, generator=torch.Generator().manual_seed(3))
 
 
 def fitted(name, kind, **more):
-    """A head, fitted to features that say something about the target."""
+    """Return a head fitted to features that are informative about the target."""
     few = {"extra_trees": {"trees": 6}, "xgboost": {"rounds": 8, "depth": 3}}[name]
     made = build("density_head", resolve("density_head", {"name": name, **few, **more}), target=TARGETS[kind])
     features = torch.randn(300, 5, generator=torch.Generator().manual_seed(0))
@@ -32,7 +32,7 @@ def answer(made):
 
 
 def put(place, value):
-    """Another number at a place of a flat array."""
+    """Return a flat array with another number at one position."""
 
     def damage(array):
         array.flatten()[place] = value
@@ -63,7 +63,7 @@ OF_FOREST = {
     "width": [put(0, 1e-300), put(0, 1e300), put(0, 0.0), put(0, -1.0), put(1, torch.nan), put(1, torch.inf)],
     "read": [put(0, 0), put(0, 1), put(0, -1), put(0, 2**40)],
 }
-"""Whole arrays but for one number. A root moved within its tree leads branches out of the tree before it."""
+"""Valid arrays except for one number; a root moved within its tree leads branches out of the tree before it."""
 
 
 @pytest.mark.parametrize("kind", TARGETS)
@@ -74,7 +74,7 @@ def test_each_damaged_array_is_refused_and_changes_nothing(name, kind):
     tried = set()
     for key, array in whole.items():
         if array.dim() and not array.numel():
-            continue  # of the other kind of target
+            continue  # belongs to the other kind of target
         damages = {**OF_ANY, **dict(enumerate(OF_FOREST[key] if name == "extra_trees" else []))}
         for said, damage in damages.items():
             with pytest.raises(CheckpointError, match=r"is damaged: .*\. Load another"):
@@ -84,18 +84,18 @@ def test_each_damaged_array_is_refused_and_changes_nothing(name, kind):
     assert tried >= {key for key, array in whole.items() if array.numel()}
     assert torch.equal(answer(made), before)
     other = build("density_head", resolve("density_head", {"name": name}), target=TARGETS[kind])
-    other.load_state_dict(made.double().state_dict())  # as a model that was cast
+    other.load_state_dict(made.double().state_dict())  # the state of a cast model
     assert torch.equal(answer(other), before)
 
 
 def number(content, after, place, value, kind=">i"):
-    """Bytes of a model with another number in the first array of that name."""
+    """Return the bytes of a model with another number in the first array of that name."""
     start = content.index(after) + len(after) + len("[$l#L") + 8 + struct.calcsize(kind) * place
     return content[:start] + struct.pack(kind, value) + content[start + struct.calcsize(kind) :]
 
 
 def damaged_models(content):
-    """Bytes of which each but for one place is a model."""
+    """Yield byte strings that differ from a model in one number each."""
     for name in (b"left_children", b"right_children"):
         for place, value in ((0, 0), (1, 0), (0, 2**20), (0, HUGE), (0, -1), (1, -2), (0, -(2**31)), (1, 1)):
             yield number(content, name, place, value)
@@ -135,7 +135,7 @@ def damaged_models(content):
 
 @pytest.mark.parametrize("kind", TARGETS)
 def test_bytes_that_are_no_model_of_this_head_are_refused(kind):
-    """Each by a sentence: an empty one aborts the process inside xgboost, a cycle of nodes never ends."""
+    """Check the message for each; an empty model aborts the process in xgboost, and a cycle of nodes never ends."""
     made = fitted("xgboost", kind)
     state, before = made.state_dict(), answer(made)
     content, count = state["model"].numpy().tobytes(), 0
@@ -161,7 +161,7 @@ def test_a_model_of_another_target_is_refused():
 @pytest.mark.parametrize("splits", ["hist", "exact"])
 @pytest.mark.parametrize("kind", TARGETS)
 def test_every_model_that_is_trained_is_taken(splits, kind):
-    """Trees of a single node and deep ones, drawn samples and features, as many rounds as one."""
+    """Check trees of a single node and deep ones, drawn samples and features, and a single round."""
     for more in (
         {"rounds": 1, "depth": 1},
         {"weight": 1000.0},

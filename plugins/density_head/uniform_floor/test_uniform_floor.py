@@ -30,7 +30,7 @@ def test_log_prob_is_the_weighted_sum(target, volume):
     "component", ["matrix_fisher", {"name": "mixture", "component": {"name": "matrix_fisher"}}]
 )
 def test_under_rotations_lies_their_own_uniform_law(component):
-    """cos e / 8π², in the density, in the loss, and under draws, of which half are uniform."""
+    """Check the floor cos e / 8π² in the density, in the loss, and in samples, half of which are uniform."""
     config = {"weight": 0.5, "component": component if isinstance(component, dict) else {"name": component}}
     made = head(config, THREE).double()
     torch.manual_seed(0)

@@ -47,12 +47,12 @@ CONCENTRATIONS = (
     1e30,
 )
 OFFSETS = (0.0, 1e-8, 1e-4, 0.1, 1.0, math.pi / 2, 3.0, math.pi, 2 * math.pi - 1e-6, -2 * math.pi, 1e6, -1e6)
-LIMIT = 8  # units of machine epsilon; 16 is wanted
+LIMIT = 8  # units of machine epsilon; the requirement is 16
 
 
 @cache
 def bessel(concentration):
-    """log(I0(κ) exp(-κ)), A(κ), 1 - A(κ), A'(κ)."""
+    """Return log(I0(κ) exp(-κ)), A(κ), 1 - A(κ), A'(κ)."""
     kappa = mpmath.mpf(concentration)
     zero, one = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
     ratio = one / zero
@@ -65,12 +65,12 @@ def leaf(number, dtype):
 
 
 def error(found, reference, scale, dtype):
-    """In machine epsilons of `scale`."""
+    """Return the error in machine epsilons of `scale`."""
     return float(abs(mpmath.mpf(found.item()) - reference) / scale) / torch.finfo(dtype).eps
 
 
 def check_points(value, mean, concentration, found, slopes):
-    """log_prob and its three gradients against 90 digits."""
+    """Compare log_prob and its three gradients with 90 digits."""
     dtype = value.dtype
     columns = (value, mean, concentration, found, *slopes)
     for row in zip(*(column.detach().reshape(-1) for column in columns), strict=True):
@@ -84,7 +84,7 @@ def check_points(value, mean, concentration, found, slopes):
         assert error(log_p, height - kappa * fall, max(1, abs(height), kappa * fall), dtype) < LIMIT, row
         assert error(by_concentration, complement - fall, complement + fall, dtype) < LIMIT, row
         turning = -kappa * mpmath.sin(difference)
-        # the last term: of a difference that nearly is a multiple of π only eps² is lost
+        # the last term: a difference that is nearly a multiple of π loses only eps²
         scale = abs(turning) + kappa * torch.finfo(dtype).eps + torch.finfo(dtype).tiny
         assert error(by_value, turning, scale, dtype) < LIMIT, row
         assert by_mean == -by_value
@@ -143,7 +143,7 @@ def test_functions_of_the_concentration_agree_with_90_digits(concentration, dtyp
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_no_seam_between_two_pieces(dtype):
-    """Over each border value and derivatives change by no more than their rounding, 40 floats to either side."""
+    """Check that value and derivatives change by no more than rounding across each border, 40 floats to either side."""
     pieces = fit_coefficients.PIECES[str(dtype).removeprefix("torch.")]
     eps = torch.finfo(dtype).eps
     edges = torch.tensor([[2 * pieces / i - 2] for i in range(1, pieces)], dtype=torch.float64)
@@ -193,7 +193,7 @@ def test_gradients_reduce_over_broadcast_arguments():
     torch.testing.assert_close(kappa.grad, spread[1].grad.sum())
 
 
-# raised by the compiler itself
+# the compiler itself raises this warning
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_blocks_change_nothing(dtype):
@@ -225,7 +225,7 @@ torch.save(found, path)
 
 
 def test_compiled_log_prob_and_gradients_agree_with_90_digits(tmp_path):
-    """In a process of its own: the type checks that tests switch on cannot be compiled."""
+    """Compare in a separate process, since the type checks that tests switch on cannot be compiled."""
     columns = list(
         zip(*((3.0 + off, 3.0, kappa) for off in OFFSETS for kappa in CONCENTRATIONS), strict=True)
     )
@@ -280,12 +280,12 @@ def test_divergence_has_first_and_second_derivatives(second):
 
 
 def tail(offset, kappa):
-    """Mass beyond `offset` on one side, by quadrature of what is left above exp(-90) of its start."""
+    """Return the probability beyond `offset` on one side, by quadrature down to exp(-90) of its start."""
     offset, kappa = mpmath.mpf(offset), mpmath.mpf(kappa)
     ends = [mpmath.sin(offset / 2) ** 2 + step / (2 * kappa) if kappa else 2 for step in (1, 4, 12, 30, 90)]
     ends = [2 * mpmath.asin(mpmath.sqrt(min(1, end))) for end in ends]
     fall = 2 * kappa * mpmath.sin(offset / 2) ** 2
-    # quad stops at an absolute error: what it sees must not be small
+    # quad stops at an absolute error, so that its integrand must not be small
     rest = mpmath.quad(lambda x: mpmath.exp(fall - 2 * kappa * mpmath.sin(x / 2) ** 2), [offset, *ends])
     return rest / (2 * mpmath.pi) * mpmath.exp(-fall - fit_coefficients.bessel(kappa)[0])
 
@@ -506,7 +506,10 @@ def test_other_targets_are_refused(kind):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, monkeypatch):
-    """float32 exactly; float64 beyond 4e8 radians to one unit of their rounding; under gradient and compiled too."""
+    """Check large angles, also under gradient and compiled.
+
+    float32 is exact, and float64 beyond 4e8 radians is right to one unit of rounding.
+    """
     value = torch.logspace(6, 38, 129, dtype=torch.float64).to(dtype)
     value = torch.cat([value, -value])
     mean, kappa = torch.full_like(value, 0.7), torch.full_like(value, 2.0)
@@ -537,7 +540,7 @@ def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, monkeypatch):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_concentration_at_its_ends_is_a_number_or_refused(dtype):
-    """Up to infinity every answer is a number and the density's limit, a point mass; below 0 there is none."""
+    """Check that results up to infinite κ are finite and those of a point mass, and that κ below 0 is refused."""
     mean = torch.tensor([[0.5], [3.0]], dtype=dtype)
     for kappa in (1e38, 3e38, math.inf, torch.finfo(dtype).max):
         density = VonMises(mean, torch.full_like(mean, kappa))
