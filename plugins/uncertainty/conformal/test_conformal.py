@@ -24,7 +24,7 @@ SPLITS, POOL = 200, 1600
 
 
 class Given(Predictor):
-    """Densities made of the inputs themselves; remembers what it was calibrated on."""
+    """A predictor whose densities are made of the inputs; remembers its calibration data."""
 
     def __init__(self, make):
         super().__init__()
@@ -57,7 +57,7 @@ def batches(inputs, target, size=100):
 
 
 def moons(count):
-    """Two moons, and a fixed classifier that is much too sure: logits of a hand-made boundary, sharpened."""
+    """Return two moons, and logits of a fixed, strongly overconfident classifier."""
     points, label = make_moons(count, noise=0.35, random_state=0)
     return torch.from_numpy(points), torch.from_numpy(label)
 
@@ -69,7 +69,7 @@ def sure_classifier(points):
 
 
 def circle(count):
-    """Von Mises noise about directions, of κ that varies with the input."""
+    """Return von Mises noise around directions, with κ that varies with the input."""
     generator = np.random.default_rng(0)
     inputs = generator.uniform(-3, 3, (count, 2))
     noise = generator.vonmises(0, 4 + 3 * np.tanh(inputs[:, 1]))
@@ -77,7 +77,7 @@ def circle(count):
 
 
 def sure_direction(inputs):
-    """The right direction with κ eight times too large."""
+    """Return the correct direction with κ eight times too large."""
     kind = type(build("density_head", resolve("density_head", "von_mises"), target=ANGLE)(torch.zeros(1, 3)))
     return kind(inputs[:, :1], 8 * (4 + 3 * torch.tanh(inputs[:, 1:])))
 
@@ -89,9 +89,9 @@ PROBLEMS = {"moons": (moons, sure_classifier, CLASSES), "circle": (circle, sure_
 @pytest.mark.parametrize("score", ["density", "mass"])
 @pytest.mark.parametrize("miscoverage", [0.1, 0.05])
 def test_coverage_is_what_was_promised(problem, score, miscoverage):
-    """Mean over 200 random splits of one pool, within 1 %, of models that are badly calibrated.
+    """Check the mean coverage over 200 random splits of one pool to 1 %, for badly calibrated models.
 
-    Of every split half of the validation samples are left to what is wrapped, as the wrapper leaves them.
+    Half of the validation samples of every split are left to the wrapped model, as the wrapper does.
     """
     make, predict, target = PROBLEMS[problem]
     inputs, label = make(POOL)
@@ -171,7 +171,7 @@ def test_what_is_wrapped_gets_one_half():
     assert len(theirs) == 24 and model.seen == sorted(theirs)
     mine = PredictionSet(sure_classifier(inputs[rest]), wrapper.threshold, "density").scores(label[rest])
     assert wrapper.threshold.item() == threshold(mine, 0.1)
-    wrapper.calibrate(batches(inputs, label, 11))  # how the samples are batched is no matter
+    wrapper.calibrate(batches(inputs, label, 11))  # the batches do not matter
     assert set(model.seen) == theirs
     ones = halves(list(batches(inputs[:4], label[:4], 1)))
     assert [len(half) for half in ones] == [2, 2]  # no empty batches
@@ -188,7 +188,7 @@ def test_neighbours_that_alternate_do_not_split_by_class():
 @settings(deadline=None)
 @given(st.lists(st.floats(allow_nan=False), min_size=1, max_size=200), st.integers(1, 99))
 def test_the_threshold_is_the_order_statistic(scores, percent):
-    """⌈(n + 1)(1 - α)⌉-th smallest, in exact integers."""
+    """Compare with the ⌈(n + 1)(1 - α)⌉-th smallest score, in exact integers."""
     rank = -(-(len(scores) + 1) * (100 - percent) // 100)
     wanted = sorted(scores)[rank - 1] if rank <= len(scores) else math.inf
     assert threshold(torch.tensor(scores, dtype=torch.float64), percent / 100) == wanted
@@ -203,7 +203,7 @@ def test_however_much_may_be_missed_the_threshold_is_the_least_score(count):
 
 @pytest.mark.parametrize("score", ["density", "mass"])
 def test_too_few_samples_make_the_set_everything_and_it_is_said(score, caplog):
-    inputs, label = moons(16)  # 8 of its own: 9 would do for 10 %
+    inputs, label = moons(16)  # 8 samples for the threshold; 10 % needs 9
     wrapper = around(Given(sure_classifier), score=score)
     assert wrapper(inputs).labels().all()  # before calibration too
     wrapper.calibrate(batches(inputs, label))

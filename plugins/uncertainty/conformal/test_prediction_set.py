@@ -34,7 +34,7 @@ def normal(place, spread, dtype=torch.float64):
 
 
 def von_mises(mean, concentration, dtype=torch.float64):
-    """The plugin's density by name: raw numbers are not needed."""
+    """Return the plugin's density by name, without raw parameters."""
     kind = type(build_head("von_mises")(torch.zeros(1, 3)))
     mean, concentration = (torch.tensor(part, dtype=dtype).reshape(-1, 1) for part in (mean, concentration))
     return kind(mean, concentration.expand_as(mean))
@@ -76,7 +76,9 @@ def test_the_density_is_kept_to_the_last_bit(kind, score):
     torch.manual_seed(2)
     assert torch.equal(median(whole, 50), wanted)
     assert whole.contains(value).shape == (3, 4) and whole.scores(value).dtype == torch.float64
-    assert not isinstance(temper(whole, hot(2.0)), PredictionSet)  # what wraps it keeps densities, not sets
+    assert not isinstance(
+        temper(whole, hot(2.0)), PredictionSet
+    )  # a wrapper around it keeps densities, not sets
 
 
 def test_estimates_and_marginals_are_those_of_the_density():
@@ -105,7 +107,7 @@ def test_density_sets_of_classes_are_those_above_the_level():
 
 
 def test_mass_scores_of_classes_by_a_loop():
-    """-log(Σ of the less probable + (1 - u) p), u from the two best of an item."""
+    """Compare with -log(Σ of the less probable + (1 - u) p), where u depends on an item's two best labels."""
     torch.manual_seed(4)
     density = Categorical(logits=4 * torch.randn(50, 5).double(), validate_args=False)
     found = PredictionSet(density, EVERYTHING, "mass").scores(density.enumerate_support())
@@ -134,7 +136,7 @@ CONCENTRATIONS = [0.01, 0.5, 5.0, 1e4, 1e8, 1e12]
 
 @pytest.mark.parametrize("concentration", CONCENTRATIONS)
 def test_arcs_of_one_level(concentration):
-    """log p falls by 1 nat where κ (1 - cos d) = 1."""
+    """Check that log p falls by 1 nat where κ (1 - cos d) = 1."""
     density = von_mises([3.1, 0.0, -40.0], concentration)
     level = -density.log_prob(density.mode)[0] + 1
     found = PredictionSet(density, level, "density")
@@ -143,7 +145,7 @@ def test_arcs_of_one_level(concentration):
     else:
         half = 2 * math.asin(math.sqrt(1 / (2 * concentration)))
         wanted = 2 * half
-    # of the size of an arc, or what a float64 angle of 3 can show of it
+    # relative to an arc's size, or to the resolution of a float64 angle of 3
     np.testing.assert_allclose(found.size().numpy(), wanted, rtol=1e-9, atol=1e-13)
     if half < math.pi:
         (low, high), *more = found.intervals()[0]
@@ -183,7 +185,7 @@ def test_intervals_of_reals(dtype, spread):
 
 
 def test_far_values_have_scores_that_differ():
-    """Where a model is far too sure, masses all round to 1; their complements do not."""
+    """Check an overconfident model, whose masses all round to 1 while their complements do not."""
     density = normal([0.0] * 4, 1.0)
     value = torch.tensor([[8.0], [20.0], [100.0], [1e6]]).double()
     found = PredictionSet(density, EVERYTHING, "mass").scores(value)
@@ -278,7 +280,7 @@ def test_volumes_of_several_numbers():
 @pytest.mark.parametrize("count", [2, 3, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sets_of_a_normal_density_are_ellipsoids(count, drop, dtype):
-    """However far beyond all draws their rim lies: volumes of the ball by its recursion, times |Σ|^½."""
+    """Compare with the ball's volume by recursion times |Σ|^½, also for rims far beyond all samples."""
     root = torch.eye(count).tril() + 0.3 * torch.ones(count, count).tril(-1)
     root = (root * (1 + torch.arange(count)).reshape(-1, 1)).to(dtype).expand(3, count, count)
     density = MultivariateNormal(torch.ones(3, count, dtype=dtype), scale_tril=root, validate_args=False)
@@ -294,7 +296,10 @@ def test_sets_of_a_normal_density_are_ellipsoids(count, drop, dtype):
 @pytest.mark.parametrize("drop", [1.0, 6.0, 30.0])
 @pytest.mark.parametrize("kind", ["reals", "angles"])
 def test_other_volumes_have_an_error_that_covers_the_quadratures(kind, drop):
-    """Of mixtures and of two angles, up to sets far beyond all draws; 40 estimates, half of them within an error."""
+    """Check 40 estimates for mixtures and for two angles, up to sets far beyond all samples.
+
+    All lie within 4.5 standard errors, and more than 30 % within one, up to the error of the quadrature.
+    """
     torch.manual_seed(7)
     if kind == "reals":
         place = torch.tensor([[[0.0, 0.0], [3.0, 1.0]]]).double()
@@ -314,7 +319,7 @@ def test_other_volumes_have_an_error_that_covers_the_quadratures(kind, drop):
     )
     gap = (size - wanted).abs()
     assert (gap <= 4.5 * error + 0.01 * wanted).all() and error.max() < 0.15 * wanted
-    if drop < 30 or kind == "reals":  # all of the torus leaves no chance
+    if drop < 30 or kind == "reals":  # a set that is the whole torus has no sampling error
         assert float((gap < error + 0.003 * wanted).double().mean()) > 0.3
 
 
@@ -390,7 +395,7 @@ def test_what_a_set_has_not_gets_a_sentence():
     st.sampled_from(["density", "mass"]),
 )
 def test_sets_are_what_contains_says(means, exponents, mass, score):
-    """Ends of arcs separate what is in from what is out; the mass of a mass set is what was asked for."""
+    """Check that ends of arcs separate inside from outside, and the probability of a mass set."""
     kind = type(von_mises([0.0], 1.0))
     count = len(means)
     place = torch.tensor(means).double().reshape(1, count, 1)
@@ -430,7 +435,7 @@ def test_levels_and_scores_are_inverse():
 @pytest.mark.parametrize("humps", [2, 5])
 @pytest.mark.parametrize("count", [7, 65, 500])
 def test_no_hump_is_lost_among_many_components(closed, humps, count):
-    """Whatever the others' number and order: humps of 60 % and of shares of the rest, each made of many components."""
+    """Check humps of 60 % and of shares of the rest, each made of many components, in any number and order."""
     torch.manual_seed(count)
     hump = torch.where(torch.rand(ITEMS, count) < 0.6, 0, torch.randint(1, humps, (ITEMS, count)))
     hump[:, :humps] = torch.arange(humps)  # each has one at least

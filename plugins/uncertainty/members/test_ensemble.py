@@ -21,7 +21,7 @@ ANGLE = Target("angle", ("azimuth",))
 
 
 def factory(head="categorical", target=CLASSES, encoder=None, shape=(4,)):
-    """Builds a fresh model at each call, as the framework does."""
+    """Return a function that builds a fresh model at each call, as the framework does."""
     encoder = resolve("encoder", encoder or {"name": "mlp", "widths": [16, 16]})
     config = resolve("density_head", head)
 
@@ -38,7 +38,7 @@ def ensemble(members=3, seed=0, **kind):
 
 
 def members_of(wrapper, **kind):
-    """Each member as a model of its own."""
+    """Return each member as a model of its own."""
     found = []
     for index in range(wrapper.trained):
         model = factory(**kind)()
@@ -85,7 +85,10 @@ def train(predictor, optimizer, inputs, target, steps=40):
     ids=["categorical", "von_mises", "scvae"],
 )
 def test_each_member_becomes_what_it_becomes_alone(kind, make, dtype, tolerance):
-    """For the same start and the same batches. Heads with weights of their own (scvae) draw: they only must move."""
+    """Compare with single models of the same start and batches.
+
+    Heads with weights of their own (scvae) draw random numbers, so that they only must change.
+    """
     inputs, target = data(kind.get("target", CLASSES))
     inputs = inputs.to(dtype)
     target = target if target.dtype == torch.int64 else target.to(dtype)
@@ -121,7 +124,7 @@ ANOTHER = {"name": "mlp", "widths": [16, 16], "batch_norm": True}
     ids=["side by side", "heads with weights", "one after the other"],
 )
 def test_each_member_reads_its_own_batches_and_clips_its_own_gradient(kind, clip):
-    """As a model alone with its own rows, whose gradient torch clips."""
+    """Compare with a single model on a member's rows, whose gradient torch clips."""
     inputs, target = (
         field.to(torch.float64) if field.is_floating_point() else field
         for field in data(kind.get("target", CLASSES))
@@ -163,7 +166,7 @@ def test_each_member_reads_its_own_batches_and_clips_its_own_gradient(kind, clip
 
 
 def test_members_start_as_models_built_one_after_the_other():
-    """The first one as the model alone with that seed."""
+    """Check that the first member equals the single model with that seed."""
     whole = ensemble(3, seed=5)
     torch.manual_seed(5)
     for index in range(3):
@@ -234,7 +237,7 @@ def test_each_member_drops_other_outputs():
 
 
 def test_dropout_of_the_members_can_be_active_where_all_else_evaluates():
-    """As MC dropout around an ensemble has it."""
+    """Check dropout as MC dropout around an ensemble uses it."""
     torch.manual_seed(0)
     whole = SideBySide(
         [network(factory(encoder={"name": "mlp", "widths": [64], "dropout": 0.5})())] * 2
@@ -261,7 +264,7 @@ def test_networks_that_do_not_vectorise_are_computed_one_after_the_other():
 
 
 class Reading(DensityHead):
-    """Learns all there is to learn, of features as they are."""
+    """A head that holds all trained parameters and reads features unchanged."""
 
     direct = True
     size = 4
@@ -302,7 +305,7 @@ def test_a_member_that_is_not_finite_is_named(batch_norm):
             whole.together.write(1, {**bad, "1.bias": torch.full_like(bad["1.bias"], torch.nan)})
         with pytest.raises(UserError, match="member 1 of 3"):
             whole(data()[0])
-        whole.members = 1  # the first alone is sound
+        whole.members = 1  # only the first member is finite
         assert whole(data()[0]).log_prob(data()[1]).isfinite().all()
 
 

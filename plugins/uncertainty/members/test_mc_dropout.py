@@ -74,7 +74,7 @@ class Plain(Predictor):
 
 
 class Branching(Encoder):
-    """An encoder that torch.vmap cannot run behind dropout: it asks for a number."""
+    """An encoder that torch.vmap cannot run after dropout, since it reads a number."""
 
     def __init__(self):
         super().__init__()
@@ -116,7 +116,7 @@ def test_one_sample_is_one_stochastic_pass_to_the_last_bit(head, is_model):
 
 @pytest.mark.parametrize("kind", ["vectorised", "repeated", "repeated predictor", "one by one"])
 def test_many_samples_are_the_mean_over_every_mask(kind, monkeypatch):
-    """Four hidden units dropped with probability 0.4: sixteen masks, enumerated in NumPy."""
+    """Compare with sixteen masks of four hidden units with dropout probability 0.4, enumerated in NumPy."""
     inner = model(encoders=({"name": "mlp", "widths": [4], "dropout": 0.4},))
     inputs = torch.randn(5, 4)
     state = {name: value.double().numpy() for name, value in inner.state_dict().items()}

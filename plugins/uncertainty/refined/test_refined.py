@@ -1,4 +1,4 @@
-"""The wrapper's answer is that of a fit which starts from the wrapped model's."""
+"""Tests that the wrapper returns a fit which starts from the wrapped model's prediction."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ TEN = PRESETS["ten"]
 
 
 def model(target: Target, length: int) -> Model:
-    """A linear model with drawn weights."""
+    """Return a linear model with random weights."""
     torch.manual_seed(0)
     head = build("density_head", resolve("density_head", "gaussian"), target=target)
     return Model([], head, (length,))

@@ -23,7 +23,7 @@ TWO, THREE = Target("class", ("off", "on")), Target("class", ("a", "b", "c"))
 
 
 class Given(Predictor):
-    """Densities made of the inputs themselves."""
+    """A predictor whose densities are made of the inputs."""
 
     def __init__(self, make):
         super().__init__()
@@ -67,7 +67,7 @@ def labelled(count, classes, seed=0, slope=2.5):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_two_classes_agree_with_scikit_learn(seed):
-    """Which fits 1/(1 + exp(A f + B)) with Platt's targets by a quasi-Newton method (2.18)."""
+    """Compare with scikit-learn, which fits 1/(1 + exp(A f + B)) with Platt's targets, quasi-Newton (eq. 2.18)."""
     logits, label = labelled(300, 2, seed)
     odds = (logits[:, 1] - logits[:, 0]).numpy()[:, None]
     wrapper = around(target=TWO)

@@ -27,7 +27,7 @@ CLASSES, ANGLE, REAL = Target("class", ("a", "b", "c")), Target("angle", ("azimu
 
 
 class Given(Predictor):
-    """Densities made of the inputs themselves."""
+    """A predictor whose densities are made of the inputs."""
 
     def __init__(self, make):
         super().__init__()
@@ -66,14 +66,14 @@ def around(model, target=CLASSES, **config):
 
 
 def once(inputs, target, size=50):
-    """Batches that can be read only once."""
+    """Return batches that can be read only once."""
     index = torch.arange(len(target))
     parts = zip(inputs.split(size), target.split(size), index.split(size), strict=True)
     return ({"input": a, "target": b, "index": c} for a, b, c in parts)
 
 
 def labelled(count, scale, seed=0, dtype=torch.float64):
-    """Logits, and labels that are as likely as logits / scale say: the best temperature is about `scale`."""
+    """Return logits, and labels drawn from logits / scale: the best temperature is about `scale`."""
     generator = torch.Generator().manual_seed(seed)
     logits = scale * 2 * torch.randn(count, 3, generator=generator, dtype=dtype)
     label = torch.multinomial(torch.softmax(logits.double() / scale, -1), 1, generator=generator)[:, 0]
@@ -81,7 +81,7 @@ def labelled(count, scale, seed=0, dtype=torch.float64):
 
 
 def cross_entropy(logits, label, logarithm):
-    """Mean negative log-likelihood at log T, by SciPy."""
+    """Return the mean negative log-likelihood at log T, by SciPy."""
     return -special.log_softmax(logits / math.exp(logarithm), -1)[np.arange(len(label)), label].mean()
 
 
@@ -102,7 +102,7 @@ def test_the_temperature_agrees_with_scipy(scale):
 
 @pytest.mark.parametrize("spread, wanted", [(0.5, 0.25), (3.0, 9.0)])
 def test_of_normals_it_is_the_ratio_of_variances(spread, wanted):
-    """T = mean of squared standardised residuals, in closed form."""
+    """Compare with T = mean of squared standardised residuals, in closed form."""
     generator = torch.Generator().manual_seed(1)
     inputs = torch.randn(2000, 2, generator=generator, dtype=torch.float64)
     noise = spread * torch.randn(2000, 1, generator=generator, dtype=torch.float64)
@@ -115,7 +115,7 @@ def test_of_normals_it_is_the_ratio_of_variances(spread, wanted):
 
 
 def test_of_any_angle_and_of_a_mixture():
-    """A cardioid of power 3 is what a cardioid at T = 1/3 says; likewise as members of a mixture."""
+    """Check that a cardioid of power 3 equals a cardioid at T = 1/3, also as members of a mixture."""
     generator = torch.Generator().manual_seed(2)
     normal = torch.randn(3, 800, generator=generator, dtype=torch.float64)
     place = normal[0, :, None]
@@ -136,7 +136,7 @@ def test_of_any_angle_and_of_a_mixture():
 
 
 def test_never_worse_than_before_even_with_several_maxima():
-    """Mixtures whose likelihood has two maxima in the temperature."""
+    """Check mixtures whose likelihood has two maxima in the temperature."""
     generator = torch.Generator().manual_seed(3)
     for trial in range(12):
         inputs = torch.randn(30, 2, generator=generator)
