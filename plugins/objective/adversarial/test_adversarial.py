@@ -37,7 +37,7 @@ def labelled(head, count, dtype=torch.float64):
 
 
 class Recorded(Predictor):
-    """Keeps the inputs of each loss, whose gradient in them is `slope`."""
+    """A predictor that records the inputs of each loss; the gradient of the loss in them is `slope`."""
 
     def __init__(self, slope=1.0):
         super().__init__()
@@ -59,7 +59,7 @@ class Recorded(Predictor):
 
 
 class Linear(Recorded):
-    """Softmax of a linear map."""
+    """A softmax of a linear map."""
 
     def __init__(self):
         super().__init__()
@@ -72,7 +72,7 @@ class Linear(Recorded):
 
 @pytest.mark.parametrize("batch_norm", [False, True], ids=["side by side", "one after the other"])
 def test_members_of_an_ensemble_are_each_moved_along_their_own_gradient(batch_norm):
-    """The penalty of each on its own rows, and its gradient, are those of a model alone."""
+    """Compare the penalty of each member on its own rows, and its gradient, with those of a model alone."""
     objective = Adversarial(weight=0.7, epsilon=0.3)
     wrapper = resolve("uncertainty", {"name": "ensemble", "members": 3})
     alone = [model("gaussian", batch_norm=batch_norm).double() for _ in range(3)]
@@ -100,7 +100,7 @@ def test_members_of_an_ensemble_are_each_moved_along_their_own_gradient(batch_no
 
 @pytest.mark.parametrize("head", list(TARGETS))
 def test_agrees_with_brute_force(head):
-    """The gradient by central differences, number by number; the mean of the losses at the moved inputs."""
+    """Compare with central differences, number by number, and the mean of the losses at the moved inputs."""
     predictor = model(head).double()
     inputs, target = torch.randn(5, 4, dtype=torch.float64), labelled(head, 5)
 
@@ -126,7 +126,7 @@ def test_agrees_with_brute_force(head):
 @settings(deadline=None, max_examples=40)
 @given(st.integers(0, 2**31), st.sampled_from([1e-4, 0.01, 1.0, 30.0]), st.sampled_from([1e-3, 1.0, 1e3]))
 def test_a_convex_loss_rises_by_at_least_its_slope(seed, epsilon, size):
-    """-log softmax of a linear map is convex: loss(x') ≥ loss(x) + ε ‖∇‖₁."""
+    """Check loss(x') ≥ loss(x) + ε ‖∇‖₁ for -log softmax of a linear map, which is convex."""
     predictor = Linear().double()
     generator = torch.Generator().manual_seed(seed)
     inputs = (size * torch.randn(6, 4, dtype=torch.float64, generator=generator)).requires_grad_()
@@ -197,7 +197,7 @@ def test_a_loss_without_a_gradient_in_the_inputs_is_refused(kind):
 
 
 class Kinked(Recorded):
-    """√0 has no derivative: 0 · ∞."""
+    """A predictor with the square root of 0, which has no derivative: 0 · ∞."""
 
     def loss(self, inputs, target):
         return super().loss(inputs, target) + 0 * inputs.abs().sum(1).sqrt()

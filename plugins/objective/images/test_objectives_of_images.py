@@ -1,4 +1,4 @@
-"""Losses of images beyond their contract: formulas written again, files of weights, what is kept, who learns what."""
+"""Tests of losses of images beyond their contract: formulas, weight files, caches, and trained parameters."""
 
 import copy
 from pathlib import Path
@@ -21,7 +21,7 @@ from plugins.objective.images.vgg import CONVOLUTIONS, TAPS, WIDTHS, Depth, laye
 
 
 class Given(Predictor):
-    """Answers the images it was made with."""
+    """A predictor that returns the images it was constructed with."""
 
     def __init__(self, images: Tensor) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ def painter() -> Model:
     ids=["squared error", "random features", "discriminators"],
 )
 def test_each_member_of_an_ensemble_is_judged_by_the_images_of_its_own_rows(make, wrapped: bool) -> None:
-    """Value and gradients are those of models alone, each of which paints its own rows, and those once."""
+    """Compare value and gradients with those of models alone, each of which draws its own rows once."""
     torch.manual_seed(0)
     alone = [painter() for _ in range(3)]
     given = iter(copy.deepcopy(alone))
@@ -99,7 +99,7 @@ def test_each_member_of_an_ensemble_is_judged_by_the_images_of_its_own_rows(make
 
 
 def torchvision(depth: Depth) -> nn.Sequential:
-    """As its documentation lays the features out: convolution, ReLU, and pooling after each block."""
+    """Return the features as torchvision documents them: convolution, ReLU, and pooling after each block."""
     torch.manual_seed(depth)
     layers: list[nn.Module] = []
     channels = 3

@@ -20,7 +20,7 @@ from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignor
 
 
 class OutlierExposure(Objective):
-    """A penalty for densities of outliers that differ from a uniform one (thesis eq. 2.21), for every kind of target.
+    """A penalty for densities of outliers that differ from a uniform one (thesis eq. 2.21), for all kinds of target.
 
     The penalty is the weight times the mean over outliers of a divergence, nats, that is 0 for a density without
     information. For classes "entropy" is KL(p ‖ u) = log K - H(p): eq. 2.21 plus a constant, which has no gradient.

@@ -42,7 +42,7 @@ def objective(**config):
 
 
 class Given(Predictor):
-    """Densities of a head at raw numbers that are a linear map of nothing but themselves; keeps its inputs."""
+    """A predictor with a head's densities at raw parameters that are a linear map of the inputs; keeps its inputs."""
 
     def __init__(self, head, raw, members=False):
         super().__init__()
@@ -106,7 +106,7 @@ def test_the_penalty_is_lambda_times_the_mean_divergence():
 
 
 def test_members_with_batches_of_their_own_see_the_same_outliers():
-    """As many as one member's batch has samples."""
+    """Check that there are as many outliers as samples in one member's batch."""
     built = iter([Model([], head("categorical", CLASSES), (2,)) for _ in range(3)])
     wrapper = resolve("uncertainty", {"name": "ensemble", "members": 3})
     whole = build("uncertainty", wrapper, model=lambda: next(built), target=CLASSES)
@@ -169,7 +169,7 @@ def test_a_sure_class_still_learns_from_cross_entropy_and_not_from_entropy(dtype
 
 
 def test_the_gradient_is_that_of_eq_2_21():
-    """The constant log K changes nothing."""
+    """Check that the constant log K has no gradient."""
     raw = torch.randn(3, dtype=torch.float64)
     predictor = Given(head("categorical", CLASSES), raw.clone())
     objective(**BOX)(predictor, given_batch()).backward()
@@ -191,7 +191,7 @@ def test_places_are_one_in_each_share(count, numbers):
 
 
 def averaged(density, scale, wanted, rows):
-    """Whether the mean over many independent estimates of one divergence is the divergence."""
+    """Return whether the mean over many independent estimates of one divergence equals the divergence."""
     found = to_ignorance(density, scale).double().numpy()
     assert len(found) == rows
     assert found.mean() == pytest.approx(wanted, abs=5 * found.std() / rows**0.5 + 1e-9)
@@ -200,7 +200,7 @@ def averaged(density, scale, wanted, rows):
 
 @pytest.mark.parametrize("concentration", [1e-3, 0.7, 5.0, 80.0])
 def test_of_a_von_mises_density(concentration):
-    """KL(u ‖ p) = log I₀(κ), since the cosine has no mean over a turn."""
+    """Check KL(u ‖ p) = log I₀(κ), since the mean of the cosine over a turn is 0."""
     torch.manual_seed(0)
     density = von_mises(concentration, rows=4000)
     wanted = float(mpmath.log(mpmath.besseli(0, concentration)))
@@ -210,7 +210,7 @@ def test_of_a_von_mises_density(concentration):
 
 
 def von_mises(concentration, rows):
-    """The head's density nearest to this concentration, found by bisection over its raw numbers."""
+    """Return the head's density nearest to this concentration, by bisection over its raw parameters."""
     build_one = head("von_mises", ANGLE)
     low, high = 0.0, 1e3
 
@@ -244,7 +244,7 @@ def test_of_two_angles_it_is_the_sum():
 
 @pytest.mark.parametrize("mean, deviation, scale", [(0.0, 3.0, 3.0), (1.5, 0.4, 2.0), (-30.0, 5.0, 0.1)])
 def test_of_a_gaussian(mean, deviation, scale):
-    """KL(N(0, s²) ‖ N(μ, σ²)) = log σ/s + (s² + μ²) / 2σ² - 1/2 each."""
+    """Check KL(N(0, s²) ‖ N(μ, σ²)) = log σ/s + (s² + μ²) / 2σ² - 1/2 for each number."""
     torch.manual_seed(0)
     density = torch.distributions.Independent(
         torch.distributions.Normal(
@@ -308,7 +308,7 @@ def test_members_train_as_if_alone():
 
 
 class Unread(torch.utils.data.Dataset):
-    """A split that nobody may read."""
+    """A split that must not be read."""
 
     def __getitem__(self, index):
         raise AssertionError("training alone is drawn from")
@@ -317,7 +317,7 @@ class Unread(torch.utils.data.Dataset):
 
 
 class Tiny(Data):
-    """Ten inputs of value 0 to 9; augmentation adds a half."""
+    """A data set of ten inputs of value 0 to 9; augmentation adds a half."""
 
     def __init__(self, shape=(2,)):
         self.input_shape = shape
@@ -346,7 +346,7 @@ class Tiny(Data):
 
 
 class OneByOne(torch.utils.data.Dataset):
-    """A data set without a way to fetch many at once."""
+    """A data set that cannot fetch many items at once."""
 
     def __init__(self, table):
         self.table = table
@@ -419,7 +419,7 @@ def test_batch_norm_sees_outliers_as_in_a_test_and_learns_nothing_of_them():
 
 
 def test_a_network_learns_to_know_nothing_outside_its_data():
-    """Two blobs, as in thesis Fig. 2.3 (f): classes kept apart at their centres, entropy log 2 in the corners."""
+    """Train on two blobs (thesis Fig. 2.3 (f)): classes kept apart at their centres, entropy log 2 in corners."""
     entropies = {}
     for exposed in (False, True):
         torch.manual_seed(0)
