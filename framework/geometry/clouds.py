@@ -122,6 +122,8 @@ def normalised(
     1.
 
     Args:
+        clouds: (batch, points, columns).
+        how: "unit_ball", "robust" or "none".
         counts: result of `sizes`, if it is known.
 
     Raises:

@@ -19,7 +19,8 @@ def unit_ball(clouds, counts, made, centre, scale):
         clouds: (cloud, point, column) float32 or float64.
         counts: number of points of each cloud, int64.
         made: filled with the normalised clouds, like `clouds`.
-        centre, scale: filled, (cloud, 3) and (cloud,) float64.
+        centre: filled with the centre of each cloud, (cloud, 3) float64.
+        scale: filled with the scale of each cloud, (cloud,) float64.
     """
     for number in range(clouds.shape[0]):
         cloud, out, count = clouds[number], made[number], counts[number]

@@ -18,6 +18,7 @@ def farthest(
     on.
 
     Args:
+        places: positions of the points, (batch, points, 3).
         counts: sizes of the clouds, 1 or more; rows behind them are not read.
         count: number of points wanted.
     """

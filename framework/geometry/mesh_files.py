@@ -53,6 +53,7 @@ def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[byt
     """Return the lines that are neither blank nor a comment, without their comments and without a byte-order mark.
 
     Args:
+        content: bytes of the file.
         comment: beginning of a comment, but not within a number, such as 1.#INF. None: there are no comments.
         names: first words of lines whose rest is a name, which may hold the beginning of a comment.
 
@@ -72,7 +73,11 @@ def placed(
     """Return a function that gives the line numbers in the file of the lines of `text_lines`, from `first` on.
 
     Args:
+        content: bytes of the file.
+        comment: as of `text_lines`.
+        names: as of `text_lines`.
         key: counts only lines with this first word.
+        first: index, among the lines of the file that are kept, of the first of these lines.
     """
 
     def place(line: int) -> int:

@@ -84,6 +84,7 @@ def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
     """Read a mesh or cloud file; the suffix of its name gives the format, in capitals or not.
 
     Args:
+        file: path of the file.
         drop_non_finite: leave out vertices with a NaN or infinite coordinate, and faces that use them, and count them
             in `dropped`, instead of raising.
 

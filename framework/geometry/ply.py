@@ -131,6 +131,8 @@ def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tu
     """Return properties of the vertices, one column each, and triangles, from a body with one line per item.
 
     Args:
+        body: bytes after the header.
+        elements: elements that the header announces.
         place: function from the index of a line of the body that is not blank to its number.
         before: number of lines of the header.
     """

@@ -166,7 +166,10 @@ def estimate_log_mean(
         log_weights: (items (n,) int64, start, count) → (replicate, count, n), nats: of these items, at the points
             `start` to `start + count` of each replicate. -inf is a weight of zero. Or (2, replicate, count, n), of
             weights and of shares as `estimated` reads them.
+        items: number of items.
+        effort: number of samples, and tolerance.
         at_once: largest number of weights requested together (at least one for each replicate).
+        device: device of the weights.
     """
     if torch.is_grad_enabled():
         at_once = max(at_once, items * effort.replicates * MOST)

@@ -48,7 +48,8 @@ def frequencies(leaf, start, label, count, classes):
     Args:
         leaf: (tree, sample).
         start: (leaf + 1,), the first entry of each leaf.
-        label, count: (entry,), the classes in a leaf, and the number of training samples of each.
+        label: (entry,), the class of each entry.
+        count: (entry,), the number of training samples of that class in the leaf.
         classes: number of classes.
     """
     trees, samples = leaf.shape

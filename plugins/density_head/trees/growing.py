@@ -28,7 +28,12 @@ def grown(
     Args:
         features: (sample, feature) float32.
         target: (sample,) labels below `classes`; or (sample, number) float64 if `classes` is 0.
-        trees, share, leaf, depth: `trees`, `features`, `leaf` and `depth` of the head.
+        classes: number of classes; 0 for reals.
+        trees: `trees` of the head.
+        share: `features` of the head.
+        leaf: `leaf` of the head.
+        depth: `depth` of the head.
+        seed: seed of the forest.
     """
     options: dict[str, Any] = {
         "n_estimators": trees,

@@ -76,6 +76,7 @@ def load_any_shape(
     A state comes from an untrusted source: nothing of its arrays is used before `require` has checked them all.
 
     Args:
+        head: the module whose buffers take the shapes of a state.
         require: receives the head and the arrays that it would have, with the dtypes of its buffers; raises a
             ValueError with a clause that says what is wrong if they do not fit.
         then: receives the head and torch's lists of missing and unexpected keys; reads what was loaded.

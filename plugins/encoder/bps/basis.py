@@ -101,6 +101,7 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
     Args:
         lattice: function that returns all lattice points within a distance of the origin, and more.
         cell: volume per lattice point.
+        count: number of points in the ball.
 
     Raises:
         ConfigError: for every position of the origin, two points that are equally far would be in and out.

@@ -65,6 +65,7 @@ def columns_of(feature: str, columns: Sequence[str]) -> list[int]:
     """Return the column indices of a feature's attributes in a cloud; an empty list for "distance" and "delta".
 
     Args:
+        feature: "distance", "delta", "color", "normal", or the name of a column.
         columns: names of a cloud's columns (`Data.columns`).
 
     Raises:
@@ -101,6 +102,10 @@ def encode(
     clouds, except where another point becomes the nearest.
 
     Args:
+        clouds: (batch, points, columns), padded as `framework.geometry.clouds` describes.
+        basis: basis points, as `prepared` returns them.
+        features: names of the features, in the order of the result.
+        normalise: as of `framework.geometry.clouds.normalised`.
         columns: names of the clouds' columns, if a feature is an attribute.
         rotation_invariant: encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals are rotated with
             it.
@@ -183,6 +188,7 @@ def per_point(
     coordinates. Padding stays NaN.
 
     Args:
+        encoding: encoding of the clouds.
         points: in the clouds' own units, of the same clouds in the same order.
     """
     local = (points.double() - encoding.centre[:, None]) / encoding.scale[:, None, None]

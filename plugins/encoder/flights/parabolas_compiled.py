@@ -117,10 +117,16 @@ def described(times, places, there, gravity, spans, noise, speed, growth, moment
     """Fill `features` (flight, number) with the features of flights that `extrapolation.ExtrapolationEncoder` returns.
 
     Args:
-        times, places, there, noise, spans: see `parabolas`.
+        times: see `parabolas`.
+        places: see `parabolas`.
+        there: see `parabolas`.
         gravity: m/s².
-        speed, growth: growth of the unit with time, (3,), m/s, and with its square, m/s².
+        spans: see `parabolas`.
+        noise: see `parabolas`.
+        speed: growth of the unit with time, (3,), m/s.
+        growth: growth of the unit with the square of time, (3,), m/s².
         moments: times at which the ball is predicted, (future,), s.
+        features: filled, (flight, number).
     """
     flights, count = times.shape
     fallen = places.copy()  # positions without the effect of gravity

@@ -45,6 +45,9 @@ def centres_of(
     The result is padded as clouds are, and has the dtype of `like`.
 
     Args:
+        chosen: whether each cell is chosen, (batch, side³), x slowest.
+        like: tensor whose dtype and device the centres get.
+        side: number of cells along each edge.
         normalised: the encoded clouds; their centre and scale lead back to the clouds' units.
         what: adjective for a chosen cell in the message, such as "occupied".
 

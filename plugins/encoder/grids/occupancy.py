@@ -63,6 +63,7 @@ def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float
 
     Args:
         clouds: normalised; rows of NaN are padding.
+        side: number of cells along each edge.
     """
     coordinates = clouds[..., :3].detach()
     inside = (coordinates.abs() <= 1 + ROUNDING).all(-1)  # False for NaN

@@ -69,6 +69,7 @@ def truncated_distance(
 
     Args:
         clouds: normalised; rows of NaN are padding.
+        side: number of cells along each edge.
         truncation: in edges of a cell.
     """
     real = ~clouds[..., 0].isnan()

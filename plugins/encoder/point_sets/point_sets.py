@@ -56,6 +56,9 @@ def over_points(
 
     Args:
         network: function of the points (as `points_of` returns them) and of the number of points of each cloud.
+        clouds: (batch, points, columns).
+        reading: columns, points and normalisation that are read.
+        dtype: dtype of the points that the network reads.
         training: whether the network needs the whole batch at once, as batch norm does.
         held: as of `in_parts`.
     """
@@ -77,6 +80,7 @@ def points_of(
     """Return the points of all clouds, concatenated, normalised and without padding, and the number of points of each.
 
     Args:
+        clouds: (batch, points, columns).
         normalise: as of `framework.geometry.clouds.normalised`; it reads all points.
         columns: number of columns that are read, the first ones.
         most: largest number of points that are read of a cloud, the first ones; None for all.
@@ -139,6 +143,9 @@ def in_parts(
     whole batch.
 
     Args:
+        network: as of `over_points`.
+        values: concatenated points.
+        counts: number of points of each cloud.
         held: approximate number of rows of numbers that the network makes of a point.
     """
     limit = (AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE) // held

@@ -26,7 +26,11 @@ def chosen(
     `framework.geometry.farthest`.
 
     Args:
+        clouds: (batch, points, columns), padded with NaN.
         counts: sizes of the clouds.
+        count: number of points to choose.
+        choice: "random" or "farthest".
+        seed: seed of "random".
     """
     if choice == "random":
         rows = [_random(size, count, seed) for size in counts.tolist()]

@@ -29,9 +29,15 @@ def project(cloud, focal, middle, nearest, farthest, depth, index, picture):
     point is left out.
 
     Args:
-        focal, middle: pixels; `middle` is (column, row) of the principal point, counted from the upper left corner of
-            the image. It is half a pixel more than counted from the centre of the first pixel.
-        nearest, farthest: metres.
+        cloud: see the module.
+        focal: focal length, pixels.
+        middle: (column, row) of the principal point, pixels, counted from the upper left corner of the image. It is
+            half a pixel more than counted from the centre of the first pixel.
+        nearest: smallest depth that is seen, metres.
+        farthest: depth from which points are not seen, metres.
+        depth: see the module.
+        index: see the module; None if the image is filled.
+        picture: see the module; None if the index is filled.
     """
     height, width = depth.shape
     depth[:] = np.inf
@@ -101,11 +107,15 @@ def splat(picture, nearest, span, focal, thick, around, close, weights, filled):
     """Fill the five channels of `filled` from the four of `picture`, as `splats.splatted` describes.
 
     Args:
-        nearest, span: smallest depth, and range of depths, of the fourth channel, metres.
-        focal, thick: pixels.
-        around, close: (places, 2) rows and columns of the offsets in a disc, row by row: the disc of a splat, and the
-            disc of the closing of holes.
+        picture: (4, height, width), as `project` fills it.
+        nearest: smallest depth of the fourth channel, metres.
+        span: range of depths of the fourth channel, metres.
+        focal: focal length, pixels.
+        thick: thickness of a surface, pixels.
+        around: (places, 2) rows and columns of the offsets in the disc of a splat, row by row.
+        close: (places, 2) rows and columns of the offsets in the disc that closes holes, row by row.
         weights: weight of a point, indexed by its squared distance and the squared distance of the nearest point.
+        filled: (5, height, width).
     """
     height, width = picture.shape[1:]
     longest, radius = len(weights), around[-1, 0]

@@ -61,6 +61,7 @@ def splatted(
     the channels, not in which points are seen.
 
     Args:
+        pictures: images of `encoder.project` at one level, (batch, 4, height, width).
         limits: nearest and farthest depth, metres, at which the fourth channel is 0 and 1.
         focal: pixels.
         radius: pixels, 1 or more.

@@ -207,6 +207,10 @@ def require_pictures(
     """Require images with enough channels, and compatible settings of crop and normalisation.
 
     Args:
+        name: name of the encoder, for messages.
+        input_shape: (channels, height, width).
+        normalisation: as of `unet.UNet`.
+        crop: as of `unet.UNet`.
         least: smallest number of channels of the input.
 
     Raises:

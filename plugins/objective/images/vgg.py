@@ -114,7 +114,10 @@ def drawn(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) 
     Their variance is that of He et al. 2015, eq. 10.
 
     Args:
+        depth: number of layers of the whole network, 16 or 19.
         width: channels of the first block; those of the others are in VGG's proportion.
+        taps: convolutions whose outputs are features, ascending.
+        seed: seed of the weights.
     """
     network = VGG(depth, [width * channels // WIDTHS[0] for channels in WIDTHS], taps)
     generator = torch.Generator().manual_seed(seed)

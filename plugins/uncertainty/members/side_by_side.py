@@ -59,6 +59,7 @@ class SideBySide(nn.Module):
         """Shorten each member's gradient to the norm `most`, as torch's clip_grad_norm_ does for one network.
 
         Args:
+            most: largest norm of a member's gradient.
             beside: further modules of each member.
         """
         gradients = [one.grad for one in self.parameters() if one.grad is not None]

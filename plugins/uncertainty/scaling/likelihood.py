@@ -43,6 +43,10 @@ def minimise(
     """Return a local minimum of Σ terms in the box lower ≤ point ≤ upper; one term's graph is held at a time.
 
     Args:
+        terms: the terms of the sum.
+        start: first point, within the box.
+        lower: lower bounds.
+        upper: upper bounds.
         rounding: rounding error of the values, relative to 1 + |value|; smaller gains end the search.
     """
     low, high = lower.cpu().numpy(), upper.cpu().numpy()
