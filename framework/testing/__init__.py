@@ -1,5 +1,6 @@
-"""The contracts of the registries as checks: a plugin's rows buy every one of them, in pytest and in `mode=check`.
+"""Contract tests of the registries: the rows of a plugin decide which checks run, in pytest and in `mode=check`.
 
-`contract` runs them for a plugin by name; `rows` is what a plugin states; `finding` what a check says. The checks
-themselves are in one module for each group, and `densities` holds what any density must satisfy.
+`contract` runs the checks of a plugin that is given by name. `rows` defines what a plugin states about itself, and
+`finding` defines the result of a check. Each group of plugins has its own module of checks; `densities` holds what
+every density must satisfy.
 """

@@ -1,4 +1,4 @@
-"""Runs the contract of any installed plugin by name: its rows, each property, one finding at a time."""
+"""Contract tests of any installed plugin, given by name: every check of every row yields one finding."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -40,16 +40,16 @@ ROW_OF = {
     "renderer": RendererRow,
 }
 SHAPES = ((3, 64, 64), (1, 96, 80), (16,))
-"""What a plugin without rows is tried with; it may refuse some, with a ConfigError."""
+"""Input shapes that an encoder without rows is tried with; it may refuse some of them with a ConfigError."""
 
 
 @dataclass(frozen=True)
 class Contract:
-    """The rows of one plugin and the checks of its group.
+    """Rows of one plugin and the checks of its group.
 
     Attributes:
-        group, name: which plugin.
-        rows: its parametrisations.
+        group, name: group and name of the plugin.
+        rows: parametrisations of the plugin to check.
     """
 
     group: str
@@ -57,18 +57,20 @@ class Contract:
     rows: tuple[Row, ...]
 
     def findings(self, row: Row) -> Iterator[Finding]:
-        """Every property of one row."""
+        """Yield one finding for each property of a row."""
         yield from _examiner(self.group)(self.name, row)
 
 
 def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> Contract:
-    """The contract of the plugin `name`; `config`, where it is neither a row already nor the defaults, is one more.
+    """Return the contract of the plugin `name`, with one more row for `config` where that is not checked already.
 
-    Where the plugin ships rows, the further one is that of the same parts, else the first whose target suits it, with
-    other parameters: it keeps the target, and what is left out, but no reference.
+    The row is added unless `config` equals the configuration of a shipped row or the defaults. Where the plugin ships
+    rows, the new row is a copy of a shipped one with the parameters of `config`: of the row whose parts have the same
+    names, else of the first row whose target the configured plugin accepts. The copy keeps the target and the
+    properties left out, but not the reference cases.
 
     Raises:
-        ConfigError: no such plugin, a group without a contract, a config out of range, or no row fits.
+        ConfigError: The plugin does not exist, its group has no contract, the config is out of range, or no row fits.
     """
     _examiner(group)
     shipped = _shipped(group, name)
@@ -94,7 +96,7 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
 
 
 def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) -> Row:
-    """The row whose parts have the names of the chosen ones', or the first whose target accepts them."""
+    """Return the row whose parts have the same names as those of `chosen`, else the first whose target is accepted."""
 
     def same_parts(row: Row) -> bool:
         theirs = resolve(group, {"name": chosen["name"], **row.config})
@@ -115,10 +117,11 @@ def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) ->
 
 
 def _shipped(group: str, name: str) -> tuple[Row, ...]:
-    """The rows a plugin gives in the `rows.py` beside its class, else those its family gives in a folder above.
+    """Return the rows of the `rows.py` beside the plugin's class, else those of a `rows.py` in a folder above it.
 
-    A family's folder stands in the drawer of its registry, `plugins/<group>/<family>`. Where there is no drawer of this
-    name, as in a package of somebody else's, any folder above counts.
+    A family of plugins keeps its rows in its folder, `plugins/<group>/<family>`. The search goes up to the folder of
+    the registry and stops there. In a package without a folder of that name, as of another author, it goes up to the
+    top.
     """
     package = load(group, name).__module__.rpartition(".")[0]
     while package:
@@ -134,7 +137,7 @@ def _shipped(group: str, name: str) -> tuple[Row, ...]:
 
 
 def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> tuple[Row, ...]:
-    """Rows with `config` on every target or shape that the plugin accepts."""
+    """Return a row with `config` for every target or input shape that the plugin accepts."""
     resolved = resolve(group, {"name": name, **config})
     if group == "data":
         return (DataRow(label, config, leave_out=SAID_BY_ROWS),)
@@ -162,7 +165,7 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
 
 
 def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
-    """Build the plugin for a target, which it may refuse; a wrapper also when it sees densities of the kind."""
+    """Build the plugin for a target, which may raise a ConfigError; a wrapper is also calibrated on such densities."""
     if group == "uncertainty":
         import torch
 
@@ -171,7 +174,7 @@ def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
 
         wrapper = build(group, resolved, model=lambda: Plain(target), target=target)
         batch = {"input": inputs(8), "target": values(target, (8,)), "index": torch.arange(8)}
-        try:  # some learn only from its densities what they cannot do, such as a power without a normaliser
+        try:  # some wrappers learn only from the densities that they cannot work, such as a power without a normaliser
             wrapper.eval().calibrate([batch])
             wrapper(batch["input"])
         except UserError as error:
@@ -265,4 +268,4 @@ CONTRACTS: dict[str, Callable[[str, Any], Iterator[Finding]]] = {
     "objective": _examine_objective,
     "renderer": _examine_renderer,
 }
-"""Group → name and row → findings."""
+"""Check functions by group: each takes the plugin's name and a row, and yields findings."""

@@ -1,4 +1,4 @@
-"""Optional questions of the protocol (framework.distributions.protocol), compared with log_prob and with draws."""
+"""Checks of the optional functions of framework.distributions.protocol against log_prob and against draws."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -32,31 +32,36 @@ from framework.errors import UserError
 from framework.testing.finding import SEED, Worst, seed
 
 MANY = 4000
-"""Draws that an answer is compared with."""
+"""Number of draws that a result is compared with."""
 TEMPERATURES = (0.6, 1.7)
 SUSPICIOUS = 6.0
-"""Standard errors that ordinary luck does not exceed."""
+"""Number of standard errors that a deviation by chance does not exceed."""
 APART = 2.7
-"""Likewise, of the statistic of Kolmogorov and Smirnov, √(n/2) times the largest distance of two shares of n draws:
-exceeded by luck once in 10⁶ comparisons."""
+"""Largest Kolmogorov-Smirnov statistic that is ascribed to chance.
+
+The statistic is √(n/2) times the largest difference between the empirical distribution functions of two samples of n
+draws. Chance exceeds this value once in 10⁶ comparisons.
+"""
 
 
 def some_values(density: Distribution, count: int = 6) -> Tensor:
-    """A few draws and the mode, (value, *batch, *event)."""
+    """Return `count` draws and the mode, (count + 1, *batch, *event)."""
     seed(SEED + 3)
     drawn = density.sample(torch.Size((count,)))
     return torch.cat([drawn, density.mode.unsqueeze(0).to(drawn)])
 
 
 def seeded_log_prob(density: Distribution, value: Tensor, number: int = SEED) -> Tensor:
+    """Return log_prob of a value, after random numbers were seeded with `number`."""
     seed(number)
     return density.log_prob(value)
 
 
 def estimated(density: Distribution, worst: Worst) -> None:
-    """estimate(density, value) is log_prob within its own error, which is 0, or unknown, where nothing is drawn.
+    """Check that estimate(density, value) agrees with log_prob within the standard error that it states.
 
-    Where log_prob draws, the error is about the spread of what it says with other seeds: no less than a fifth of it.
+    Where nothing is drawn, the standard error must be 0 or unknown. Where log_prob draws random numbers, the standard
+    error must be at least a fifth of the spread of log_prob over seeds.
     """
     value = some_values(density)
     wanted = seeded_log_prob(density, value)
@@ -79,7 +84,7 @@ def estimated(density: Distribution, worst: Worst) -> None:
             "log_prob draws and its standard error is less than a fifth of its spread over seeds",
         )
     else:
-        # what was drawn once, when the density was made, says so by its samples
+        # a density that drew once, when it was made, says so by its number of samples
         worst.count((known > 0) & (found.samples == 0), "a standard error where nothing is drawn")
     size = wanted.double().abs().clamp(min=1)
     room = 1e-6 * size + (SUSPICIOUS * known if drawn else 0.0)
@@ -92,8 +97,8 @@ def estimated(density: Distribution, worst: Worst) -> None:
 
 
 def powers(density: Distribution, worst: Worst) -> None:
-    """tempered(density, T) is proportional to p^(1/T), of the same shapes and number type, where it is known."""
-    while isinstance(density, Mixture):  # whose components are tempered, each by itself
+    """Check that tempered(density, T), where known, is proportional to p^(1/T), with the same shapes and dtype."""
+    while isinstance(density, Mixture):  # a mixture tempers each of its components by itself
         density = density.components
     value = some_values(density)
     log_prob = density.log_prob(value).double()
@@ -118,7 +123,7 @@ def powers(density: Distribution, worst: Worst) -> None:
 
 
 def powers_of(density: Distribution, worst: Worst, check: Callable[[Distribution, Worst], None]) -> None:
-    """A property of densities, asked of those at two temperatures."""
+    """Apply a check to the density at each of TEMPERATURES."""
     for temperature in TEMPERATURES:
         try:
             power = tempered(density, torch.tensor(temperature, dtype=torch.float64))
@@ -129,7 +134,7 @@ def powers_of(density: Distribution, worst: Worst, check: Callable[[Distribution
 
 
 def picks(density: Distribution, worst: Worst) -> None:
-    """pick(density, index) draws from the item that the index names, of densities with batch_shape (rows, 2)."""
+    """Check that pick(density, index) draws from the item that the index names; batch_shape is (rows, 2)."""
     rows, count = density.batch_shape
     index = (torch.arange(MANY).unsqueeze(-1) + torch.arange(rows)) % count
     drawn = pick(density, index).sample()
@@ -142,7 +147,7 @@ def picks(density: Distribution, worst: Worst) -> None:
 
 
 def two_samples(density: Distribution, first: Tensor, second: Tensor, worst: Worst, what: str) -> None:
-    """Draws (draw, *event) of one density, against as many others: in units of APART."""
+    """Compare draws (draw, *event) with as many draws of the same density; the error is in units of APART."""
     count = len(first)
     if density.has_enumerate_support and density.event_shape == ():
         labels = torch.arange(int(max(first.max(), second.max())) + 1)
@@ -155,14 +160,14 @@ def two_samples(density: Distribution, first: Tensor, second: Tensor, worst: Wor
         mine = torch.cat([torch.ones(count), -torch.ones(len(second))]).double() / count
         order = both.argsort(dim=0, stable=True)
         value, sign = both.gather(0, order), mine[order]
-        # equal values are one step
+        # equal values form one step of the distribution function
         last = torch.cat([value[1:] != value[:-1], torch.ones_like(value[:1], dtype=torch.bool)])
         apart = sign.cumsum(0).abs().where(last, 0.0)
     worst.see((count / 2) ** 0.5 * apart / APART, f"draws of {what} are not the density's")
 
 
 def slopes(density: Distribution, worst: Worst) -> None:
-    """slope(density, value) touches log_prob, has its gradient, and is a bound from below however far one goes."""
+    """Check that slope(density, value) equals log_prob and its gradient at the value and is a lower bound elsewhere."""
     value = some_values(density).requires_grad_()
     with torch.enable_grad():
         log_prob = density.log_prob(value)
@@ -193,7 +198,7 @@ def slopes(density: Distribution, worst: Worst) -> None:
 
 
 def moved_places(density: Distribution, worst: Worst) -> None:
-    """about(density, index, place) at d is log_prob at place + d, of densities of one number."""
+    """Check that about(density, index, place) at d is log_prob at place + d, for densities of one number."""
     rows = density.batch_shape[0]
     index = torch.arange(2 * rows + 1) % rows
     width = known_widths(density)
@@ -211,13 +216,13 @@ def moved_places(density: Distribution, worst: Worst) -> None:
 
 
 def known_widths(density: Distribution) -> Tensor:
-    """Of the normal that is as high, (rows), and no more than half a turn."""
+    """Return the standard deviation, (rows,), of a normal as high as the density at its mode; for angles at most 1."""
     width = (-density.log_prob(density.mode).double()).exp() / math.sqrt(2 * math.pi)
     return width.clamp(max=1.0) if isinstance(density.support, Circular) else width
 
 
 def normal_forms(density: Distribution, worst: Worst) -> None:
-    """normals are the density, and mahalanobis is -2 log p up to a constant, where they are known."""
+    """Check that `normals` gives the density and `mahalanobis` -2 log p up to a constant, where they are known."""
     worst.count(False, "not known")
     value = some_values(density)
     log_prob = density.log_prob(value).double()
@@ -234,7 +239,7 @@ def normal_forms(density: Distribution, worst: Worst) -> None:
 
 
 def candidates(density: Distribution, worst: Worst) -> None:
-    """peaks and scales: finite, of the shapes that are said, and widths above 0."""
+    """Check that `peaks` and `scales` are finite and of the documented shapes, and that all scales are above 0."""
     places = peaks(density)
     shape = (*density.batch_shape, *density.event_shape)
     worst.same("shape of a peak", tuple(places.shape[1:]), shape)
@@ -246,7 +251,7 @@ def candidates(density: Distribution, worst: Worst) -> None:
 
 
 def shares_below(density: Distribution, worst: Worst) -> None:
-    """each_cdf is the share of draws below, number by number, in standard errors of MANY draws."""
+    """Check that each_cdf is the share of draws below a value, for each number; in standard errors of MANY draws."""
     value = some_values(density)
     found = each_cdf(density, value)
     if found is None:
@@ -260,7 +265,7 @@ def shares_below(density: Distribution, worst: Worst) -> None:
 
 
 def moments_of_draws(density: Distribution, worst: Worst) -> None:
-    """mean and variance of each of many reals are those of draws, in standard errors."""
+    """Check mean and variance of each number of many reals against those of draws, in standard errors."""
     drawn = density.sample(torch.Size((MANY,))).double()
     middle = drawn.mean(0)
     apart = (drawn - middle).square()
@@ -277,28 +282,31 @@ def moments_of_draws(density: Distribution, worst: Worst) -> None:
     worst.see((mean - middle).abs() / noise / SUSPICIOUS, "mean")
     noise = apart.std(0) / MANY**0.5 + 2 * noise.square() + 1e-6 * variance.abs() + 1 / MANY * apart.amax(0)
     gap = (variance - apart.mean(0)).abs() / noise / SUSPICIOUS
-    # of a number with two values, one of them rare, draws may show one only
+    # where a number has two values and one is rare, the draws may show only the other
     several = (drawn.sort(0).values.diff(dim=0) > 0).sum(0) > 1
     worst.see(gap.where(variance.isfinite() & several, 0.0), "variance")
 
 
 def medians_of_draws(density: Distribution, worst: Worst) -> None:
-    """Half of the draws lie below each number's median, of angles on the half turn after it; in standard errors."""
+    """Check that half of the draws lie on each side of the median of each number, in standard errors.
+
+    For angles the two sides are the half turns before and after the median.
+    """
     seed(SEED)
     chosen = median(density, MANY // 2)
     drawn = density.sample(torch.Size((MANY,)))
     offset = drawn - chosen
     offset = wrap(offset) if isinstance(density.support, Circular) else offset
-    # its own error adds to that of the shares
+    # the median is itself estimated from draws, which adds to the error of the shares
     noise = 0.5 * (3 / MANY) ** 0.5
     above, below = (offset > 0).double().mean(0), (offset < 0).double().mean(0)
-    # of numbers with few values more than half may be equal to it
+    # where a number has few values, more than half of the draws may equal the median
     gap = (torch.maximum(above, below) - 0.5).clamp(min=0)
     worst.see(gap / noise / SUSPICIOUS, "more than half of the draws on one side")
 
 
 def marginals_of_draws(density: Distribution, worst: Worst) -> None:
-    """Draws of marginal(density, number) are like those of the number."""
+    """Check that draws of marginal(density, number) are distributed as that number is in draws of the density."""
     drawn = density.sample(torch.Size((MANY // 2,)))
     for number in range(density.event_shape[0]):
         try:
@@ -314,7 +322,7 @@ def marginals_of_draws(density: Distribution, worst: Worst) -> None:
 
 
 def mixed(components: Distribution) -> Mixture:
-    """Of densities with batch_shape (rows, 2), seven tenths of the first."""
+    """Return the mixture of two components with weights 0.7 and 0.3; batch_shape of `components` is (rows, 2)."""
     like = components.log_prob(components.mode)
     weights = like.new_tensor([0.7, 0.3], dtype=torch.float64).log().expand(components.batch_shape)
     return Mixture(weights.to(like.dtype), components)
@@ -323,11 +331,11 @@ def mixed(components: Distribution) -> Mixture:
 def every_question(
     density: Distribution, index: Tensor, temperature: Tensor
 ) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Yield all that densities (rows,) can be asked, by name; what one does not know it refuses.
+    """Yield every function of the protocol by name, as a call on densities (rows,); a density may refuse some.
 
     Args:
-        index: (draw, 1), numbers of rows.
-        temperature: above 0, of no dimension.
+        index: Numbers of rows, (draw, 1).
+        temperature: Temperature above 0, a tensor without dimensions.
     """
     few = torch.Size((5,))
     value = density.sample(few)

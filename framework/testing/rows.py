@@ -1,8 +1,8 @@
-"""Rows of the contract: a plugin states parameters and references in its `rows.py`, and every check runs on them.
+"""Rows of the contract: the parameters and references that a plugin states in its `rows.py` for the contract tests.
 
-`rows.py` stands beside the module that holds the plugin's class, or for a family in a folder above it; its `ROWS` is a
-dictionary from the plugin's name to its rows, of `HeadRow` for a density head, and so on. A plugin without rows is
-checked with its default parameters and no reference.
+`rows.py` stands beside the module of the plugin's class, or for a family in a folder above it. Its `ROWS` is a
+dictionary from the plugin's name to its rows, for example `HeadRow` for a density head. A plugin without rows is
+checked with its default parameters and without a reference.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -18,13 +18,13 @@ from framework.target import Target
 
 @dataclass(frozen=True)
 class Case:
-    """Stiff or extreme raw numbers of a density head with log-densities from an independent source.
+    """Stiff or extreme distribution parameters of a density head, with log-densities from an independent source.
 
     Attributes:
-        name: what is extreme here: "κ = 1e12".
-        raw: (batch, size) float64 raw numbers that float32 holds exactly.
-        value: (batch, *event) targets that float32 holds exactly, int64 for classes.
-        log_prob: (batch,) float64, the log-density there, nats, to full float64 accuracy.
+        name: What is extreme here: "κ = 1e12".
+        raw: Distribution parameters, (batch, size) float64, each exactly representable in float32.
+        value: Targets, (batch, *event), each exactly representable in float32; int64 for classes.
+        log_prob: Log-density at `value`, (batch,) float64, nats, to full float64 accuracy.
     """
 
     name: str
@@ -35,17 +35,19 @@ class Case:
 
 @dataclass(frozen=True)
 class HeadRow:
-    """One parametrisation of a density head.
+    """Parametrisation of a density head.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        target: what it predicts.
-        config: its parameters.
-        cases: the reference: a built head (evaluation mode, float64) → cases. None where none is known.
-        scale: standard deviation of the normal raw numbers on which densities of three numbers, and those that draw,
-            are integrated, such that they are broad enough for a grid; others follow at scales of 1e-2 to 1e3 too.
-        limits: property → limit, where it is not the contract's own.
-        leave_out: property → why this density cannot have it.
+        name: What distinguishes the row from the plugin's other rows.
+        target: Target that the head predicts.
+        config: Parameters of the head.
+        cases: Function from a built head (evaluation mode, float64) to reference cases; None where no reference is
+            known.
+        scale: Standard deviation of the normal distribution parameters at which densities of three numbers, and
+            densities that draw, are integrated. It must make them broad enough for a grid. Other densities are also
+            integrated at scales from 1e-2 to 1e3.
+        limits: Property → limit, where it differs from the contract's own.
+        leave_out: Property → reason why this density cannot have it.
     """
 
     name: str
@@ -59,14 +61,14 @@ class HeadRow:
 
 @dataclass(frozen=True)
 class EncoderRow:
-    """One parametrisation of an encoder: of images of 3 or fewer channels, of vectors; of clouds see CloudRow.
+    """Parametrisation of an encoder of vectors or of images with at most 3 channels; CloudRow is for point clouds.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        input_shape: of one sample.
-        config, limits, leave_out: as in HeadRow.
-        columns: names of its last dimension, as `Data.columns`.
-        inputs: number of samples → inputs, where it does not read any numbers.
+        name: What distinguishes the row from the plugin's other rows.
+        input_shape: Shape of the input of one sample.
+        config, limits, leave_out: See HeadRow.
+        columns: Names of the last dimension of the input, as `Data.columns`.
+        inputs: Function from a number of samples to inputs, for an encoder that does not accept arbitrary numbers.
     """
 
     name: str
@@ -80,22 +82,25 @@ class EncoderRow:
 
 @dataclass(frozen=True)
 class CloudRow(EncoderRow):
-    """One parametrisation of an encoder of point clouds, of shape (points, columns) with x, y, z in the first three.
+    """Parametrisation of an encoder of point clouds.
 
-    Such an encoder sees a set: neither padding nor the order of its points matters, and bad clouds are named.
+    A cloud has shape (points, columns), with x, y, z in the first three columns. Such an encoder reads a set: its
+    features depend neither on padding nor on the order of the points, and it must refuse malformed clouds with an error
+    that names them.
     """
 
 
 @dataclass(frozen=True)
 class MetricRow:
-    """One parametrisation of a metric.
+    """Parametrisation of a metric.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        target: what is predicted; a metric that reads images sees a ball there (`framework.testing.balls`).
-        fields: further fields of a batch that it reads: number of samples → tensor with that first dimension.
-        size: height and width of the images that are predicted, where it reads some.
-        config, limits, leave_out: as in HeadRow.
+        name: What distinguishes the row from the plugin's other rows.
+        target: Target that is predicted; a metric that reads images gets images of a ball (`framework.testing.balls`).
+        fields: Further batch fields that the metric reads: name → function from a number of samples to a tensor with
+            that first dimension.
+        size: Height and width in pixels of the predicted images, where the metric reads some.
+        config, limits, leave_out: See HeadRow.
     """
 
     name: str
@@ -109,14 +114,14 @@ class MetricRow:
 
 @dataclass(frozen=True)
 class WrapperRow:
-    """One parametrisation of an uncertainty wrapper.
+    """Parametrisation of an uncertainty wrapper.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        target: what is predicted.
-        identity: parameters with which it must be the model it wraps, to the last bit ({"members": 1}); None where
-            there are none.
-        config, limits, leave_out: as in HeadRow.
+        name: What distinguishes the row from the plugin's other rows.
+        target: Target that is predicted.
+        identity: Parameters with which the wrapper must equal the model that it wraps, to the last bit ({"members":
+            1}); None where there are none.
+        config, limits, leave_out: See HeadRow.
     """
 
     name: str
@@ -129,13 +134,14 @@ class WrapperRow:
 
 @dataclass(frozen=True)
 class ObjectiveRow:
-    """One parametrisation of an objective, on inputs that are vectors of `framework.testing.wrappers.LENGTH` numbers.
+    """Parametrisation of an objective; the inputs are vectors of `framework.testing.wrappers.LENGTH` numbers.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        target: what is predicted.
-        fields: further fields of a batch that it reads: number of samples → tensor with that first dimension.
-        config, limits, leave_out: as in HeadRow.
+        name: What distinguishes the row from the plugin's other rows.
+        target: Target that is predicted.
+        fields: Further batch fields that the objective reads: name → function from a number of samples to a tensor with
+            that first dimension.
+        config, limits, leave_out: See HeadRow.
     """
 
     name: str
@@ -148,11 +154,11 @@ class ObjectiveRow:
 
 @dataclass(frozen=True)
 class RendererRow:
-    """One parametrisation of a renderer.
+    """Parametrisation of a renderer.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        config, limits, leave_out: as in HeadRow.
+        name: What distinguishes the row from the plugin's other rows.
+        config, limits, leave_out: See HeadRow.
     """
 
     name: str
@@ -162,7 +168,7 @@ class RendererRow:
 
 
 Damage = Literal["missing", "empty", "cut", "garbage", "folder"]
-"""What can happen to a file: it is gone, has no bytes, half of them, others, or a folder stands in its place."""
+"""Damage to a file: it is removed, emptied, cut in half, filled with other bytes, or replaced by a folder."""
 DAMAGES: tuple[Damage, ...] = ("missing", "empty", "cut", "garbage", "folder")
 
 
@@ -176,24 +182,24 @@ SAID_BY_ROWS: Mapping[str, str] = dict.fromkeys(
     ),
     "a rows.py has to say what is wanted",
 )
-"""What of a data set without rows cannot be checked, and why."""
+"""Properties that cannot be checked of a data set without rows, and the reason."""
 
 
 @dataclass(frozen=True)
 class DataRow:
-    """One parametrisation of a data set, as small as it goes: it is prepared a dozen times.
+    """Parametrisation of a data set, as small as possible, because it is prepared a dozen times.
 
     Attributes:
-        name: what distinguishes it from the plugin's other rows.
-        config, limits, leave_out: as in HeadRow.
-        write: fills an empty folder with what the data set reads, the official layout where there is one, and returns
-            the parameters that say where it is ({"root": ...}). None where data are generated.
-        synthetic: what `Data.synthetic` has to say; None: anything.
-        files: fills an empty folder with two or more files of a user's own, no two alike, for `Data.read`.
-        fragile: pattern of files below what was written or generated → the damage to the first of them that `prepare`
-            has to name. Half a list of names is a list of names: such damage nobody can see.
-        skip: parameters that have files of the first of these patterns left out and counted where they cannot be read.
-        changes: parameters each of which changes the samples, and with them the fingerprint.
+        name: What distinguishes the row from the plugin's other rows.
+        config, limits, leave_out: See HeadRow.
+        write: Function that fills an empty folder with the files that the data set reads, in the official layout where
+            there is one, and returns the parameters that locate them ({"root": ...}). None where data are generated.
+        synthetic: Value that `Data.synthetic` must have; None accepts any.
+        files: Function that fills an empty folder with two or more user files for `Data.read`, no two of them equal.
+        fragile: Pattern of written or generated files → kinds of damage to the first match that `prepare` must report
+            by name. Leave out damage that cannot be detected: half of a list of names is still a list of names.
+        skip: Parameters with which unreadable files of the first pattern are left out and counted.
+        changes: Parameters that each change the samples, and therefore the fingerprint.
     """
 
     name: str
