@@ -1,4 +1,4 @@
-"""What must hold of the calibration of an uncertainty wrapper: it does no harm, and fits on all that it is given."""
+"""Checks of the calibration of an uncertainty wrapper: it does no harm, and it uses all data that it is given."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -17,34 +17,39 @@ from framework.testing.wrappers import Build, in_units, inputs, wrapped
 from framework.uncertainty import Uncertainty
 
 SPREADS = {"as sure as it should be": 1.0, "too sure": 3.0, "not sure enough": 0.3}
-"""How far labels lie from the mode, in terms of draws of the model's own densities."""
+"""Description of a model → factor by which labels lie farther from the mode than draws of the model's densities."""
 ROWS = 200
 UNEVEN = ((50, 0.5), (50, 2.0), (30, 1.0), (4, 8.0))
-"""Rows of each batch, and the spread of its labels."""
+"""Number of rows of each batch, and the factor that spreads its labels (see SPREADS)."""
 FAR = 8.0
-"""Inputs this many times the usual ones, at which models of different weights predict places far apart."""
+"""Factor on the usual inputs, so that models of different weights predict places far apart."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A row, and how to build its wrapper for the row's target in any unit."""
+    """Checks of one wrapper's calibration.
+
+    Attributes:
+        row: Row of the contract.
+        build: Function that builds the row's wrapper for the row's target in any unit.
+    """
 
     row: WrapperRow
     build: Build
 
     def checks(self) -> Iterator[tuple[str, float, Callable[[Worst], None]]]:
-        """Names, limits, checks."""
+        """Yield the name, the limit and the function of each check."""
         yield "calibration does not harm", 4.0, self.no_harm
         yield "fits on all it is given", 0.05, self.on_all
         yield "what is wrapped is calibrated first", 0.0, self.wrapped_first
 
     @cached_property
     def target(self) -> Target:
-        """In another unit than the row's where there is one: nothing may suppose that labels are of size 1."""
+        """Target in another unit than the row's where it has one; no code may assume labels of size 1."""
         return in_units(self.row.target)[:2][-1]
 
     def make(self, target: Target | None = None) -> Uncertainty:
-        """A fresh one in float64, around models that are calibrated themselves."""
+        """Return a new wrapper in float64 around models that are marked as calibrated."""
         seed(SEED)
         wrapper = self.build(target or self.target).eval().double()
         for model in wrapped(wrapper):
@@ -52,7 +57,14 @@ class Calibration:
         return wrapper
 
     def labelled(self, target: Target, count: int, spread: float, number: int) -> Batch:
-        """Inputs, and labels about what the wrapper says before it is calibrated."""
+        """Return seeded inputs, and labels drawn from the densities that the uncalibrated wrapper predicts.
+
+        Args:
+            target: Target of the wrapper.
+            count: Number of rows.
+            spread: Factor by which labels lie farther from the mode than draws.
+            number: Number of the seed.
+        """
         given = inputs(count, number).double()
         with torch.no_grad():
             density = self.make(target)(given)
@@ -61,7 +73,11 @@ class Calibration:
 
     @cached_property
     def densities(self) -> dict[str, Distribution]:
-        """Of three rows on which models differ much, float64: as built and calibrated, the latter in several units."""
+        """Densities, float64, by description, of three rows on which models differ much.
+
+        The first entry holds the densities of the wrapper as built; each further entry holds those of the calibrated
+        wrapper in one unit of the target.
+        """
         found: dict[str, Distribution] = {}
         for number, target in enumerate(in_units(self.row.target)):
             where = f"location {target.location[0]:g}, scale {target.scale[0]:g}, " if target.scale else ""
@@ -76,12 +92,15 @@ class Calibration:
 
     @cached_property
     def many(self) -> dict[str, Distribution]:
-        """Of 64 rows, as built."""
+        """Densities of the wrapper as built, of 64 rows."""
         with torch.no_grad():
             return {"as built": self.make(self.row.target)(FAR * inputs(64).double())}
 
     def no_harm(self, worst: Worst) -> None:
-        """The log-likelihood of validation and of new rows is no lower than before, beyond 4 standard errors."""
+        """Check that calibration does not lower the mean log-likelihood of validation rows and of new rows.
+
+        The limit is 4 standard errors.
+        """
         for what, spread in SPREADS.items():
             seen, unseen = (self.labelled(self.target, ROWS, spread, number) for number in (1, 2))
             wrapper = self.make()
@@ -98,7 +117,10 @@ class Calibration:
                 )
 
     def on_all(self, worst: Worst) -> None:
-        """Batches in another order, in one, and that come only once: the same densities, in nats on average."""
+        """Check that batches in reverse order, as one batch, or given only once lead to the same densities.
+
+        The error is the mean difference of log-densities, nats.
+        """
         given = [self.labelled(self.target, rows, spread, 3 + at) for at, (rows, spread) in enumerate(UNEVEN)]
         whole = {name: torch.cat([batch[name] for batch in given]) for name in given[0]}
         backwards = [{name: field.flip(0) for name, field in batch.items()} for batch in given[::-1]]
@@ -121,7 +143,7 @@ class Calibration:
         return log_prob(wrapper, new)
 
     def wrapped_first(self, worst: Worst) -> None:
-        """Whatever is wrapped is calibrated, and before the wrapper fits anything to its densities."""
+        """Check that `calibrate` first calibrates the wrapped models and then fits to their densities."""
         given = in_batches(self.labelled(self.target, 100, 2.0, 3), 30)
         found = []
         for before in (0, 1):
@@ -137,7 +159,10 @@ class Calibration:
 
 
 def spread_out(density: Distribution, factor: float) -> Tensor:
-    """One label for each row: a draw, `factor` times as far from the mode; of classes of p^(1/factor)."""
+    """Return one label for each row: a draw of the density, `factor` times as far from the mode.
+
+    A label of classes is a draw from the probabilities p^(1/factor), normalised.
+    """
     if density.has_enumerate_support:
         logits = density.log_prob(density.enumerate_support()).movedim(0, -1)
         return Categorical(logits=logits / factor).sample()
@@ -148,13 +173,13 @@ def spread_out(density: Distribution, factor: float) -> Tensor:
 
 
 def in_batches(batch: Batch, rows: int) -> list[Batch]:
-    """The rows of one batch in several."""
+    """Split a batch into batches of at most `rows` rows."""
     parts = {name: field.split(rows) for name, field in batch.items()}
     return [{name: part[at] for name, part in parts.items()} for at in range(len(parts["target"]))]
 
 
 @torch.no_grad()
 def log_prob(wrapper: Uncertainty, batch: Batch) -> Tensor:
-    """Of the labels, with the same random numbers each time."""
+    """Return the log-density at the targets, (rows,) float64, with the same random numbers at each call."""
     seed(SEED)
     return wrapper(batch["input"]).log_prob(batch["target"]).double()

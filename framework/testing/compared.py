@@ -1,4 +1,4 @@
-"""A renderer's pictures against brute force, batches of scenes, sets of points; each reports its worst case."""
+"""Checks of a renderer's images: against brute force, for batches of scenes and for sets of points."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from framework.testing.scenes import empty, sphere, square
 
 
 def draws_points(renderer: Renderer) -> bool:
-    """Whether vertices that no face joins are seen: what it draws are points, and no triangles."""
+    """Return whether the renderer draws points, that is, whether it shows vertices that belong to no face."""
     if "color" not in renderer.channels:
         return False
     scene = empty(sphere())
@@ -32,7 +32,7 @@ def _triangles(renderer: Renderer, channel: str, worst: Worst) -> bool:
 
 
 def colors(renderer: Renderer, worst: Worst) -> None:
-    """Perspective-correct between the corners, of as many channels as the scene has, and not rounded to bytes."""
+    """Check that colours are perspective-correct in all channels of the scene, and not rounded to bytes."""
     if not _triangles(renderer, "color", worst):
         return
     scenes = {
@@ -58,7 +58,7 @@ def colors(renderer: Renderer, worst: Worst) -> None:
 
 
 def visibility(renderer: Renderer, worst: Worst) -> None:
-    """Of triangles across each other the face that is nearest in each pixel."""
+    """Check that each pixel shows the nearest of several faces that intersect."""
     for channel in ("face", "mask"):
         if not _triangles(renderer, channel, worst):
             continue
@@ -70,7 +70,7 @@ def visibility(renderer: Renderer, worst: Worst) -> None:
 
 
 def depth(renderer: Renderer, worst: Worst) -> None:
-    """Relative; metres along the optical axis."""
+    """Check the depth along the optical axis, metres; the error is relative."""
     if not _triangles(renderer, "depth", worst):
         return
     for what, scene in {"crossing triangles": crossing(), "a floor": floor()}.items():
@@ -87,7 +87,11 @@ def depth(renderer: Renderer, worst: Worst) -> None:
 
 
 def several(renderer: Renderer, worst: Worst) -> None:
-    """A batch is each scene, in their order, whatever their sizes; indices of any type; and no scene is changed."""
+    """Check that a batch equals its scenes drawn one by one, whatever their order and sizes.
+
+    Check also that faces may have any integer type, that drawing leaves a scene unchanged, and that the results of two
+    calls share no memory.
+    """
     scenes = [sphere(), square(2.0), replace(sphere(), camera=camera((33, 40))), square(5.0)]
     channels = sorted(renderer.channels)
     alone = [renderer(scene, channels) for scene in scenes]
@@ -116,8 +120,10 @@ def _tensors(scene: Scene) -> list[Tensor]:
 
 
 def color_gradient(renderer: Renderer, worst: Worst) -> None:
-    """Pictures are linear in vertices' colours, and in a texture's: the gradient along a few directions is a difference
-    of two pictures, to rounding."""
+    """Check the gradient in vertex colours or texels against differences of two images, along a few directions.
+
+    An image is linear in colours, so that the difference is exact up to rounding.
+    """
     linear = sorted(renderer.differentiable & {"colors", "texture"})
     worst.count(False, "no gradient in colours")
     generator = torch.Generator().manual_seed(SEED)
@@ -133,7 +139,7 @@ def color_gradient(renderer: Renderer, worst: Worst) -> None:
         weight = torch.randn(scene.camera.height, scene.camera.width, 3, generator=generator).double()
         for number in range(3):
             way = torch.randn(given.shape, generator=generator).double()
-            if number:  # one in a hundred, so that a few of many are seen too
+            if number:  # changes one number in ten, so that an error in a few of them shows
                 way = way * (torch.rand(len(way), *[1] * (way.dim() - 1), generator=generator) < 0.1)
             step = torch.zeros((), dtype=torch.float64, requires_grad=True)
             total = (renderer(_colored(scene, given + step * way), ("color",))["color"] * weight).sum()
@@ -158,7 +164,7 @@ def _colored(scene: Scene, given: Tensor) -> Scene:
 
 
 def points(renderer: Renderer, worst: Worst) -> None:
-    """One that draws points shows each where the camera sees it, in its colour, and the nearer of two."""
+    """Check that a renderer of points shows each at its pixel in its colour, and the nearer of two points there."""
     if not draws_points(renderer):
         worst.count(False, "draws no points")
         return

@@ -1,4 +1,4 @@
-"""What every density must satisfy, whatever made it; each function reports the worst case it saw."""
+"""Checks of any density, whatever plugin made it; each check reports its worst case."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -35,19 +35,22 @@ from framework.testing.questions import (
 
 DRAWS = 20_000
 SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
-"""Standard deviations of the raw numbers, beside the row's own."""
+"""Standard deviations of the distribution parameters at which densities are checked, beside the row's own scale."""
 CELLS = 24
-"""Cells of about equal mass in which draws of one number are counted."""
+"""Number of cells of about equal mass in which draws of one number are counted."""
 MEDIAN_DRAWS = 2000
 Check = Callable[[Distribution, Worst], None]
 
 
 class Property(NamedTuple):
-    """A check of densities: its limit, and which raw numbers it is asked of.
+    """Check of densities, its limit, and the distribution parameters at which it runs.
 
     Attributes:
-        batch: "scales": at every scale; "own": at the row's own, where a fixed grid resolves them; "many": 64 rows each
-            of small, ordinary and large ones.
+        name: Name of the property.
+        limit: Largest error that passes.
+        check: Function that runs the check.
+        batch: "scales": every scale of SCALES and the row's own; "own": the row's own scale, at which a fixed grid
+            resolves the densities; "many": 64 rows each of small, ordinary and large distribution parameters.
     """
 
     name: str
@@ -57,10 +60,10 @@ class Property(NamedTuple):
 
 
 def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
-    """Every property of the row's densities, in float64.
+    """Yield one finding for each property of the row's densities, in float64.
 
-    A density that draws random numbers inside is asked at the row's own scale only: what it says of the same raw
-    numbers differs from one to the next by more than any quadrature errs.
+    A density that draws random numbers is checked at the row's own scale only: its log_prob at the same distribution
+    parameters varies between calls by more than the error of any quadrature.
     """
     draws = subject.draws()
 
@@ -79,9 +82,10 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
     for name, limit, check, batch in CHECKS:
         if not subject.wants(name) or not applies(name, subject, draws):
             continue
-        # more than two numbers are integrated, and more than one counted, on a fixed grid
+        # densities of more than two numbers are integrated on a fixed grid, and draws of more than one number
+        # counted on one
         grid = {"integral": 2, "samples follow log_prob": 1}.get(name, math.inf)
-        hangs = subject.seconds < PATIENCE  # most likely at extreme raw numbers
+        hangs = subject.seconds < PATIENCE  # a check took too long, most likely at extreme parameters
         chosen = "own" if draws or hangs or _numbers(subject) > grid else batch
         if chosen == "own" and batch == "many":
             continue
@@ -96,11 +100,11 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
 
 
 def _examine_questions(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
-    """The optional questions of the protocol, and the properties again of a mixture and of a power, in float64."""
+    """Yield findings for the optional functions of the protocol, and for mixtures and tempered densities."""
 
     @cache
     def pairs() -> Distribution:
-        """Batch_shape (3, 2)."""
+        """Return densities of batch_shape (3, 2)."""
         head = subject.make().double()
         head.requires_grad_(False)
         return head(subject.row.scale * subject.raws(3, 2).double())
@@ -150,7 +154,7 @@ def _examine_questions(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
             power = partial(powers_of, check=check)
             asked.append((f"tempered: {name}", limit, rows, power, suits))
     for name, limit, density, check, suits in asked:
-        # what is left out of a density is left out of its mixtures and powers
+        # a property that a row leaves out is left out for its mixtures and powers too
         if not suits or not subject.wants(name) or name.rpartition(": ")[2] in subject.row.leave_out:
             continue
 
@@ -166,7 +170,7 @@ def _numbers(subject: HeadSubject) -> int:
 
 
 def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
-    """Whether a property can be asked of the row's target."""
+    """Return whether a property can be checked for the row's target."""
     kind, numbers = subject.row.target.kind, _numbers(subject)
     kind = "real" if kind == "image" else kind
     wanted = {
@@ -184,7 +188,10 @@ def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
 
 
 def integral(density: Distribution, worst: Worst) -> None:
-    """The density integrates to 1: of one or two numbers in boxes that follow it, of three on a grid."""
+    """Check that the density integrates to 1.
+
+    A density of one or two numbers is integrated in boxes that adapt to it, a density of three numbers on a grid.
+    """
     if density.event_shape in ((1,), (2,)):
         found = boxes(density)
         total = found.mean(torch.ones_like(found.log_prob))
@@ -195,10 +202,11 @@ def integral(density: Distribution, worst: Worst) -> None:
 
 
 def integral_by_draws(density: Distribution, worst: Worst) -> None:
-    """E_p[q/(p + q)] over draws is E_q[p/(p + q)], q the normal of other draws' covariance; in standard errors.
+    """Check by draws that the density p is normalised, where q is a normal fitted to other draws; in standard errors.
 
-    Both are ∫ pq/(p + q) if p is normalised and drawn from; what is averaged lies in [0, 1], whatever the tails. Were
-    q fitted to the draws that are averaged, it would be too high there, by some standard errors of ten numbers.
+    The check compares E_p[q/(p + q)] with E_q[p/(p + q)]. Both are ∫ pq/(p + q) if p is normalised and draws follow it.
+    The averaged quantities lie in [0, 1], however heavy the tails are. If q were fitted to the draws that are averaged,
+    it would be too high there, which for ten numbers amounts to some standard errors.
     """
     others, drawn = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
     support = density.support
@@ -226,7 +234,7 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
     of_p = torch.sigmoid(-log_ratio(offset, standard.movedim(-1, 0)))
     of_q = torch.sigmoid(log_ratio(shift + torch.einsum("dbi,bij->dbj", normal, root), normal))
     noise = ((of_p.var(0) + of_q.var(0)) / DRAWS).sqrt()
-    # where draws are coarser than the density is narrow, nothing can be said
+    # no verdict is possible where rounding of the draws is coarser than the density is narrow
     least = root.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
     told = least > 1e4 * torch.finfo(torch.float64).eps * drawn.abs().amax(0).amax(-1)
     gap = (of_p.mean(0) - of_q.mean(0)).abs() / (noise + 1e-9)
@@ -236,8 +244,11 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
 
 
 def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
-    """χ² of draws over cells, as standard deviations of a normal (Wilson & Hilferty 1931): of one number in cells of
-    equal mass by quadrature, of more on a grid; cells expecting below five draws are one."""
+    """Check by a χ² test over cells that draws follow log_prob; the error is a standard normal deviate.
+
+    χ² is converted after Wilson & Hilferty (1931). Draws of one number are counted in cells of equal mass by
+    quadrature, draws of several numbers on a grid. Cells that expect fewer than five draws are merged into one.
+    """
     seed(SEED)
     drawn = density.sample(torch.Size((DRAWS,)))
     if density.event_shape == (1,):
@@ -250,7 +261,7 @@ def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
 
 
 def samples_follow_marginals(density: Distribution, worst: Worst) -> None:
-    """Each number of the draws follows marginal(density, number)."""
+    """Check that each number of the draws follows marginal(density, number)."""
     drawn = density.sample(torch.Size((DRAWS,)))
     for number in range(density.event_shape[0]):
         try:
@@ -285,7 +296,10 @@ def _chi_square(expected: Tensor, count: Tensor, worst: Worst, what: str) -> Non
 
 
 def independent(density: Distribution, worst: Worst) -> None:
-    """Draws know nothing of the draw before nor of the neighbour's: correlation of their signs, in standard errors."""
+    """Check that draws are independent of the draw before and of the next batch row.
+
+    The error is the correlation of their signs in standard errors.
+    """
     drawn = density.sample(torch.Size((4000,))).double()
     if density.event_shape:
         offset = drawn - density.mode.double()
@@ -305,7 +319,7 @@ def independent(density: Distribution, worst: Worst) -> None:
 
 
 def periodic(density: Distribution, worst: Worst) -> None:
-    """log_prob the same up to a thousand turns on; relative to its slope, since 2π has no exact float."""
+    """Check that log_prob is the same up to a thousand turns on; relative to its slope, since 2π has no exact float."""
     generator = torch.Generator().manual_seed(SEED)
     shape = torch.Size((8, *density.batch_shape, *density.event_shape))
     value = 6 * torch.randn(shape, dtype=torch.float64, generator=generator)
@@ -316,15 +330,18 @@ def periodic(density: Distribution, worst: Worst) -> None:
     for turns in (1, -1, 7, -1000):
         moved = value.detach() + turns * 2 * math.pi
         scale = here.detach().abs().clamp(min=1) + slope.abs().sum(-1)
-        # a rounded turn is off by the same share as any other float
+        # the number of turns times 2π is rounded relative to its size, as any float
         scale = scale * (1 + moved.abs().amax(-1))
         error = (density.log_prob(moved) - here.detach()).abs() / scale
         worst.see(error, lambda at, turns=turns: f"{turns} turns on, value {at[0]}, {worst.row(at[1])}")
 
 
 def entropy(density: Distribution, worst: Worst) -> None:
-    """entropy() is -∫ p log p: by quadrature of one or two numbers, else by draws; limits are in units of 1e-6 nats
-    (relative above 1), or of an error of what is drawn that ordinary luck does not exceed."""
+    """Check that the entropy is -∫ p log p: by quadrature for one or two numbers and classes, else by draws.
+
+    The error is in units of 1e-6 nats (relative above 1 nat) or, where draws are involved, of a statistical error that
+    chance hardly exceeds.
+    """
     found = torch.stack([_after(number, density.entropy) for number in range(2)]).double()
     noise = torch.zeros_like(found[0])
     if not torch.equal(*found):
@@ -340,7 +357,8 @@ def entropy(density: Distribution, worst: Worst) -> None:
         drawn = density.sample(torch.Size((DRAWS,)))
         surprise = _surprise(density, drawn)
         wanted, noise = surprise.mean(0), noise + 1.2 * surprise.std(0) / DRAWS**0.5
-        # a draw is rounded, by more than a density of several numbers may be narrow: once more, to see what that does
+        # A draw is rounded, possibly by more than the width of a density of several numbers. A second rounding
+        # shows the effect.
         size = drawn.abs().clamp(min=math.pi if isinstance(density.support, Circular) else 0.0)
         once_more = drawn + torch.finfo(drawn.dtype).eps * size * (torch.rand_like(drawn) - 0.5).sign()
         noise = noise + (_surprise(density, once_more) - surprise).abs().mean(0)
@@ -361,7 +379,7 @@ def _after(number: int, ask: Callable[[], Tensor]) -> Tensor:
 
 
 def mode_is_highest(density: Distribution, worst: Worst) -> None:
-    """No draw, and no point of the quadrature, is more than `limit` nats above the mode."""
+    """Check that neither a draw nor a node of the quadrature is more than `limit` nats above the mode."""
     seed(SEED)
     count = max(64, 36_000 // max(18, density.batch_shape.numel()))
     drawn = density.sample(torch.Size((count,)))
@@ -373,7 +391,10 @@ def mode_is_highest(density: Distribution, worst: Worst) -> None:
 
 
 def mode_of_mixture(density: Distribution, worst: Worst) -> None:
-    """In units of what may be missed: where no `slope` leads up from the components' modes, up to log 2."""
+    """Check the mode of a mixture; the error is in units of the height that the search may miss.
+
+    That height is 0.05 nats where `slope` leads up from the modes of the components, else log 2 nats.
+    """
     known = density.has_enumerate_support or slope(density, density.mode) is not None
     inner = Worst()
     mode_is_highest(density, inner)
@@ -381,7 +402,7 @@ def mode_of_mixture(density: Distribution, worst: Worst) -> None:
 
 
 def marginals(density: Distribution, worst: Worst) -> None:
-    """marginal(density, i) is the joint density integrated over the other angles."""
+    """Check that marginal(density, i) is the joint density integrated over the other angles."""
     numbers = density.event_shape[0]
     points = 256 if numbers == 2 else 64
     sides = [side(density, number, points, points // 8) for number in range(numbers)]
@@ -403,16 +424,17 @@ def marginals(density: Distribution, worst: Worst) -> None:
 
 
 def median_is_best(density: Distribution, worst: Worst) -> None:
-    """Half of the mass lies on either side of median(density), and no angle has a smaller expected deviation.
+    """Check that half of the mass lies on each side of the median.
 
-    In standard errors of a median of 2000 draws; where nothing is drawn, in 1e-6 of the mass.
+    The expected deviation from the median of an angle must also be the least. The error is in standard errors of a
+    median of MEDIAN_DRAWS draws; where nothing is drawn, in 1e-6 of the mass.
     """
     chosen = _after(SEED, lambda: median(density, MEDIAN_DRAWS)).double()
     still = torch.equal(chosen, _after(SEED + 1, lambda: median(density, MEDIAN_DRAWS)).double())
     found = boxes(density)
     below = found.below(chosen[..., 0].unsqueeze(0))[0]
     if isinstance(density.support, Circular):
-        # ahead of the median up to its antipode, both counted from half a turn before the mode
+        # mass ahead of the median up to its antipode; both are counted from half a turn before the mode
         other = found.below(
             wrap(chosen[..., 0] + math.pi - found.way.mode[:, 0]).unsqueeze(0) + found.way.mode[:, 0]
         )
@@ -420,7 +442,7 @@ def median_is_best(density: Distribution, worst: Worst) -> None:
         deviation = angular_distance(chosen[..., 0], found.value[..., 0])
         mean = found.mean(deviation)
         spread = (found.mean(deviation.square()) - mean.square()).clamp(min=1e-30).sqrt()
-        # few of the nodes will do: the others lie between them
+        # every seventh node suffices, since the others lie between them
         best = torch.stack(
             [found.mean(angular_distance(node, found.value[..., 0])) for node in found.value[::7, :, 0]]
         )
@@ -436,17 +458,18 @@ def median_is_best(density: Distribution, worst: Worst) -> None:
 
 
 def moments(density: Distribution, worst: Worst) -> None:
-    """mean and variance, where the density has them, are those of the quadrature, in standard deviations.
+    """Check mean and variance, where the density has them, against the quadrature, in standard deviations.
 
-    Heavy tails leave doubt in a quadrature that is cut for the density alone; beyond it the difference counts. Where a
-    variance is said not to exist, that of the quadrature must be huge, and the mean need not exist either.
+    The quadrature adapts to the density alone, so that heavy tails leave an error in moments; only differences beyond
+    that error count. Where the density states that no variance exists, that of the quadrature must be huge, and the
+    mean need not exist either.
     """
     found = boxes(density)
-    offset = found.value - found.way.mode  # so that a narrow density far from 0 cancels nothing
+    offset = found.value - found.way.mode  # keeps the digits of a narrow density far from 0
     mean = torch.stack([found.mean(part) for part in offset.unbind(-1)], -1)
     variance = torch.stack([found.mean(part) for part in (offset - mean).square().unbind(-1)], -1)
     numbers = range(offset.shape[-1])
-    # of the value's distance from the mode, and of its square
+    # uncertainty of the mean distance from the mode, and of its mean square
     first, second = (
         torch.stack(
             [
@@ -466,7 +489,7 @@ def moments(density: Distribution, worst: Worst) -> None:
     none = torch.zeros_like(variance, dtype=torch.bool)
     if "variance" in given:
         huge = variance + second > 1e6 * found.way.scale.square()
-        # just below where it exists, it grows too slowly to be huge within the quadrature's reach
+        # where the variance only just does not exist, it grows too slowly to be huge within the quadrature's reach
         none = ~given["variance"].isfinite() & (huge | (100 * second > variance))
         gap = ((given["variance"] - variance).abs() - 10 * second).clamp(min=0) / variance
         worst.see(gap.where(~none, 0.0), lambda at: f"variance, {worst.row(at[0])}")
@@ -476,7 +499,7 @@ def moments(density: Distribution, worst: Worst) -> None:
 
 
 def masses(density: Distribution, worst: Worst) -> None:
-    """cdf and arc, where they are known, are those of the quadrature at mode ± {0, 0.3, 1, 3, 30} widths."""
+    """Check cdf and arc, where they are known, against the quadrature at mode ± {0, 0.3, 1, 3, 30} widths."""
     found = boxes(density)
     offset = torch.tensor([-30, -3, -1, -0.3, 0, 0.3, 1, 3, 30], dtype=torch.float64)[:, None]
     value = found.way.mode[:, 0] + offset * found.way.scale[:, 0]
@@ -503,7 +526,7 @@ OF_ONE = (
     "mean and variance",
     "cdf",
 )
-"""Properties that are asked of a mixture of two densities of one number, or of classes, too."""
+"""Properties that are also checked for a mixture of two densities of one number or of classes."""
 CHECKS = (
     Property("integral", 1e-6, integral, "scales"),
     Property("integral by draws", 6.0, integral_by_draws, "scales"),

@@ -1,8 +1,9 @@
-"""Finds on the CPU the calls that would mix tensors of the CPU with tensors of a GPU.
+"""A check on the CPU for calls that would mix tensors of the CPU with tensors of a GPU.
 
-`OneDevice` runs code with the tensors that it receives marked as tensors "of the device", as a GPU would hold them, and
-tensors made without `device=` marked as tensors of the CPU. Results inherit the marks of what they are computed from,
-and a call that mixes both where CUDA would raise is recorded. Nothing is moved: all numbers stay as they are.
+`OneDevice` runs code with its input tensors marked as tensors of the device, as if a GPU held them. Tensors made
+without `device=` are marked as tensors of the CPU. A result inherits the marks of the tensors that it is computed from,
+and a call that mixes both kinds where CUDA would raise an error is recorded. No tensor is moved: all numbers stay as
+they are.
 """
 
 import dis
@@ -20,9 +21,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from framework.testing.finding import SEED, TooSlow, Worst, seed
 
 DEVICE = torch.device("cpu", 0)
-"""What `tensor.device` says of a tensor of the device; torch reads it as the CPU.
+"""Device that `tensor.device` reports for a tensor marked as of the device; torch treats it as the CPU.
 
-It differs from `torch.device("cpu")`, which `tensor.device` says of a tensor of the CPU.
+It differs from `torch.device("cpu")`, which `tensor.device` reports for a tensor marked as of the CPU.
 """
 FACTORIES = frozenset(
     ("zeros", "ones", "empty", "full", "arange", "range", "linspace", "logspace", "eye", "rand", "randn", "randint",
@@ -30,37 +31,37 @@ FACTORIES = frozenset(
      "blackman_window", "bartlett_window", "kaiser_window", "fft_fftfreq", "fft_rfftfreq", "empty_strided",
      "scalar_tensor", "sparse_coo_tensor")
 )  # fmt: skip
-"""Functions whose result is of the CPU unless `device=` says otherwise."""
+"""Functions whose result is on the CPU unless `device=` is given."""
 CONVERSIONS = frozenset(("tensor", "as_tensor", "asarray"))
-"""Functions whose result is where their argument is if that is a tensor, else as of FACTORIES."""
+"""Functions whose result is on the device of their argument if that is a tensor; else they act as FACTORIES."""
 OF_THE_FIRST = frozenset(
     ("expand_as", "view_as", "reshape_as", "copy_", "set_", "resize_as_", "__deepcopy__", "is_same_size", "align_as",
      "_make_subclass", "backward", "register_hook", "new_tensor", "new_zeros", "new_ones",
      "new_full", "new_empty", "new_empty_strided", "zeros_like", "ones_like", "empty_like", "full_like", "rand_like",
      "randn_like", "randint_like")
 )  # fmt: skip
-"""Functions whose result is where their first argument is, whatever the others are."""
+"""Functions whose result is on the device of their first argument, whatever the devices of the others are."""
 ONE_BY_ONE = frozenset(("broadcast_tensors", "atleast_1d", "atleast_2d", "atleast_3d"))
-"""Functions each of whose results is where the argument in the same place is."""
+"""Functions that return one result for each argument, on the device of that argument."""
 STRICT = frozenset(
     ("cat", "concat", "concatenate", "stack", "hstack", "vstack", "dstack", "column_stack", "row_stack", "block_diag",
      "searchsorted", "bucketize", "gather", "scatter", "scatter_", "scatter_add", "scatter_add_", "scatter_reduce",
      "scatter_reduce_", "index_select", "index_add", "index_add_", "index_copy", "index_copy_", "take",
      "take_along_dim", "equal", "allclose", "isclose", "outer", "kron", "tensordot", "einsum", "isin")
 )  # fmt: skip
-"""Functions that refuse tensors of two devices even where those of the CPU are single numbers."""
+"""Functions that refuse tensors of two devices even where the CPU tensors have no dimensions."""
 _LIBRARIES = frozenset(("torch", "torchmetrics", "jaxtyping", "beartype", "numpy", "scipy"))
 Questions = Iterator[tuple[str, Callable[[], Any]]]
-"""Names and what is asked."""
+"""Names of calls, and functions that perform them."""
 _on_device: Any = WeakTensorKeyDictionary()
-"""Tensor → whether it is of the device (True) or of the CPU (False); of any other nothing is known."""
+"""Mark of a tensor: True on the device, False on the CPU; a tensor without an entry has no known place."""
 
 
 class OneDevice(TorchFunctionMode):
-    """Records the calls inside that mix tensors of the device with tensors of the CPU.
+    """Recorder of calls that mix tensors of the device with tensors of the CPU, used as a context manager.
 
     Attributes:
-        faults: what was mixed and where, each place once.
+        faults: Descriptions of the mixed tensors and the place of the call; each place occurs once.
     """
 
     def __init__(self) -> None:
@@ -68,26 +69,26 @@ class OneDevice(TorchFunctionMode):
         self.faults: list[str] = []
 
     def receive(self, value: Any) -> Any:
-        """Mark every tensor in a value, whatever containers or dictionaries hold it, as of the device; returns it."""
+        """Mark every tensor in a value or its nested containers as of the device, and return the value."""
         for tensor in tensors_in(value):
             _on_device[tensor] = True
         return value
 
     def move(self, module: nn.Module) -> None:
-        """Mark what `module.to(device)` moves: parameters, buffers and the states of metrics.
+        """Mark the tensors that `module.to(device)` would move: parameters, buffers and the states of metrics.
 
-        Plain attributes stay on the CPU, and so do tensors that are constants of the modules of its package.
+        Plain attributes stay on the CPU. Tensors that modules of the same package hold as constants do too.
         """
         _mark_constants({"framework", type(module).__module__.partition(".")[0]})
         for part in module.modules():
             self.receive([*part._parameters.values(), *part._buffers.values()])
             states = getattr(part, "_defaults", None)
-            if isinstance(states, dict):  # a torchmetrics.Metric
+            if isinstance(states, dict):  # state of a torchmetrics.Metric
                 self.receive([states, [getattr(part, name) for name in states]])
                 part._device = DEVICE  # type: ignore[assignment]
 
     def keep(self, value: Any) -> None:
-        """Mark every tensor in a value as of the CPU, as attributes of an object that nothing moves."""
+        """Mark every tensor in a value as of the CPU, like attributes of an object that no call moves."""
         for tensor in tensors_in(value):
             _on_device[tensor] = False
 
@@ -129,7 +130,7 @@ class OneDevice(TorchFunctionMode):
         if name == "__setitem__":
             self._assigned(*args)
             return result
-        if name == "grad":  # of torch.autograd: each gradient is where its input is
+        if name == "grad":  # torch.autograd.grad: each gradient is on the device of its input
             sources = args[1] if len(args) > 1 else kwargs["inputs"]
             pairs = zip(result, [sources] if isinstance(sources, Tensor) else sources, strict=True)
             for gradient, source in pairs:
@@ -158,7 +159,7 @@ class OneDevice(TorchFunctionMode):
         return result
 
     def _placed(self, result: Any, device: Any) -> Any:
-        """Mark a new tensor by the `device=` it was made with."""
+        """Mark a new tensor according to the `device=` argument that it was made with."""
         if device is None or not _is_device(device):
             self._leave(result)
         else:
@@ -169,7 +170,10 @@ class OneDevice(TorchFunctionMode):
         return self._inherit(result, [source]) if device is None else self._placed(result, device)
 
     def _moved(self, name: str, result: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
-        """Mark what `.to`, `.cpu` and their like return; a new tensor where it is on the other side of the old one."""
+        """Mark the result of `.to`, `.cpu` and similar calls.
+
+        The result is a new tensor where its mark differs from that of its source.
+        """
         source = args[0]
         inside = _on_device.get(source)
         for choice in (*args[1:], *kwargs.values()):
@@ -188,7 +192,7 @@ class OneDevice(TorchFunctionMode):
         return result
 
     def _inherit(self, result: Any, sources: list[Tensor]) -> Any:
-        """Mark results by what they are computed from."""
+        """Mark results by the marks of the tensors that they are computed from."""
         known = [_on_device.get(tensor) for tensor in sources]
         if any(known):
             self.receive(result)
@@ -197,21 +201,21 @@ class OneDevice(TorchFunctionMode):
         return result
 
     def _leave(self, result: Any) -> None:
-        """Mark tensors as of the CPU, but not those of a function that decides by itself where it computes."""
+        """Mark tensors as of the CPU, unless a calling function chooses by itself where it computes."""
         tensors = [tensor for tensor in tensors_in(result) if _on_device.get(tensor) is not False]
         if tensors and not _decided():
             for tensor in tensors:
                 _on_device[tensor] = False
 
     def _indexed(self, name: str, tensor: Any, index: Any) -> None:
-        """Record a tensor of the CPU that is indexed by one of the device; the other way round is right."""
+        """Record a fault where a CPU tensor is indexed by a tensor of the device; CUDA allows the reverse."""
         if isinstance(tensor, Tensor) and _on_device.get(tensor) is False:
             for part in tensors_in(index):
                 if _on_device.get(part) and (part.dim() > 0 or part.dtype == torch.bool):
                     self._fault(name, "a tensor of the device indexes one of the CPU")
 
     def _assigned(self, tensor: Tensor, index: Any, value: Any) -> None:
-        """Record what cannot be assigned: slices are copied between devices, indexed numbers are not."""
+        """Record a fault where an assignment to indexed elements mixes devices; CUDA allows it for slices."""
         self._indexed("__setitem__", tensor, index)
         listed = index if isinstance(index, tuple) else (index,)
         advanced = any(
@@ -236,13 +240,15 @@ class OneDevice(TorchFunctionMode):
 
 
 def on_one_device(make: Callable[[OneDevice], Questions], worst: Worst) -> None:
-    """Report every call that would mix devices while something is made and asked.
+    """Report every call that would mix devices while an object is built and used.
 
-    What raises an error is asked once more without marks: an error that comes only with them is reported, any other is
-    left to the checks that are for it.
+    A call that raises an error is repeated without marks. An error that occurs only with marks is reported; any other
+    error is left to the checks that test for it.
 
     Args:
-        make: builds what is checked in the given mode, marks what is moved and received, and yields its questions.
+        make: Function that builds the object under the given mode, marks the tensors that are moved and received, and
+            yields the calls to make.
+        worst: Recorder of the faults.
     """
     mode = OneDevice()
     worst.count(False, "no tensor met one of another device")
@@ -269,7 +275,7 @@ def _ask(mode: OneDevice, question: Callable[[], Any]) -> None:
         except TooSlow:
             raise
         except Exception as error:
-            if not marked:  # it is refused, or another check is for it
+            if not marked:  # the input is refused, or another check covers the error
                 return
             said = " ".join(f"{type(error).__name__}: {error}".split())
         if not said:
@@ -278,7 +284,7 @@ def _ask(mode: OneDevice, question: Callable[[], Any]) -> None:
 
 
 def tensors_in(value: Any, depth: int = 0) -> Iterator[Tensor]:
-    """Every tensor in a value, or in the lists, tuples and dictionaries that it holds."""
+    """Yield every tensor in a value and in the lists, tuples, sets and dictionaries nested in it, 4 levels deep."""
     if isinstance(value, Tensor):
         yield value
     elif depth < 4 and isinstance(value, (list, tuple, set)):
@@ -294,7 +300,7 @@ def _is_device(chosen: Any) -> bool:
 
 
 def _mark_constants(packages: set[str]) -> None:
-    """Mark tensors that modules hold as constants, which nothing moves."""
+    """Mark tensors that modules of the packages hold as constants as of the CPU; no call moves them."""
     for name, module in list(sys.modules.items()):
         if name.partition(".")[0] in packages:
             for value in list(vars(module).values()):
@@ -303,7 +309,7 @@ def _mark_constants(packages: set[str]) -> None:
 
 
 def _frames() -> Iterator[FrameType]:
-    """The calls that led here, the innermost first, up to the check."""
+    """Yield the frames of the calls between here and the check, innermost first, without those of libraries."""
     frame = sys._getframe(1)
     while frame is not None and frame.f_code.co_filename == __file__:
         frame = frame.f_back
@@ -314,15 +320,15 @@ def _frames() -> Iterator[FrameType]:
 
 
 def _decided() -> bool:
-    """Whether a function that led here asks where a tensor is, and so has a way for each kind of device.
+    """Return whether a calling function asks where a tensor is, and so has separate code for each kind of device.
 
-    Its way for the CPU, which is taken here, is not the one that a GPU takes.
+    Its code for the CPU, which runs here, is not the code that runs on a GPU, so its calls are not judged.
     """
     return any(_asks(frame.f_code) for frame in _frames())
 
 
 def _asks(code: CodeType) -> bool:
-    """Whether a function reads `is_cuda`, `is_cpu` or `device.type`."""
+    """Return whether a function reads `is_cuda`, `is_cpu` or `device.type`."""
     known = _ASKS.get(code)
     if known is None:
         known = bool({"is_cuda", "is_cpu"} & {*code.co_names})
@@ -339,7 +345,7 @@ _ASKS: dict[CodeType, bool] = {}
 
 
 def _place() -> str:
-    """File and line of the call, below its package, and its text."""
+    """Return file and line of the innermost call outside libraries; the path is cut to its last three parts."""
     for frame in _frames():
         path = frame.f_code.co_filename
         return f"{'/'.join(path.split('/')[-3:])}:{frame.f_lineno}"

@@ -1,4 +1,4 @@
-"""What the contract asks of an encoder's gradients; each function reports the worst case it saw."""
+"""Checks of an encoder's gradients; each reports its worst case."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,31 +12,32 @@ from framework.testing.finding import SEED, Worst, seed
 Make = Callable[[], Encoder]
 Inputs = Callable[[int], Tensor]
 GROUPS = 24
-"""Of parameters, each of which is moved at once; of a slow encoder SLOW_GROUPS."""
+"""Number of groups of parameters; the parameters of a group are moved at once. A slow encoder has SLOW_GROUPS."""
 SLOW_GROUPS = 2
 STEPS = (1e-8, 1e-10, 1e-6)
-"""The smaller, the fewer units bend within a step; the larger, the less rounds."""
+"""Step lengths: a smaller step reaches fewer kinks of the units, a larger one loses less to rounding."""
 CLOSE = 1e-3
 REPEATED = 4099
-"""A prime, which no layer is as wide as."""
+"""Prime number that is not the width of any layer."""
 LARGEST = 30.0
-"""How many times as far a parameter of small gradient is moved."""
+"""Largest factor by which a parameter of small gradient is moved farther than others."""
 
 
 def of_weights(make: Make, inputs: Inputs, worst: Worst, *, slow: bool) -> None:
-    """Directional derivatives of a sum over the features in the parameters, a few of these at a time, in float64:
-    relative to the gradient's size, by the best of a few steps: none agrees with a wrong gradient.
+    """Check directional derivatives of a sum over the features in groups of parameters, in float64.
 
-    In evaluation, and in training where the encoder is not slow: moments of few samples bend a deep network too much.
+    The error is relative to the gradient's size. The step that agrees best counts, since no step agrees with a wrong
+    gradient. The check runs in evaluation mode, and in training mode where the encoder is not slow. Batch norm over few
+    samples makes the loss of a slow, deep network too nonlinear in training.
     """
     for training, count in ((False, 2),) if slow else ((True, 6), (False, 3)):
         encoder = make().double().train(training)
-        moved_a_little(encoder)  # since units of no offset bend at 0, which empty inputs are
+        moved_a_little(encoder)  # units without offset have a kink at 0, which is their value on empty inputs
         _of_weights(encoder, inputs(count).double(), worst, slow=slow)
 
 
 def moved_a_little(encoder: Encoder) -> None:
-    """Its parameters, as after some training: none is 0."""
+    """Move the encoder's parameters a little, as after some training, so that none is 0."""
     generator = torch.Generator().manual_seed(SEED)
     with torch.no_grad():
         for value in encoder.parameters():
@@ -54,7 +55,7 @@ def _of_weights(encoder: Encoder, batch: Tensor, worst: Worst, *, slow: bool) ->
     state = {name: value.clone() for name, value in encoder.named_buffers()}
 
     def total() -> Tensor:
-        """With the same running moments, and the same units left out by dropout."""
+        """Return the loss with the same running moments and the same dropout mask at each call."""
         seed(SEED)
         for name, value in encoder.named_buffers():
             value.copy_(state[name])
@@ -91,7 +92,7 @@ def _of_weights(encoder: Encoder, batch: Tensor, worst: Worst, *, slow: bool) ->
 
 
 def _noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Normal numbers, over and over the same where there are very many."""
+    """Return normal numbers, which repeat every REPEATED numbers."""
     numbers = torch.randn(min(like.numel(), REPEATED), dtype=torch.float64, generator=generator)
     return numbers.repeat(-(-like.numel() // len(numbers)))[: like.numel()].view(like.shape)
 
@@ -99,7 +100,7 @@ def _noise(like: Tensor, generator: torch.Generator) -> Tensor:
 def _moved(
     values: Sequence[Tensor], way: Sequence[Tensor], step: float, total: Callable[[], Tensor]
 ) -> float:
-    """What comes of moved parameters, which are moved back afterwards, to rounding."""
+    """Return the loss at moved parameters; they are moved back afterwards, up to rounding."""
     with torch.no_grad():
         for value, one in zip(values, way, strict=True):
             value.add_(one, alpha=step)

@@ -1,4 +1,4 @@
-"""What one check found: its worst case and how far that is from the limit."""
+"""Result of one check: its worst case, and how far that is from the limit."""
 
 import math
 import signal
@@ -16,8 +16,8 @@ SEED = 20260
 
 
 def seed(number: int) -> None:
-    """Seeds what a check draws, which is all on the processor."""
-    # Not torch.manual_seed: for every device that is not in use it formats the stack, 0.5 ms in all.
+    """Seed the default CPU generator, which all random numbers of a check come from."""
+    # torch.manual_seed also formats the stack for every device that is not in use, 0.5 ms in all
     torch.default_generator.manual_seed(number)
 
 
@@ -26,11 +26,11 @@ class Finding:
     """One line of the contract's table.
 
     Attributes:
-        name: what must hold.
-        worst: the worst case in words; why, where it failed.
-        error: how wrong it is, in the property's own measure; NaN where something came out NaN, infinite where the
-            plugin raised or did not end.
-        limit: the largest error that passes.
+        name: Property that must hold.
+        worst: Worst case in words; the reason, where the property does not hold.
+        error: Size of the error in the property's own measure; NaN where a result was NaN, infinite where the plugin
+            raised an error or did not end in time.
+        limit: Largest error that passes.
     """
 
     name: str
@@ -40,6 +40,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
+        """Return whether the error is within the limit; NaN is not."""
         return self.error <= self.limit  # NaN does not
 
     def __str__(self) -> str:
@@ -48,10 +49,10 @@ class Finding:
 
 
 class Worst:
-    """Keeps the worst of what it sees.
+    """Recorder of the worst case among errors.
 
     Attributes:
-        rows: what the batch rows of the densities looked at are, where a number does not say it.
+        rows: Descriptions of the batch rows of the densities, used where a row number says too little.
     """
 
     def __init__(self) -> None:
@@ -60,32 +61,38 @@ class Worst:
         self.rows: Sequence[str] = ()
 
     def row(self, index: int) -> str:
+        """Return the description of a batch row."""
         return self.rows[index] if self.rows else f"batch row {index}"
 
     def see(self, error: float | Tensor, case: str | Callable[[tuple[int, ...]], str]) -> None:
-        """An error, or a tensor of them with a description by index. Nothing is worse than NaN."""
+        """Record an error, or a tensor of errors, if it is the worst so far; NaN is worse than every number.
+
+        Args:
+            error: Number, or tensor of any shape.
+            case: Description of the case, or a function from the index of the worst error to it.
+        """
         if not isinstance(error, Tensor):
             error = torch.tensor(float(error), dtype=torch.float64)
         if error.numel() == 0:
             return
         flat = error.detach().double().flatten()
-        index = int(flat.argmax())  # that of the first NaN, if there is one
+        index = int(flat.argmax())  # the index of the first NaN, if there is one
         if not flat[index].item() <= self.error and not math.isnan(self.error):
             self.error = flat[index].item()
-            # torch's own imports a symbolic algebra, 0.4 s
+            # torch's own unravel_index imports a symbolic algebra package, 0.4 s
             at = tuple(int(number) for number in np.unravel_index(index, error.shape))
             self.case = case if isinstance(case, str) else case(at)
 
     def count(self, wrong: Tensor | bool, case: str) -> None:
-        """How many of a yes-or-no property's numbers are wrong."""
+        """Record the number of wrong values of a yes-or-no property."""
         self.see(float(wrong.sum()) if isinstance(wrong, Tensor) else float(wrong), case)
 
     def same(self, what: str, found: object, wanted: object) -> None:
-        """Something that must be equal: a shape, a type."""
+        """Record an error of 1 unless two objects, such as shapes or types, are equal."""
         self.count(found != wanted, f"{what}: {found}" + (f", wanted {wanted}" if found != wanted else ""))
 
     def same_bits(self, what: str, found: Tensor, wanted: Tensor) -> None:
-        """The largest difference of two tensors that must not differ in a bit; NaN equals NaN."""
+        """Record the largest difference of two tensors that must agree to the last bit; NaN equals NaN."""
         if found.shape != wanted.shape or found.dtype != wanted.dtype:
             self.see(
                 torch.inf,
@@ -97,11 +104,13 @@ class Worst:
         self.see(gap.where(~equal, 0), what)
 
     def finite(self, what: str, found: Tensor) -> None:
+        """Record the number of values that are NaN or infinite."""
         self.count(
             ~found.isfinite(), f"{what}: {int((~found.isfinite()).sum())} of {found.numel()} not finite"
         )
 
     def finding(self, name: str, limit: float) -> Finding:
+        """Return the finding; it fails if no error was recorded, since nothing was compared."""
         # a check that compared nothing has shown nothing
         error = torch.inf if self.error == -torch.inf else self.error
         case = f"NaN: {self.case}" if math.isnan(error) else self.case
@@ -109,14 +118,18 @@ class Worst:
 
 
 class TooSlow(Exception):
-    """A check did not end in time."""
+    """Error of a check that did not end in time."""
 
 
 @contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Ends a check that has used more processor time; only where a process can have such an alarm, in its main thread.
+    """Raise TooSlow in a block that uses more than `seconds` of processor time.
 
-    Processor time, not the clock's: a busy machine must not make a sound plugin fail.
+    The limit applies only in the main thread and on systems that have such an alarm. It counts processor time rather
+    than elapsed time, so that a busy machine does not make a sound plugin fail.
+
+    Raises:
+        TooSlow: The block used more processor time.
     """
     if not hasattr(signal, "ITIMER_PROF") or threading.current_thread() is not threading.main_thread():
         yield
@@ -135,7 +148,7 @@ def at_most(seconds: float) -> Iterator[None]:
 
 
 def examined(name: str, limit: float, look: Callable[[Worst], None], *, seconds: float = 20.0) -> Finding:
-    """The finding of one check: whatever it raises, or its not ending, is an infinite error."""
+    """Run one check and return its finding; an exception, or no end in time, counts as an infinite error."""
     worst = Worst()
     seed(SEED)
     try:
@@ -148,10 +161,10 @@ def examined(name: str, limit: float, look: Callable[[Worst], None], *, seconds:
 
 
 def require(*findings: Finding) -> None:
-    """For tests.
+    """Assert that all findings hold; for tests.
 
     Raises:
-        AssertionError: something does not hold; says all of it.
+        AssertionError: A finding does not hold, or there is none; the message lists all that fail.
     """
     assert findings, "nothing was examined"
     failed = [str(finding) for finding in findings if not finding.holds]

@@ -1,4 +1,4 @@
-"""Gradients of a head's loss: against finite differences, and nothing to gain by leaving the truth."""
+"""Checks of the gradients of a head's loss: against finite differences, and zero on average over draws."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -12,23 +12,27 @@ from framework.testing.finding import SEED, Worst, seed
 from framework.testing.heads import HeadSubject, as_type, seeded
 
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
-"""Of central differences, relative to raw numbers above 1; those after the third where the first three disagree."""
+"""Steps of central differences, relative to distribution parameters above 1.
+
+Steps after the third are used where none of the first three agrees.
+"""
 
 
 def gradient(subject: HeadSubject, worst: Worst) -> None:
-    """Derivatives of the loss in every raw number, and along one direction in parameters, against central differences.
+    """Check derivatives of the loss in each distribution parameter and along a direction in the head's parameters.
 
-    Each row by itself, at random targets and at draws; of three steps the one that agrees best, as the smallest is
-    lost in rounding and the largest may reach across a kink. Where none does, the step follows the density's own width:
-    of ever smaller ones the one that agrees best with the next, whatever the derivative says.
+    They are compared with central differences, for each row alone, at random targets and at draws. Of three steps the
+    one that agrees best counts, as the smallest may be lost in rounding and the largest may cross a kink. Where none of
+    them agrees, smaller steps follow that resolve a narrow density: the difference that is closest to that of the step
+    before counts, whatever the derivative is.
     """
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
-        # not the very numbers to which trees were fitted: they jump there
+        # not the numbers to which trees were fitted, since trees jump there
         raw = (1.013 * size * subject.raws(8).double()).requires_grad_()
         value = as_type(subject.values(8), torch.float64)
         with torch.no_grad():
-            # far out, a draw of several reals may be rounded by more than the narrowest of them is wide
+            # far out, a draw of several reals may be rounded by more than the width of the narrowest density
             if subject.row.target.kind != "real" or size <= 30:
                 value[4:] = seeded(head, raw[4:]).sample()
 
@@ -53,11 +57,12 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
                 errors = [one.error(analytic, least) for one in found]
                 error = torch.stack(errors).amin(0)
                 if bool((error > 1e-7).any()):
-                    # narrower than the steps, or a kink within them: smaller ones, until two agree with each other
+                    # The density is narrower than the steps, or a kink lies within them. Try smaller steps until
+                    # two agree.
                     found += [at(step) for step in steps[3:]]
                     error = torch.minimum(error, most_certain(found).error(analytic, least))
                 numeric = most_certain(found).slope
-                # differences of large losses know fewer digits
+                # differences of large losses have fewer correct digits
                 worst.see(
                     error * (1.0 if size <= 3 else 1e-3),
                     lambda at, name=name, size=size, column=column, analytic=analytic, numeric=numeric: (
@@ -68,13 +73,16 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
 
 
 class Difference(NamedTuple):
-    """A central difference of a loss, and what rounding of the two losses may add to it."""
+    """Central difference of a loss, and the bound on what rounding of the two losses adds to it."""
 
     slope: Tensor
     noise: Tensor
 
     def error(self, analytic: Tensor, least: Tensor | float) -> Tensor:
-        """Of a derivative, beyond the noise, relative to the slope where that is no less than `least` and 1e-3."""
+        """Return the error of a derivative beyond the noise, relative to the slope.
+
+        The scale is at least `least` and 1e-3.
+        """
         scale = self.slope.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
         return ((analytic - self.slope).abs() - self.noise).clamp(min=0) / scale
 
@@ -83,7 +91,7 @@ class Difference(NamedTuple):
 def difference(
     loss: Callable[[], Tensor], argument: Tensor, direction: Tensor, step: float, whole: bool
 ) -> Difference:
-    """Along a direction of the argument, of each row's loss or of their sum."""
+    """Return the central difference of each row's loss or, if `whole`, of their sum, along a direction."""
     ends = []
     for sign in (1, -1):
         argument += sign * step * direction
@@ -91,13 +99,13 @@ def difference(
         argument -= sign * step * direction
     if whole:
         ends = [end.sum() for end in ends]
-    # what rounding of the two losses, and of raw numbers on the way, does to their difference
+    # effect that rounding of the two losses, and of distribution parameters on the way, has on their difference
     noise = 16 * torch.finfo(torch.float64).eps * ends[0].abs() / step
     return Difference((ends[0] - ends[1]) / (2 * step), noise)
 
 
 def most_certain(found: Sequence[Difference]) -> Difference:
-    """Of each row the difference that the one before differs from least, beside its own noise."""
+    """Return for each row the difference that deviates least from the one before it, with its own noise added."""
     slope, noise = (torch.stack(parts) for parts in zip(*found, strict=True))
     doubt = (slope[1:] - slope[:-1]).abs() + noise[1:]
     best = doubt.nan_to_num(nan=math.inf).argmin(0, keepdim=True)
@@ -105,10 +113,10 @@ def most_certain(found: Sequence[Difference]) -> Difference:
 
 
 def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterator[tuple[str, Tensor]]:
-    """A random direction of length 1, and of few raw numbers each by itself."""
+    """Yield a random direction of length 1, and each axis where there are few distribution parameters."""
     generator = torch.Generator().manual_seed(number)
     direction = torch.randn(argument.shape, dtype=argument.dtype, generator=generator)
-    if size <= 3:  # far out, numbers of very different reach are not stepped along together
+    if size <= 3:  # far out, parameters that act on very different scales are not changed together
         yield "", direction / (direction.norm(dim=-1, keepdim=True) if raw else direction.norm())
     for column in range(argument.shape[-1] if raw and argument.shape[-1] <= 12 else 0):
         yield (
@@ -118,8 +126,11 @@ def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterat
 
 
 def proper(subject: HeadSubject, worst: Worst) -> None:
-    """The mean gradient of the loss over draws of the density is 0, as of any proper score (Gneiting & Raftery 2007);
-    in standard errors, to which what may be too rare to be drawn adds."""
+    """Check that the mean gradient of the loss over draws of the density is 0, in standard errors.
+
+    This holds for every proper score (Gneiting & Raftery 2007). The standard error includes a term for values too rare
+    to be drawn.
+    """
     if subject.draws():
         worst.count(False, "draws in log_prob, of which the loss may be a bound")
         return
@@ -128,7 +139,7 @@ def proper(subject: HeadSubject, worst: Worst) -> None:
         raw = (size * subject.raws(3).double()).expand(draws, -1, -1).clone().requires_grad_()
         with torch.no_grad():
             value = head.eval()(raw[0]).sample(torch.Size((draws,)))
-        # gradients elsewhere tell how large one may be that was not drawn
+        # gradients at other targets show how large the gradient of a value may be that was not drawn
         value[:32] = as_type(subject.values(32, 3), torch.float64)
         (gradient,) = torch.autograd.grad(head.train().loss(raw, value).sum(), raw, allow_unused=True)
         if gradient is None:

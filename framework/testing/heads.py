@@ -1,6 +1,6 @@
-"""The contract of a density head: one function a property, each reporting the worst case it saw.
+"""Contract tests of a density head: one function for each property; each reports its worst case.
 
-What the head's densities must satisfy is in framework.testing.densities.
+The properties of the head's densities are checked in framework.testing.densities.
 """
 
 import math
@@ -25,25 +25,27 @@ from framework.testing.rows import HeadRow
 
 BATCH_SHAPES = ((), (4,), (3, 2), (0,))
 SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
-"""Raw numbers of these sizes, and of the largest a type holds, are fed in as they may come from a diverging network."""
+"""Sizes of distribution parameters, beside the largest of the dtype, as a diverging network may produce them."""
 
 
 MANY_ROWS = 300
-"""Of a batch whose first and last rows are predicted alone too."""
+"""Number of rows of a batch whose first and last rows are also predicted alone."""
 MOST_COLUMNS = 24
-"""Raw numbers of which each is changed by itself."""
+"""Largest number of distribution parameters that are each changed alone."""
 PATIENCE = 20.0
-"""Seconds of processor time for one check."""
+"""Limit of processor time for one check, seconds."""
 
 
 @dataclass
 class HeadSubject:
-    """A row and how to build the head it describes; every built head has the same parameters.
+    """Row of a density head, and how to build the head; every head that is built has the same parameters.
 
     Attributes:
-        seconds: what a check may take: little, once one has not ended.
-        of: builds it for another target; None where nobody asks how the target's unit is read.
-        only: the one property to examine; "" for all.
+        row: Row of the contract.
+        build: Function that builds the head for the row's target.
+        seconds: Limit of processor time for a check; 1 s after one check has not ended in time.
+        of: Function that builds the head for another target; None where the target's unit is not checked.
+        only: Name of the one property to check; "" for all.
     """
 
     row: HeadRow
@@ -53,38 +55,38 @@ class HeadSubject:
     only: str = ""
 
     def examined(self, name: str, limit: float, look: Callable[[Worst], None]) -> Finding:
-        """The finding of one check, with the row's limit where it has its own."""
+        """Run one check, with the row's limit where it has its own, and return the finding."""
         found = examined(name, self.row.limits.get(name, limit), look, seconds=self.seconds)
         if found.worst.startswith("TooSlow"):
             self.seconds = 1.0
         return found
 
     def wants(self, name: str) -> bool:
-        """Whether a property is to be examined."""
+        """Return whether a property is to be checked."""
         return name not in self.row.leave_out and self.only in ("", name)
 
     def make(self) -> DensityHead:
-        """A fresh head in evaluation mode."""
+        """Return a new head in evaluation mode."""
         seed(SEED)
         return self.build().eval()
 
     @cached_property
     def size(self) -> int:
-        """How many raw numbers a head reads."""
+        """Number of distribution parameters that the head reads."""
         with torch.random.fork_rng(devices=[]):
             return self.make().size
 
     def raws(self, *batch: int) -> Tensor:
-        """Seeded normal raw numbers (*batch, size), float32."""
+        """Return seeded normal distribution parameters (*batch, size), float32."""
         generator = torch.Generator().manual_seed(SEED)
         return torch.randn(*batch, self.size, generator=generator)
 
     def values(self, *batch: int) -> Tensor:
-        """Seeded targets: angles over several turns, reals of size 1, labels."""
+        """Return seeded targets: angles over several turns, reals of size 1, labels."""
         return values(self.row.target, batch)
 
     def draws(self) -> bool:
-        """Whether the density of the same raw numbers and parameters is another with another seed."""
+        """Return whether log_prob draws random numbers: it differs between seeds at the same inputs."""
         try:
             with torch.no_grad():
                 head, raw, value = self.make(), self.raws(4), self.values(4)
@@ -93,12 +95,15 @@ class HeadSubject:
                     seed(number)
                     found.append(head(raw).log_prob(value))
             return not torch.equal(*found)
-        except Exception:  # the checks themselves say what
+        except Exception:  # the checks themselves report the error
             return False
 
 
 def ready(head: DensityHead, target: Target) -> DensityHead:
-    """The head itself; one that is fitted at once has seen a few drawn features, as many as it wants, and targets."""
+    """Return the head, after `fit` on seeded features and targets where it needs one.
+
+    A head without a fixed number of features is fitted to four.
+    """
     if isinstance(head, Fitted):
         features = torch.randn(200, head.size or 4, generator=torch.Generator().manual_seed(SEED))
         head.fit(features, values(target, (200,)), SEED)
@@ -106,7 +111,7 @@ def ready(head: DensityHead, target: Target) -> DensityHead:
 
 
 def values(target: Target, batch: tuple[int, ...]) -> Tensor:
-    """Seeded targets: angles over several turns, reals of size 1 (in the target's unit, if it has one), labels."""
+    """Return seeded targets: angles over several turns, labels, or reals of size 1 in the target's unit."""
     generator = torch.Generator().manual_seed(SEED + 1)
     if target.kind == "class":
         return torch.randint(len(target.names), batch, generator=generator)
@@ -118,7 +123,7 @@ def values(target: Target, batch: tuple[int, ...]) -> Tensor:
 
 
 def examine_head(subject: HeadSubject) -> Iterator[Finding]:
-    """Every property of the head itself, cheapest first."""
+    """Yield one finding for each property of the head itself, cheapest first."""
     from framework.testing.gradients import gradient, proper
     from framework.testing.precision import precision, reference
     from framework.testing.units import TOLERANCE, units
@@ -155,7 +160,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
 
 
 def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
-    """Losses, calibration, and all that a density can be asked."""
+    """Check losses, calibration and every function of the densities for mixed devices."""
     from framework.testing.questions import every_question
 
     def make(mode: OneDevice) -> Questions:
@@ -181,7 +186,7 @@ def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _shapes(subject: HeadSubject, worst: Worst) -> None:
-    """Batches of any shape, also empty; losses with finite gradients in the raw numbers."""
+    """Check batches of any shape, also empty ones, and finite gradients of losses in the distribution parameters."""
     target = subject.row.target
     event = target.event_shape
     for batch in BATCH_SHAPES:
@@ -223,7 +228,7 @@ def _shapes(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _number_types(subject: HeadSubject, worst: Worst) -> None:
-    """float64 stays float64, half precision is upcast to float32."""
+    """Check that float64 stays float64 and that half precision is converted to float32."""
     float32, float64 = torch.float32, torch.float64
     wanted = {float64: float64, float32: float32, torch.float16: float32, torch.bfloat16: float32}
     for given, computed in wanted.items():
@@ -238,7 +243,7 @@ def _number_types(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
-    """A ValueError that names the first bad batch row."""
+    """Check that NaN and infinity raise a ValueError that names the first bad batch row."""
     head = subject.make()
     for bad in (math.nan, math.inf, -math.inf):
         for column in range(0, head.size, max(1, head.size // 7)):
@@ -254,7 +259,7 @@ def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _repeatable(subject: HeadSubject, worst: Worst) -> None:
-    """Also after other raw numbers, in training and evaluation: a head keeps nothing between calls."""
+    """Check that results repeat, also after calls with other inputs, in training and in evaluation mode."""
     raw, value = subject.raws(4), subject.values(4)
 
     def everything(head: DensityHead) -> dict[str, Tensor]:
@@ -280,9 +285,9 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
-    """A row's loss has no gradient in another row, nor changes with it: no density depends on its neighbours.
+    """Check that a row's results do not depend on other rows, nor has its loss a gradient in them.
 
-    Nor does it depend on how many there are, as far as nothing is drawn.
+    Where nothing is drawn, results must not depend on the number of rows either.
     """
     found = []
     for factor in (1.0, -3.0):
@@ -334,14 +339,14 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _round_trip(subject: HeadSubject, worst: Worst) -> None:
-    """calibrate changes buffers only; a fresh head with the stored state gives the same bits."""
+    """Check that `calibrate` changes buffers only, and that a new head with the stored state gives the same bits."""
     head, raw, value = subject.make(), subject.raws(32), subject.values(32)
     before = {name: parameter.clone() for name, parameter in head.named_parameters()}
     with torch.no_grad():
         head.calibrate(raw, value)
         for name, parameter in head.named_parameters():
             worst.same_bits(f"parameter {name} after calibrate", parameter, before[name])
-        seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
+        seed(SEED + 7)  # so that a parameter that is not stored has another value
         other = subject.build().eval()
         other.load_state_dict(head.state_dict())
         seed(SEED)
@@ -351,7 +356,7 @@ def _round_trip(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
-    """framework.distributions.density.Mixture with one component, which every wrapper and mixture returns."""
+    """Check that framework.distributions.density.Mixture of one component equals the component, to the last bit."""
     head, raw, value = subject.make(), subject.raws(4), subject.values(4)
     with torch.no_grad():
         found = {}
@@ -368,7 +373,7 @@ def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _knobs(subject: HeadSubject, worst: Worst) -> None:
-    """Attributes that may be set at any time, their declared values ascending; the smallest two work."""
+    """Check that values of the knobs are in ascending order and that the smallest two can be set and work."""
     head = subject.make()
     worst.count(False, "none declared")
     for name, dial in head.knobs.items():
@@ -382,7 +387,7 @@ def _knobs(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
-    """Raw numbers of any finite size: log-densities, losses, their gradients, samples and modes."""
+    """Check that densities, losses and gradients are finite at distribution parameters of any finite size."""
     for dtype in (torch.float32, torch.float64):
         head = subject.make().to(dtype)
         for size in (*SIZES, torch.finfo(dtype).max):
@@ -403,10 +408,10 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _calibrated(subject: HeadSubject, worst: Worst) -> None:
-    """calibrate leaves the mean log_prob of what it was given as good as before, or better; relative above 1 nat.
+    """Check that `calibrate` does not lower the mean log_prob of its data; relative above 1 nat.
 
-    Of targets that have nothing to do with the raw numbers, and of draws from the head's own densities, as far from
-    their modes as they are drawn, and three times nearer and farther: there a hundredth is allowed.
+    Its data are targets that are independent of the distribution parameters, and draws from the head's own densities:
+    as drawn, three times nearer to the mode, and three times farther. For the draws a loss of a hundredth is allowed.
     """
     if subject.draws():
         worst.count(False, "draws in log_prob")
@@ -427,13 +432,16 @@ def _calibrated(subject: HeadSubject, worst: Worst) -> None:
             head.calibrate(raw, value)
             after = head(raw).log_prob(value).double().mean()
         loss = (before - after).clamp(min=0) / before.abs().clamp(min=1) if after.isfinite() else after
-        # fitted to intervals, say, it need not be the likeliest
+        # a calibration that fits, for example, intervals need not maximise the likelihood
         loss = loss if spread is None else 1e-3 * loss
         worst.see(loss, f"{what}: {before.item():.6g} before, {after.item():.6g} after")
 
 
 def _calibrated_backwards(subject: HeadSubject, worst: Worst) -> None:
-    """calibrate fits the same to rows in another order: rows whose targets are twice as far come last, or first."""
+    """Check that `calibrate` does not depend on the order of rows.
+
+    Real targets of the second half of the rows are doubled.
+    """
     if subject.draws():
         worst.count(False, "draws in log_prob")
         return
@@ -451,7 +459,7 @@ def _calibrated_backwards(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _all_read(subject: HeadSubject, worst: Worst) -> None:
-    """Each raw number changes the loss of some target at some size: none is read and then left out."""
+    """Check that each distribution parameter changes the loss of some target at some size."""
     head, columns = subject.make().double().train(), range(subject.size)
     if head.direct or isinstance(head, Fitted):
         worst.count(False, "it reads features, which are not made for it")
@@ -476,8 +484,11 @@ def _all_read(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
-    """A loss that is a multiple of -log_prob and a constant at a head's own draws is so with a factor of 1, and also
-    at values that are hardly drawn; relative to log_prob."""
+    """Check that a loss that is a multiple of -log_prob plus a constant has the factor 1; relative to log_prob.
+
+    Whether the loss is such a multiple is decided at draws of the head's own densities. Such a loss must fit log_prob
+    also at values that are hardly ever drawn.
+    """
     if subject.draws():
         worst.count(False, "draws in log_prob, of which the loss may be a bound")
         return
@@ -501,7 +512,7 @@ def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
     size = 1 + log_prob.abs()
     fits = ((rest / size)[:24].amax(0) < 1e-9) & (offset.abs().amax(0) > 1e-3)
     worst.count(False, "another loss than log_prob")
-    # of an image it may be that of one number
+    # the loss of an image may be the mean over its numbers
     share = density.event_shape.numel() if subject.row.target.kind == "image" else 1
     gap = torch.where(fits, torch.minimum((factor - 1).abs(), (share * factor - 1).abs()), 0.0)
     worst.see(gap, lambda at: f"{factor[at].item():.4g} times -log_prob, row {at[0]}")
@@ -510,7 +521,7 @@ def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _several_values(subject: HeadSubject, worst: Worst) -> None:
-    """log_prob of values (5, *batch) is that of each by itself."""
+    """Check that log_prob of values (5, *batch) equals that of each value alone."""
     with torch.no_grad():
         density, value = subject.make()(subject.raws(4)), subject.values(5, 4)
         found = density.log_prob(value)
@@ -523,10 +534,11 @@ def _several_values(subject: HeadSubject, worst: Worst) -> None:
 
 
 def seeded(head: DensityHead, raw: Tensor) -> Distribution:
-    """The density with the same random numbers, if it draws any, each time."""
+    """Return the density of distribution parameters, with the same random numbers at each call if it draws any."""
     seed(SEED)
     return head(raw)
 
 
 def as_type(value: Tensor, dtype: torch.dtype) -> Tensor:
+    """Convert a floating-point tensor to the dtype; return any other tensor as it is."""
     return value.to(dtype) if value.is_floating_point() else value

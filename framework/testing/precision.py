@@ -1,4 +1,4 @@
-"""Log-densities of a head to their last digits: against the row's reference, and in float32 against float64."""
+"""Checks of the digits of a head's log-densities: against the row's reference, and float32 against float64."""
 
 import copy
 import math
@@ -12,10 +12,10 @@ from framework.testing.heads import HeadSubject, as_type, seeded
 
 
 def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
-    """log_prob of the row's cases; error relative to max(1, |reference|).
+    """Check log_prob of the row's cases; the error is relative to max(1, |reference|).
 
-    A head that computes with parameters of its own cannot but round on the way, once for each: what that changes, to
-    first order, is no error of its. One without is given its numbers exactly, and must not lose them.
+    A head with parameters of its own rounds each of them once when it is converted. What this changes, to first order,
+    is not counted as an error. A head without parameters receives its inputs exactly and must not lose their digits.
     """
     assert subject.row.cases is not None
     head = subject.make().double()
@@ -38,10 +38,10 @@ def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
 
 
 def precision(subject: HeadSubject, worst: Worst) -> None:
-    """log_prob in float32 against the same head in float64, at the same numbers; error in float32 epsilons.
+    """Check log_prob in float32 against the same head in float64 at the same inputs; the error is in float32 epsilons.
 
-    Relative to max(1, |log p|) and to what a rounding of the raw numbers or of an angle changes: what is left is
-    cancellation inside.
+    The error is relative to max(1, |log p|) plus the change from rounding the distribution parameters or an angle, so
+    that what remains is cancellation inside the head.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()
@@ -67,8 +67,11 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
 def rounded(
     subject: HeadSubject, head: DensityHead, raw: Tensor, value: Tensor, parameters: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """log_prob of a float64 head, and what a relative rounding of its numbers changes, Σ|r ∂log p/∂r| + Σ max(|φ|,
-    π)|∂log p/∂φ|, with the same of the parameters where asked; in units of the rounding."""
+    """Return log_prob of a float64 head, and its first-order change from rounding the inputs, in units of the rounding.
+
+    The change is Σ|r ∂log p/∂r| + Σ max(|φ|, π)|∂log p/∂φ| over distribution parameters r and angles φ. With
+    `parameters`, the sum over the head's own parameters is added.
+    """
     arguments = {"raw": raw.clone().requires_grad_()}
     if value.is_floating_point():
         arguments["value"] = value.double().requires_grad_()
@@ -80,7 +83,7 @@ def rounded(
     for (name, argument), slope in zip(arguments.items(), slopes, strict=True):
         size = argument.detach().abs().clamp(min=least.get(name, 0.0))
         change = change + (slope.abs() * size).flatten(log_prob.dim()).sum(-1)
-    if own:  # shared by all rows of the batch
+    if own:  # the parameters are shared by all rows of the batch, so that each row needs its own gradient
         for row, one in enumerate(log_prob):
             of_one = torch.autograd.grad(one, own, retain_graph=True, allow_unused=True)
             parts = [

@@ -10,18 +10,21 @@ from torch.distributions import Distribution
 from framework.distributions.circular import Circular
 
 POINTS = {1: 1020, 2: 252, 3: 60}
-"""Grid points a side by the number of angles; spectrally exact for densities that the grid resolves."""
+"""Number of angles → grid points per side; exact to spectral accuracy for densities that the grid resolves."""
 REAL_POINTS = {1: 1020, 2: 252, 3: 72}
 CELLS = {1: 12, 2: 12, 3: 6}
-"""Cells a side in which samples are counted; divides the points."""
+"""Number of cells per side in which samples are counted; it divides the number of points."""
 REAL_SCALE = 3.0
-"""Reals are read on a circle, x = 3 tan(t/2), t uniform: half of the points lie within ±3."""
+"""Scale c of the map x = c tan(t/2) from a uniform t on the circle to the reals; half of the points lie within ±c."""
 
 
 def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
-    """Borders (cells a side + 1,) of each number, and the mass (*cells, *batch) of each cell, float64.
+    """Return the borders (cells per side + 1,) of each number, and the mass (*cells, *batch) of each cell, float64.
 
-    Covers one to three numbers, and classes, whose borders lie between the labels; more numbers raise a ValueError.
+    Densities may be over one to three numbers or over classes; the borders of classes lie between the labels.
+
+    Raises:
+        ValueError: The density has more than three numbers.
     """
     batch = density.batch_shape
     if density.event_shape == ():
@@ -42,15 +45,15 @@ def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
 
 
 def density_at(density: Distribution, points: Tensor) -> Tensor:
-    """The density at points (points, numbers), (points, *batch), float64."""
+    """Return the density at points (points, numbers), shape (points, *batch), float64."""
     batch = density.batch_shape
-    like = density.sample(torch.Size((0,)))  # a sample of nothing tells the density's number type
+    like = density.sample(torch.Size((0,)))  # an empty sample has the dtype of the density
     value = points.to(like.dtype).reshape(-1, *(1,) * len(batch), points.shape[-1])
     return density.log_prob(value.expand(-1, *batch, -1)).double().exp()
 
 
 def counted(density: Distribution, borders: list[Tensor], samples: Tensor) -> Tensor:
-    """How many of samples (draws, *batch, *event) fall in each cell, (*cells, *batch), float64."""
+    """Return the number of samples (draws, *batch, *event) in each cell, (*cells, *batch), float64."""
     batch = density.batch_shape
     if density.event_shape == ():
         labels = torch.arange(len(borders[0]) - 1).reshape(-1, *(1,) * samples.dim())
@@ -68,10 +71,10 @@ def counted(density: Distribution, borders: list[Tensor], samples: Tensor) -> Te
 
 
 def side(density: Distribution, index: int, points: int, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Nodes (points,), their weights, and the borders (count + 1,) of cells, of one number of the density.
+    """Return nodes (points,), their weights, and the borders (count + 1,) of cells for one number of the density.
 
-    A whole turn has equally spaced nodes; a part of one, at whose ends a density need not close, those of Gauss and
-    Legendre in each cell.
+    Nodes over a whole turn are equally spaced. A part of a turn, at whose ends a density need not agree, has
+    Gauss-Legendre nodes in each cell.
     """
     middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
     border = torch.arange(count + 1, dtype=torch.float64) / count
@@ -91,5 +94,5 @@ def side(density: Distribution, index: int, points: int, count: int) -> tuple[Te
 
 
 def _real(part: Tensor) -> Tensor:
-    """(0, 1) → the reals."""
+    """Map numbers in (0, 1) to the reals."""
     return REAL_SCALE * torch.tan(math.pi * (part - 0.5))

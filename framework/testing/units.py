@@ -1,4 +1,4 @@
-"""Heads of reals whose targets have a location and a scale: the density in the target's own unit."""
+"""Check of heads of reals whose target has a location and a scale: the density is in the target's own unit."""
 
 import math
 from collections.abc import Callable
@@ -19,14 +19,14 @@ from framework.testing.questions import MANY, two_samples
 
 Answer = TypeVar("Answer")
 UNITS = ((200.0, 50.0), (0.3, 1e-5))
-"""Location and scale of every other number: of a height in centimetres, say, and of a wavelength in metres."""
+"""Location and scale, in turn, of the numbers of a target, as of a height in centimetres and a wavelength in metres."""
 TOLERANCE = 1e-5
 
 
 def units(subject: HeadSubject, worst: Worst) -> None:
-    """A target of location l and scale s has the density of the standardised one at (y - l)/s, over s.
+    """Check that the density of a target of location l and scale s is p((y - l)/s)/s, with p the density without them.
 
-    A head that does not read them gives the density of the target's own unit: the same as without; that is allowed.
+    A head may ignore location and scale and give the same density as without them; that passes.
     """
     head = subject.make()
     if head.direct or isinstance(head, Fitted):
@@ -58,7 +58,7 @@ def _compare(subject: HeadSubject, target: Target, location: Tensor, scale: Tens
     )
     standard = subject.values(12).double()
     with torch.no_grad():
-        # some near the place, where a narrow density is not negligible
+        # some values near the mode, where a narrow density is not negligible
         standard[6:] = _after(lambda: alone(raw[6:]).sample()).double()
     value = location + scale * standard
     volume = scale.log().sum()
@@ -106,7 +106,7 @@ def _compare(subject: HeadSubject, target: Target, location: Tensor, scale: Tens
 def _places(
     own: Distribution, plain: Distribution, location: Tensor, scale: Tensor, worst: Worst, what: str
 ) -> None:
-    """What is asked of either but log_prob, in the standardised unit."""
+    """Check mode, moments, median, marginals and cdf of both densities in the standardised unit."""
     for name in ("mode", "mean", "variance"):
         try:
             found, wanted = getattr(own, name).double(), getattr(plain, name).double()
@@ -133,7 +133,7 @@ def _places(
 
 
 def _see(worst: Worst, what: str, found: Tensor, wanted: Tensor, least: float) -> None:
-    """Relative to the size of what is wanted where that is above `least`."""
+    """Record the difference, relative to the wanted value where that is above `least`, else to `least`."""
     apart = torch.where((found == wanted) | (found.isnan() & wanted.isnan()), 0.0, (found - wanted).abs())
     worst.see(apart / wanted.nan_to_num(nan=0.0).abs().clamp(min=max(least, math.ulp(1.0))), what)
 
