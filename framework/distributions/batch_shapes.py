@@ -1,4 +1,4 @@
-"""Densities with another batch_shape: several side by side, or one batch folded; what wrappers mix is made of these."""
+"""Densities with a changed batch_shape: several densities side by side, or one reshaped batch; wrappers mix these."""
 
 from collections.abc import Collection, Sequence
 from typing import ClassVar
@@ -30,10 +30,10 @@ from framework.distributions.protocol import (
 
 
 class Stacked(Distribution):
-    """K densities of one batch_shape side by side: batch_shape (*batch, K), the form in which a Mixture reads them.
+    """K densities of one batch_shape side by side, with batch_shape (*batch, K), the form that a Mixture reads.
 
     Args:
-        densities: at least one; all of one batch_shape, event_shape and support.
+        densities: at least one; all have the same batch_shape, event_shape and support.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -55,20 +55,20 @@ class Stacked(Distribution):
         return self.densities[0].support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Every class, (class, *batch, K) or (class, *1) without `expand`."""
+        """Return every class, (class, *batch, K), or (class, *1) without `expand`."""
         found = self.densities[0].enumerate_support(expand).unsqueeze(-1)
         return found.expand(*found.shape[:-1], len(self.densities)) if expand else found
 
     @property
     def _axis(self) -> int:
-        """Of K, among the dimensions of a value."""
+        """The dimension of a value tensor that counts the K densities."""
         return -1 - len(self.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
         return torch.stack([density.log_prob(part) for density, part in self.apart(value)], -1)
 
     def apart(self, value: Tensor) -> list[tuple[Distribution, Tensor]]:
-        """Each density, and of values (*sample, *batch, K or 1, *event) those that are its own."""
+        """Return each density with its own part of the values (*sample, *batch, K or 1, *event)."""
         wide = value.expand(*value.shape[: self._axis], len(self.densities), *self.event_shape)
         return list(zip(self.densities, wide.unbind(self._axis), strict=True))
 
@@ -93,11 +93,11 @@ class Stacked(Distribution):
 
 
 class Reshaped(Distribution):
-    """One density whose batch is read in another shape of as many items, in the same order.
+    """One density whose batch is read in another shape with the same number of items, in the same order.
 
     Args:
-        density: with any batch_shape.
-        batch_shape: of as many items.
+        density: a density with any batch_shape.
+        batch_shape: the new shape, with as many items.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -119,7 +119,7 @@ class Reshaped(Distribution):
         return self.density.support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        """Return every class, (class, *batch), or (class, *1) without `expand`."""
         found = self.density.enumerate_support(expand=False).reshape(-1, *(1,) * len(self.batch_shape))
         return found.expand(-1, *self.batch_shape) if expand else found
 
@@ -128,7 +128,11 @@ class Reshaped(Distribution):
         return self.density.log_prob(flat).reshape(shape)
 
     def inner(self, value: Tensor) -> tuple[Tensor, torch.Size]:
-        """Values (*sample, *batch, *event) in the batch_shape of the density inside, and the answer's shape."""
+        """Return the values in the batch_shape of the inner density, and the shape of the result.
+
+        Args:
+            value: values (*sample, *batch, *event) in the new batch_shape.
+        """
         whole = torch.broadcast_shapes(value.shape, torch.Size((*self.batch_shape, *self.event_shape)))
         lead = whole[: len(whole) - len(self.batch_shape) - len(self.event_shape)]
         flat = value.expand(whole).reshape(*lead, *self.density.batch_shape, *self.event_shape)
@@ -316,7 +320,7 @@ def _(density: Reshaped) -> Tensor:
 
 
 def _beside(found: list[Tensor], axis: int) -> Tensor:
-    """(peak, …) of each density; where one has fewer than others, its first stands for the rest."""
+    """Stack tensors (peak, …) of several densities; a density with fewer peaks repeats its first peak."""
     most = max(len(one) for one in found)
     same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
     return torch.stack(same, axis)

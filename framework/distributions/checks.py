@@ -1,4 +1,4 @@
-"""Refuses NaN among numbers about to be averaged."""
+"""A check that refuses NaN among numbers before they are averaged."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -7,13 +7,14 @@ from framework.errors import UserError
 
 
 def refuse_nan(values: Float[Tensor, "batch"], what: str) -> Float[Tensor, "batch"]:
-    """`values` themselves, one a sample.
+    """Return `values`, one per sample, unchanged if none is NaN.
 
     Args:
-        what: they are, in the plural: "entropies of the test split".
+        values: the numbers that are checked.
+        what: name of the numbers in the plural, for the message: "entropies of the test split".
 
     Raises:
-        UserError: some are NaN; says how many, and which is the first.
+        UserError: some values are NaN; the message says how many, and which is the first.
     """
     wrong = values.isnan()
     if wrong.any():

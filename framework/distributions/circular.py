@@ -1,4 +1,4 @@
-"""Angles as angles: their support, wrapping, distance, mean, and the exact circular median."""
+"""Functions of angles: support, wrapping, distance, mean, and the exact circular median."""
 
 import math
 
@@ -9,11 +9,12 @@ from torch.distributions import constraints
 
 
 class Circular(constraints.Constraint):
-    """Real numbers read as angles, radians modulo 2π, in the last dimension: the support of a density over angles.
+    """Support of a density over angles: real numbers in the last dimension, read as radians modulo 2π.
 
     Args:
-        ranges: (lowest, highest) of each angle within [-π, π], radians, of a density that is spread over a chart of
-            something else (rotations, say) and integrates to 1 there; None for a whole turn of each.
+        ranges: (lowest, highest) of each angle within [-π, π], radians, for a density that is spread over a chart of
+            another space (rotations, for example) and integrates to 1 over these ranges; None if each angle covers the
+            whole circle.
     """
 
     event_dim = 1
@@ -27,11 +28,11 @@ class Circular(constraints.Constraint):
 
 
 circular = Circular()
-"""The support of a density over angles, each a whole turn."""
+"""Support of a density over angles that each cover the whole circle."""
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """The same angle in [-π, π), radians."""
+    """Return the equivalent angle in [-π, π), radians."""
     turn = 2 * math.pi
     wrapped = torch.remainder(angle + math.pi, turn) - math.pi
     # remainder may round up to a whole turn for tiny negative arguments
@@ -39,23 +40,23 @@ def wrap(angle: Tensor) -> Tensor:
 
 
 def angular_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Absolute angular deviation in [0, π], radians (Δ_AAD of thesis eq. 3.23)."""
+    """Return the absolute angular deviation in [0, π], radians (Δ_AAD of thesis eq. 3.23)."""
     return wrap(first - second).abs()
 
 
 def circular_mean(angle: Tensor, dim: int = -1) -> Tensor:
-    """Direction of the mean of unit vectors, in [-π, π]; the mean of 359° and 1° is 0°."""
+    """Return the direction of the mean of the unit vectors, in [-π, π]; the mean of 359° and 1° is 0°."""
     return torch.atan2(angle.sin().mean(dim), angle.cos().mean(dim))
 
 
 def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
-    """The sample with the least mean angular deviation from all (eq. 3.24), exactly, in O(S log S).
+    """Return the sample with the least mean angular deviation from all samples (eq. 3.24), exactly, in O(S log S).
 
     F(θ) = Σ_k Δ(θ, φ_k) is piecewise linear with convex kinks at samples and concave kinks at their antipodes, so
-    its minimum over the whole circle lies at a sample: this is the exact circular median. With the samples sorted,
-    those within half a turn ahead of φ_j are a run that starts at j; prefix sums over two turns give their summed
-    distance, and the summed distance to the rest likewise. Ties go to the smallest angle in [-π, π). Of samples
-    that are not all finite it is NaN.
+    its minimum over the whole circle lies at a sample: this sample is the exact circular median. In the sorted samples,
+    the samples within half a turn ahead of φ_j are consecutive and start at j. Prefix sums over two turns give the
+    sum of their distances, and the sum of the distances to all other samples. Ties go to the smallest angle in
+    [-π, π). The result is NaN if not all samples are finite.
     """
     count = samples.shape[0]
     if count == 0:
@@ -80,5 +81,5 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
 
 
 def grid(points: int, *, dtype: torch.dtype = torch.float32, device: torch.device | None = None) -> Tensor:
-    """Equally spaced angles in [-π, π): the trapezium rule on them is spectrally exact for smooth densities."""
+    """Return equally spaced angles in [-π, π); on them the trapezium rule is spectrally exact for smooth densities."""
     return -math.pi + 2 * math.pi / points * torch.arange(points, dtype=dtype, device=device)

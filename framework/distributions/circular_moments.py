@@ -1,4 +1,4 @@
-"""Trigonometric moments of a density of one angle, from a grid, and what follows from them."""
+"""Trigonometric moments of a density of one angle, computed on a grid, and quantities that follow from them."""
 
 import math
 
@@ -11,26 +11,31 @@ from framework.distributions.circular import Circular
 from framework.distributions.density import circular_grid
 
 POINTS = (720, 2880)
-"""Angles on the grid, and on the finer one that is tried where some density is too narrow for it."""
+"""Number of angles on the grid, and on the finer grid that is used when the first does not resolve some density."""
 MASS_GAP = 1e-4
-"""How far the mass on the grid may be from 1."""
+"""Largest difference between 1 and the mass on a grid that resolves the density."""
 COARSE_ENOUGH = {torch.float64: 1e-8}
-"""How large the moments at the coarse grid's end may be for the fine one to be spared, by the type of the density's
-numbers."""
+"""Largest moment at the coarse grid's end for which the fine grid is not needed, by the density's number type."""
 ROUNDED = 4e-6
-"""Likewise of types with fewer digits: rounding alone, which no finer grid mends, leaves 2e-6 there in float32."""
+"""Value of COARSE_ENOUGH for number types with fewer digits.
+
+In float32, rounding alone leaves 2e-6 there, which no finer grid improves.
+"""
 LAST_MOMENTS = 1e-4
-"""How large the moments at the fine grid's end may be: those beyond are taken for 0. A von Mises density with
-concentration 3,500 (σ = 1°) is spared the fine grid, and one with 100,000 (σ = 0.18°) is still resolved there."""
+"""Largest moment at the fine grid's end for which the higher moments are taken as 0.
+
+A von Mises density with concentration 3,500 (σ = 1°) does not need the fine grid, and one with 100,000 (σ = 0.18°) is
+still resolved on the fine grid.
+"""
 
 
 class CircularMoments:
-    """m_n = E exp(i n X), n = 0 ... N/2, of densities of one angle X (Mardia & Jupp 2000, §3.4.1).
+    """Moments m_n = E exp(i n X), n = 0 ... N/2, of densities of one angle X (Mardia & Jupp 2000, §3.4.1).
 
     Args:
-        moments: m_0 is 1.
-        resolved: where the grid saw the density; elsewhere the moments say nothing, and draws have to. NaN of a
-            density that is NaN counts as seen.
+        moments: the moments; m_0 is 1.
+        resolved: whether the grid resolved the density. Where it did not, the moments are meaningless, and draws must
+            be used instead. A density that is NaN counts as resolved.
     """
 
     def __init__(self, moments: Complex[Tensor, "harmonic *batch"], resolved: Bool[Tensor, "*batch"]) -> None:
@@ -41,14 +46,15 @@ class CircularMoments:
 
     @property
     def direction(self) -> Float[Tensor, "*batch"]:
-        """Of the mean, radians in [-π, π]; 0 where the mean resultant is below 1e-6 and has none."""
+        """Direction of the mean, radians in [-π, π]; 0 where the mean resultant is below 1e-6 and has no direction."""
         first = self.moments[1]
         return torch.where(first.abs() < 1e-6, 0.0, first.angle())
 
     def arc(self, start: Tensor, end: Tensor) -> Tensor:
-        """Mass from `start` counter-clockwise to `end`, (*sample, *batch), both of that shape, radians.
+        """Return the mass from `start` counter-clockwise to `end`, (*sample, *batch).
 
-        The Fourier series of the density integrated term by term: as exact as the moments.
+        The Fourier series of the density is integrated term by term, so the result is as exact as the moments. Both
+        angles are (*sample, *batch), radians.
         """
         turn = torch.remainder(end - start, 2 * math.pi)
         return self._series(turn, start).clamp(0, 1)
@@ -64,26 +70,27 @@ class CircularMoments:
         return turn / (2 * math.pi) + parts.sum(0) / math.pi
 
     def distance(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """E d(X, y), d the angular distance, radians: d(θ) = π/2 - 4/π Σ cos(nθ)/n² over odd n."""
+        """Return E d(X, y), with d the angular distance, radians: d(θ) = π/2 - 4/π Σ cos(nθ)/n² over odd n."""
         turned = self.moments[1:] * torch.polar(torch.ones_like(self.order), -self.order * value)
         return math.pi / 2 - 4 / math.pi * (turned.real / self.order.square())[::2].sum(0)
 
     @property
     def spread(self) -> Float[Tensor, "*batch"]:
-        """E d(X, X'), X' as X and independent of it, radians, by the same series."""
+        """E d(X, X'), radians, by the same series; X' is an independent copy of X."""
         squares = self.moments[1:].abs().square()
         return math.pi / 2 - 4 / math.pi * (squares / self.order.square())[::2].sum(0)
 
     def density(self, finer: int, *, slope: bool = False) -> Float[Tensor, "points *batch"]:
-        """On equally spaced angles from -π, `finer` times as many as the moments are of: the series between them.
+        """Return the density on equally spaced angles from -π, interpolated by the Fourier series.
 
         Args:
-            slope: its derivative instead, per radian.
+            finer: how many times as many angles are used as the grid of the moments had.
+            slope: if true, return the derivative of the density per radian instead.
         """
         count = 2 * (len(self.moments) - 1) * finer
         sign = 1 - 2 * (torch.arange(len(self.moments), device=self.moments.device) % 2)
         turned = self.moments.conj() * sign.reshape(-1, *(1,) * self.resolved.dim())
-        turned[-1] /= 2  # the highest is the mean of two, and stands for both
+        turned[-1] /= 2  # the highest moment is the mean of two coefficients and stands for both
         if slope:
             turned[0] = 0
             turned[1:] *= 1j * self.order
@@ -94,13 +101,13 @@ class CircularMoments:
 
 @torch.no_grad()
 def circular_moments(density: Distribution) -> CircularMoments:
-    """From the trapezium rule on a grid (spectrally exact of smooth densities).
+    """Return the moments by the trapezium rule on a grid, which is spectrally exact for smooth densities.
 
-    A density that the coarse grid does not resolve is evaluated on the finer one; the moments of those it does stay
-    those of the coarse one, so that they do not depend on what else is in the batch.
+    A density that the coarse grid does not resolve is evaluated on the finer grid. Densities that the coarse grid
+    resolves keep their coarse moments, so that these do not depend on the other densities of the batch.
 
     Raises:
-        ValueError: not a density of one angle.
+        ValueError: the density is not over one angle.
     """
     moments, resolved = _on_grid(density, POINTS[0])
     if bool(resolved.all()):
@@ -121,7 +128,7 @@ def _on_grid(density: Distribution, points: int) -> tuple[Tensor, Tensor]:
         inside = (angles >= low) & (angles <= high)
         mass = mass * inside.reshape(-1, *(1,) * (mass.dim() - 1))
     total = mass.sum(0)
-    if total.numel() == 0:  # the fast Fourier transform refuses nothing
+    if total.numel() == 0:  # the fast Fourier transform refuses an empty batch
         nothing = torch.zeros(points // 2 + 1, *total.shape, dtype=torch.complex128, device=total.device)
         return nothing, total > 0
     moments = torch.fft.rfft(mass / total, dim=0).conj().resolve_conj()

@@ -1,4 +1,4 @@
-"""Class probabilities of any density over classes, and labels that fit them: what metrics of classes share."""
+"""Class probabilities of any density over classes, and a check of class labels, shared by the metrics of classes."""
 
 import math
 
@@ -11,22 +11,22 @@ from framework.distributions.protocol import estimate
 from framework.errors import DataError, UserError
 
 LARGEST_DEFECT = 0.01
-"""How far from 1 the probabilities may sum up: float32 rounds logits of 1e4 to 1e-3."""
+"""Largest deviation of the sum of probabilities from 1; float32 rounds logits of 1e4 to 1e-3."""
 
 
 def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]:
-    """p(y = k) of each sample, in [0, 1], each row with sum 1 to float64.
+    """Return p(y = k) of each sample, in [0, 1]; each row sums to 1 in float64.
 
-    exp of log_prob at each class, in float64, over their sum: a float32 log_prob leaves sums of 1 ± 1e-7 (± 1e-3 where
-    logits reach 1e4), and a mixture's largest probability may exceed 1 by as much. Where log_prob is estimated from
-    draws (`estimate`), class by class, the sum is as far from 1 as chance has it.
+    The function computes exp of log_prob at each class, in float64, divided by their sum. A float32 log_prob leaves
+    sums of 1 ± 1e-7 (± 1e-3 where logits reach 1e4), and a mixture's largest probability may exceed 1 by as much. Where
+    log_prob is estimated from draws (`estimate`), class by class, the deviation of the sum from 1 is random.
 
     Args:
-        density: over classes, with batch_shape (batch,): `enumerate_support` lists them, class k the k-th.
+        density: density over classes, with batch_shape (batch,); class k is the k-th of `enumerate_support`.
 
     Raises:
-        UserError: a density that does not list its values, a probability that is NaN, a sum that is not 1 within 1 %
-            though nothing is drawn, or is 0.
+        UserError: the density does not list its values, a probability is NaN, a sum is 0, or a sum differs from 1 by
+            1 % or more although nothing is drawn.
     """
     if not density.has_enumerate_support or tuple(density.event_shape):
         raise UserError(
@@ -49,10 +49,10 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
 
 
 def require_labels(target: Real[Tensor, "batch"], classes: int) -> Real[Tensor, "batch"]:
-    """`target` itself, if every label is that of one of the classes.
+    """Return `target` unchanged if every label names one of the classes.
 
     Raises:
-        DataError: a label below 0 or above `classes` - 1, or NaN; says which.
+        DataError: a label is below 0, above `classes` - 1, or NaN; the message says which.
     """
     wrong = ~((target >= 0) & (target < classes))
     if wrong.any():

@@ -1,4 +1,4 @@
-"""What torch's own densities answer in closed form, and the normal quantile."""
+"""Closed-form answers of torch's own densities to the questions of `protocol`, and the normal quantile."""
 
 import inspect
 from collections.abc import Callable, Collection
@@ -42,7 +42,7 @@ for _kind in (
 
 @estimate.register
 def _(density: Independent, value: Tensor) -> Estimate:
-    """A product of independent factors: squared errors of their logarithms add up."""
+    """Return the estimate of a product of independent factors; the squared errors of their logarithms add up."""
     factors = estimate(density.base_dist, value)
     count = density.reinterpreted_batch_ndims
     if count:
@@ -55,12 +55,15 @@ def _(density: Independent, value: Tensor) -> Estimate:
 
 
 _ON_THE_LINE = (Normal, torchs.Laplace, torchs.Cauchy, torchs.Gumbel, torchs.StudentT)
-"""Densities of all reals whose distribution function is known; that of others is wrong outside of the support."""
+"""Densities over all real numbers whose distribution function is known.
+
+The distribution function of torch's other densities is wrong outside of their support.
+"""
 
 
 @marginal.register
 def _(density: Independent, index: int) -> Distribution:
-    """Of a product the factor itself."""
+    """Return the factor itself as the marginal of a product."""
     if density.event_shape == (1,) and index == 0:
         return density
     if density.reinterpreted_batch_ndims == 0:
@@ -72,14 +75,17 @@ def _(density: Independent, index: int) -> Distribution:
 
 
 def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
-    """One of torch's densities over a number, with `change` of each of its parameters; None where that is not known.
+    """Return a torch density over one number with `change` applied to each of its parameters; None where unknown.
 
-    It is where every parameter of its constructor is a tensor with one number for each item of the batch; a mixture or
-    a density that was transformed by hand is made of other things.
+    This is known where every parameter of the constructor is a tensor with one number for each item of the batch. A
+    mixture or a density that was transformed by hand has other parts.
     """
     kind: Any = next(one for one in type(density).__mro__ if getattr(torchs, one.__name__, None) is one)
     names = {*inspect.signature(kind.__init__).parameters} - {"self", "validate_args"}
-    if {"probs", "logits"} <= names:  # one is given; the other is computed, to rounding, when it is asked
+    if {
+        "probs",
+        "logits",
+    } <= names:  # one of the two was given; torch computes the other with rounding errors
         names -= {"probs"} if "logits" in vars(density) else {"logits"}
     shape = None if density.event_shape else density.batch_shape
     changed: dict[str, Tensor] = {}
@@ -92,10 +98,12 @@ def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distr
 
 
 def _below(base: Distribution, value: Tensor) -> Tensor:
-    """The distribution function of one of those densities, float64; Student's, which torch has not, is SciPy's."""
+    """Return the distribution function of one of `_ON_THE_LINE`, float64; SciPy gives Student's, which torch lacks."""
     if not isinstance(base, torchs.StudentT):
         return base.cdf(value)
-    from scipy.special import stdtr  # importing SciPy takes longer than most commands need it
+    from scipy.special import (
+        stdtr,
+    )  # imported here, since importing SciPy is slow and most commands do not need it
 
     freedom, standard = torch.broadcast_tensors(base.df, (value - base.loc) / base.scale)
     return torch.from_numpy(stdtr(freedom.cpu().numpy(), standard.cpu().numpy())).to(value.device)
@@ -113,7 +121,7 @@ def _(density: Independent, value: Tensor) -> Tensor | None:
 @cdf.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     known = isinstance(density.base_dist, _ON_THE_LINE) and density.event_shape == (1,)
-    # a normal may have no width, of which `normals` knows what to do
+    # `normals` also handles a normal density of width 0
     found = each_cdf(density, value) if known and normals(density) is None else None
     return cdf.dispatch(Distribution)(density, value) if found is None else found.squeeze(-1)
 
@@ -221,5 +229,5 @@ def _(density: MultivariateNormal, value: Tensor) -> Tensor:
 
 
 def normal_quantile(place: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """z with Φ(z) = place; places of [0, 1) closer to an end than float64 tells apart become ±8.2, never infinite."""
+    """Return z with Φ(z) = place; places of [0, 1) that float64 cannot tell from an end become ±8.2, never infinite."""
     return torch.special.ndtri(place.clamp(2.0**-54, 1 - 2.0**-53))

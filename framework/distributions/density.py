@@ -1,4 +1,4 @@
-"""The mixture, which every wrapper and mixture head returns, and quadratures of the density of one angle."""
+"""The mixture that every wrapper and mixture head returns, and a grid and the entropy of the density of one angle."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -48,27 +48,27 @@ __all__ = [
     "merged",
     "pick",
     "take",
-]  # among them what this file held before the questions had a page of their own
+]  # some of these moved to other files; the old import path keeps working
 
 circular_entropy = entropy_of_one
 CHUNK = 2**20
-"""Component densities evaluated at once without gradient, when one density is asked at many points."""
+"""Largest number of component densities evaluated at once without gradient, when one density is read at many points."""
 LARGEST = 2**26
-"""Numbers of their values, likewise: an image has a hundred thousand."""
+"""Largest number of elements of their values at once; an image has a hundred thousand."""
 
 CROSSED = 16
-"""Most components of which every two are looked at together for the mode."""
+"""Largest number of components for which the mode search compares every pair."""
 
 
 class Mixture(Distribution):
-    """Σ_k w_k p_k: every wrapper and mixture head returns this; parameters are never averaged.
+    """The density Σ_k w_k p_k, which every wrapper and mixture head returns; parameters are never averaged.
 
     Args:
-        log_weights: (*batch, K), nats; normalised here, so logits will do. -inf is a weight of zero.
+        log_weights: (*batch, K), nats. They are normalised here, so logits are accepted. -inf is a weight of zero.
         components: one density with batch_shape (*batch, K).
 
-    A mixture of one is its component to the last bit: the log-weight of one component is exactly 0 and log-sum-exp
-    of one term is that term.
+    A mixture of one component equals this component to the last bit: the log-weight of one component is exactly 0, and
+    log-sum-exp of one term is that term.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -91,7 +91,7 @@ class Mixture(Distribution):
         return self.components.support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Every class, (class, *batch) or (class, *1) without `expand`."""
+        """Return every class, (class, *batch), or (class, *1) without `expand`."""
         return self.components.enumerate_support(expand)[..., 0]
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -102,8 +102,10 @@ class Mixture(Distribution):
         return torch.logsumexp(self.log_weights + self.components.log_prob(spread), -1)
 
     def in_parts(self, value: Tensor) -> Sequence[Tensor]:
-        """Values (*sample, *batch, *event), split along the first dimension where all at once would fill the memory: a
-        grid of angles on many samples of many components."""
+        """Return the values (*sample, *batch, *event), split along the first dimension if they would fill the memory.
+
+        A grid of angles on many samples with many components is an example.
+        """
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
         if extra > 0 and value.shape[0] > self.rows and not torch.is_grad_enabled():
             return value.split(self.rows)
@@ -111,7 +113,7 @@ class Mixture(Distribution):
 
     @property
     def rows(self) -> int:
-        """Values (*batch, *event) that are computed at once without gradient."""
+        """Number of values (*batch, *event) that are computed at once without gradient."""
         components = max(1, self.log_weights.numel())
         return max(1, min(CHUNK // components, LARGEST // (components * max(1, self.event_shape.numel()))))
 
@@ -132,14 +134,15 @@ class Mixture(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """The likeliest class; of one component its mode; otherwise a top of the density (`highest`)."""
+        """The likeliest class; the mode of a single component; otherwise a maximum of the density (`highest`)."""
         event = len(self.event_shape)
         if self.log_weights.shape[-1] == 1:
             return self.components.mode.squeeze(-1 - event)
         if self.has_enumerate_support:
             support = self.enumerate_support()
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
-        # of every component, however nested: two humps of one may be highest with another's
+        # take the peaks of every component, also of nested mixtures: a lower peak of one component may become the
+        # highest point together with a peak of another component
         places = peaks(self)
         if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
             modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
@@ -148,43 +151,44 @@ class Mixture(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """Of reals, (*batch, *event); angles and classes have none."""
+        """The mean of real numbers, (*batch, *event); angles and classes have none."""
         first, offset, shares = self._moments()
         return first + (shares * offset).sum(self._axis)
 
     @property
     def variance(self) -> Tensor:
-        """Of each real, by the law of total variance."""
+        """The variance of each real number, by the law of total variance."""
         _, offset, shares = self._moments()
         apart = offset - (shares * offset).sum(self._axis, keepdim=True)
         return (shares * (self.components.variance + apart.square())).sum(self._axis)
 
     @property
     def _axis(self) -> int:
-        """Of the components, among the dimensions of a value."""
+        """The dimension of a value tensor that counts the components."""
         return -1 - len(self.event_shape)
 
     def _moments(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean of the first component, how far the components' means are from it, and their weights.
+        """Return the mean of the first component, the offsets of all component means from this mean, and the weights.
 
         Raises:
-            NotImplementedError: there is no mean; so say torch's own densities.
+            NotImplementedError: there is no mean; torch's own densities raise the same error.
         """
         if self.has_enumerate_support or isinstance(self.support, Circular):
             raise NotImplementedError(
                 "Angles and classes have no mean; ask mode, median or circular_moments."
             )
         means = self.components.mean
-        # about one of them: weights of float32 sum to 1 but for 1e-7, of means far from 0 that is much
+        # offsets from one mean: float32 weights sum to 1 only to 1e-7, a large error for means far from 0
         first = means.select(self._axis, 0)
         weights = self.log_weights.exp()[(..., *(None,) * len(self.event_shape))]
         return first, means - first.unsqueeze(self._axis), weights
 
     def entropy(self) -> Tensor:
-        """Nats. Exact for classes, by quadrature for one number.
+        """Return the entropy, nats; exact for classes, by quadrature for one number.
 
-        For several numbers Σ_k w_k (H_k - E_k log f/p_k), each component's own entropy H_k and a mean over about 1000
-        samples in all, as many of each: only where components overlap anything is left to chance.
+        For several numbers the entropy is Σ_k w_k (H_k - E_k log f/p_k), with H_k each component's own entropy, and E_k
+        a mean over about 1000 samples in all, equally many from each component. So only the overlap of components is
+        estimated from random draws.
         """
         count = self.log_weights.shape[-1]
         if count == 1:
@@ -202,7 +206,7 @@ class Mixture(Distribution):
         return (self.log_weights.exp() * found).sum(-1)
 
     def _surprise(self, draws: int) -> Tensor:
-        """log p_k - log f at so many draws of each component, (draw, *batch, component)."""
+        """Return log p_k - log f at `draws` draws of each component, (draw, *batch, component)."""
         drawn = self.components.sample(torch.Size((draws,)))
         values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
         mixed = self.log_prob(values).unflatten(0, (draws, self.log_weights.shape[-1])).movedim(1, -1)
@@ -210,21 +214,21 @@ class Mixture(Distribution):
 
 
 def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
-    """The estimate of log Σ_k t_k from those of log t_k, up to constants, along the last dimension.
+    """Return the estimate of log Σ_k t_k from the estimates of log t_k, up to constants, along the last dimension.
 
-    The terms must be drawn independently of one another. Delta method: the squared relative error of the sum is
-    Σ_k (t_k / Σ_j t_j)² s_k². Samples add up.
+    The terms must be drawn independently of one another. By the delta method, the squared relative error of the sum is
+    Σ_k (t_k / Σ_j t_j)² s_k². The numbers of samples add up.
 
     Args:
-        parts: errors, samples and so on of each term, (*items, K).
+        parts: estimates of the terms, with errors and numbers of samples, (*items, K).
         log_terms: log t_k, (*items, K).
-        log_sum: (*items,).
+        log_sum: log Σ_k t_k, (*items,).
     """
     with torch.no_grad():
         whole = log_sum.unsqueeze(-1)
         share = torch.where(whole == -math.inf, 1.0, (log_terms - whole).exp())
         error = parts.standard_error
-        # what adds nothing adds no error, not even an infinite one; an unknown error stays unknown
+        # a term with no share adds no error, not even an infinite one; an unknown error stays unknown
         silent = (error == 0) | ((share == 0) & ~error.isnan())
         error = torch.where(silent, 0.0, share * error).square().sum(-1).sqrt()
     return with_error(log_sum, error, parts.samples.sum(-1), parts.unresolved.any(-1))
@@ -232,7 +236,7 @@ def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
 
 @estimate.register
 def _(density: Mixture, value: Tensor) -> Estimate:
-    """Of independent components; of one component its own, to the last bit."""
+    """Return the estimate of a mixture of independent components; of one component its own, to the last bit."""
     several = density.in_parts(value)
     if len(several) > 1:
         return joined([estimate(density, part) for part in several])
@@ -245,7 +249,7 @@ def _(density: Mixture, value: Tensor) -> Estimate:
 
 
 def joined(parts: Sequence[Estimate]) -> Estimate:
-    """Of several batches one, along the first dimension."""
+    """Return one estimate from those of several batches, concatenated along the first dimension."""
     return Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -256,8 +260,11 @@ def _(density: Mixture, index: int) -> Distribution:
 
 @median.register
 def _(density: Mixture, samples: int) -> Tensor:
-    """Of one component its own; otherwise of draws, as by default. But of images the mean, which `Frozen` answers too:
-    the median of few draws is a noisy picture, and that of the distribution function takes a second of a processor."""
+    """Return the median of a single component; otherwise the median of draws, as by default.
+
+    For images the mean is returned, as `Frozen` does: the median of few draws is a noisy image, and the median from the
+    distribution function takes a second of processor time.
+    """
     if density.log_weights.shape[-1] == 1:
         return median(density.components, samples).squeeze(-1 - len(density.event_shape))
     if len(density.event_shape) == 3:
@@ -286,10 +293,10 @@ def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
 
 
 def _mixed(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
-    """The weighted mean of the components' `parts`, (*sample, *batch, *number, K)."""
+    """Return the weighted mean of the components' `parts`, (*sample, *batch, *number, K)."""
     if parts is None:
         return None
-    weights = density.log_weights.double().softmax(-1)  # float32's sum to 1 but for 1e-7
+    weights = density.log_weights.double().softmax(-1)  # float32 weights sum to 1 only to 1e-7
     weights = weights[(..., *(None,) * numbers, slice(None))]
     return torch.where(weights > 0, weights * parts, 0.0).sum(-1).clamp(0, 1)
 
@@ -299,7 +306,7 @@ def _(density: Mixture) -> Normals | None:
     parts = normals(density.components)  # (*batch, K, k)
     if parts is None:
         return None
-    # again: float32's sum to 1 but for 1e-7
+    # normalise again: float32 weights sum to 1 only to 1e-7
     log_weights = density.log_weights.double().log_softmax(-1).unsqueeze(-1) + parts.log_weights
     return Normals(*(number.flatten(-2) for number in (log_weights, parts.mean, parts.scale)))
 
@@ -330,9 +337,12 @@ def _(density: Mixture, index: Tensor) -> Distribution:
 
 @pick.register
 def _(density: Reshaped, index: Tensor) -> Distribution:
-    """The same items of the inner density, whose batch is one line of them then: nothing is drawn and thrown away."""
+    """Pick the matching items of the inner density, whose batch becomes one line of items.
+
+    So no draw is thrown away.
+    """
     inner = density.density
-    # a mixture draws of all its items to pick from each, which here would be those of the whole batch every time
+    # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch
     if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
         return pick.dispatch(Distribution)(density, index)
     # items in the order of (*batch, K): the item of batch place b and component k is b·K + k
@@ -340,7 +350,7 @@ def _(density: Reshaped, index: Tensor) -> Distribution:
     count = density.batch_shape[-1]
     first = torch.arange(density.batch_shape[:-1].numel(), device=index.device) * count
     items = first.reshape(density.batch_shape[:-1]) + index
-    # `pick` reads the last batch dimension as the components: one line of them has no other dimension
+    # `pick` reads the last batch dimension as the components; a batch of one line has no other dimension
     return Reshaped(pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))
 
 
@@ -352,8 +362,11 @@ def _(density: Mixture) -> Tensor:
 
 @images.register
 def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
-    """Of one component its own; of several over images their mean. Of several over anything else none: what components
-    draw at points of their own shows no point of the mixture."""
+    """Return the images of a single component; for several components over images, their mean.
+
+    Several components over other targets have no image: components that are each drawn at their own point prediction do
+    not show the point prediction of the mixture.
+    """
     if density.log_weights.shape[-1] == 1:
         axis = len(density.batch_shape)
         return {name: found.squeeze(axis) for name, found in images(density.components, channels).items()}
@@ -379,16 +392,16 @@ def _(density: Mixture, index: tuple[Tensor, ...], place: Tensor) -> Distributio
 
 
 def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Tensor]:
-    """Angles (points,) in [-π, π) and the log-density there (points, *batch) of a density of one angle.
+    """Return angles (points,) in [-π, π) and the log-density there (points, *batch) of a density of one angle.
 
     A density narrower than the grid (concentration above points²/40) may fall between two points; use more points
-    for those.
+    for such a density.
     """
     if tuple(density.event_shape) != (1,):
         raise ValueError(
             f"wanted the density of one angle, got event_shape {tuple(density.event_shape)}; use marginal()."
         )
-    # a sample of nothing tells the density's dtype and device
+    # an empty sample has the density's dtype and device
     like = density.sample(torch.Size((0,)))
     angles = grid(points, dtype=like.dtype, device=like.device)
     value = angles.reshape(points, *(1,) * len(density.batch_shape), 1).expand(

@@ -1,19 +1,19 @@
-"""A density in one line, for a notebook: its kind, its shapes and what its distribution parameters are."""
+"""A density as one line of text for a notebook: its kind, its shapes and its distribution parameters."""
 
 import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
 LONGEST = 200
-"""Most characters of a line."""
+"""Largest number of characters of a line."""
 WHOLE = 6
-"""Most numbers of a parameter that are shown; of more the range is."""
+"""Largest number of a parameter's elements that are printed in full; of longer parameters the range is printed."""
 
 
 def one_line(self: Distribution) -> str:
     """Return the kind of a density, its shapes, its names where it has some, and its parameters.
 
-    Nothing is drawn or integrated for it. Densities take it as their `__repr__`.
+    The function draws and integrates nothing. Densities use it as their `__repr__`.
     """
     batch, event = (tuple(shape) for shape in (self.batch_shape, self.event_shape))
     said = [f"batch={batch}", f"event={event}"]
@@ -26,19 +26,19 @@ def one_line(self: Distribution) -> str:
 
 
 class CategoricalDensity(Categorical):
-    """A categorical density that prints as others do."""
+    """A categorical density that prints as the other densities do."""
 
     __repr__ = one_line
 
 
 def _parameters(density: Distribution, inner: bool = True) -> list[str]:
-    """Return what the parameters of a density are, and of a density in it where it is the `inner` one's turn."""
+    """Return the parameters of a density as text, and those of a density inside it if `inner` is true."""
     found = ((key, _parameter(key, value, inner)) for key, value in vars(density).items())
     return [f"{key}={text}" for key, text in found if text]
 
 
 def _parameter(key: str, value: object, inner: bool) -> str:
-    """Return a parameter in a few characters; '' for what is none."""
+    """Return a parameter as a few characters; '' for an attribute that is no parameter."""
     if key.startswith("_"):
         return ""
     if isinstance(value, Distribution):

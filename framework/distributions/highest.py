@@ -1,4 +1,4 @@
-"""Where a density is highest, uphill from a few places."""
+"""Search for the highest point of a density, uphill from several starting points."""
 
 import torch
 from torch import Tensor
@@ -8,18 +8,18 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import Slope, slope
 
 STARTS = 3
-"""So many of the places given, the highest, are climbed from."""
+"""Number of the given places, the highest ones, from which the search starts."""
 STEPS = 16
 LONGEST = 16.0
-"""The longest step, in steps to the top of the bound."""
+"""Longest step, as a multiple of the step to the maximum of the bound."""
 
 
 def highest(density: Distribution, places: Tensor) -> Tensor:
-    """A point (*batch, *event) where the density is as high as at any of `places` (place, *batch, *event), or higher.
+    """Return a point (*batch, *event) where the density is at least as high as at all `places` (place, *batch, *event).
 
-    Where the density knows its `slope` it is a local maximum, to the rounding of log_prob and as far as STEPS lead,
-    reached from the highest places: not the highest point of all where no way up from these leads there. Where it does
-    not, it is the best place.
+    Where the density knows its `slope`, the point is a local maximum, up to the rounding of log_prob and within STEPS
+    steps from the highest places. It is not the global maximum if no ascent from these places leads there. Where the
+    `slope` is not known, the point is the best of `places`.
     """
     height, which = density.log_prob(places).topk(min(STARTS, len(places)), 0)
     start = places.gather(0, _over_event(density, which))
@@ -28,13 +28,17 @@ def highest(density: Distribution, places: Tensor) -> Tensor:
 
 
 def crossings(components: Distribution, modes: Tensor) -> Tensor:
-    """Tops of the products of two of K components with batch_shape (*batch, K), (place, *batch, *event), where their
-    `slope` is known: two that are narrow in different numbers may be highest together far from the mode of each.
+    """Return maxima of the products of two of K components, (place, *batch, *event), where their `slope` is known.
+
+    Two components that are narrow in different numbers may be highest together far from the mode of each.
 
     Args:
-        modes: of the components, (K, *batch, *event).
+        components: a density with batch_shape (*batch, K).
+        modes: modes of the components, (K, *batch, *event).
     """
-    both = slope(components, modes.unsqueeze(-2))  # (K, *batch, K, *event): the second's at the first's mode
+    both = slope(
+        components, modes.unsqueeze(-2)
+    )  # (K, *batch, K, *event): the second component at the first's mode
     if both is None:
         return modes[:0]
     own = both.stiffness.diagonal(dim1=0, dim2=-2).movedim(-1, 0).unsqueeze(-2)
@@ -43,7 +47,7 @@ def crossings(components: Distribution, modes: Tensor) -> Tensor:
 
 
 def _to_top(pull: Tensor, stiffness: Tensor, angles: bool) -> Tensor:
-    """From where a bound touches to its top; 0 where that is no number."""
+    """Return the step from where a bound touches the density to the bound's maximum; 0 where it is not finite."""
     return (torch.atan2(pull, stiffness) if angles else pull / stiffness).nan_to_num(0.0, 0.0, 0.0)
 
 
@@ -54,10 +58,11 @@ def _over_event(density: Distribution, index: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _climbed(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Places (start, *batch, *event) from which no step leads up any more, and their log-densities.
+    """Return places (start, *batch, *event) from which no step leads further up, and their log-densities.
 
-    A step leads to the top of the bound, which is never lower, and on by what the last step has told (the secant): of
-    one number that is Newton's method near the top, without a second derivative.
+    A step leads to the maximum of the bound, where the density is never lower. The step is lengthened by what the last
+    step showed (the secant method). For one number this is Newton's method near the maximum, without a second
+    derivative.
     """
     here = slope(density, place)
     if here is None:
@@ -76,7 +81,7 @@ def _climbed(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tens
         found = slope(density, there)
         assert found is not None
         up = rising & (found.log_prob > height)
-        # where not even the bound's top is higher, rounding decides
+        # where not even the bound's maximum is higher, only rounding is left
         rising = up | (rising & (reach > 1))
         left = (found.pull * step).sum(-1) / gain
         longer = torch.where(left < 1, reach / (1 - left), LONGEST).clamp(1, LONGEST)

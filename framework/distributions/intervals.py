@@ -1,4 +1,4 @@
-"""The middle of a density of reals or angles: quantiles where its distribution function is known, draws otherwise."""
+"""Central intervals of densities of reals or angles: quantiles of a known distribution function, otherwise of draws."""
 
 import math
 from collections.abc import Callable
@@ -19,30 +19,33 @@ from framework.distributions.protocol import Normals, arc, cdf, marginal, normal
 from framework.errors import UserError
 
 DRAWS = 9999
-"""Draws of each density whose distribution function is not known; the mass between two of them is right to 0.003."""
+"""Number of draws of a density whose distribution function is unknown; the mass between two draws is right to 0.003."""
 ROUNDS = 200
-"""Most narrowings of a bracket: it ends earlier, at the last digits of its distance from the density's middle."""
+"""Largest number of times that a bracket is narrowed.
+
+The search ends earlier, at the last digits of the bracket's distance from the density's middle.
+"""
 EXACT = 1e-12
-"""Width of a bracket at its end, relative to that distance."""
+"""Width of a bracket at the end of the search, relative to that distance."""
 AROUND = 24
-"""Angles on which the middle of a density of one angle is first looked for, besides those about its peaks."""
+"""Number of angles at which the search for the middle of a density of one angle starts, besides those near peaks."""
 RUNGS, NARROWER = 16, 8.0
-"""Arcs among which the one that holds a mass is first looked for, each so much narrower than the one before."""
+"""Number of arcs that are tried first in the search for the arc of a given mass, and the ratio of their widths."""
 _FURTHEST = 1100
-"""Doublings of a bracket: from the smallest to the largest number."""
+"""Number of doublings of a bracket that leads from the smallest to the largest floating-point number."""
 _FEW = 5.0
-"""Draws that must lie beyond an end for the error of that end to be known."""
+"""Number of draws that must lie beyond an end so that the error of this end is known."""
 
 
 class Interval(NamedTuple):
-    """The middle part of each number's density, (*batch, number) each, float64.
+    """The central interval of each number's density, (*batch, number) each, float64.
 
     Attributes:
-        low, high: the ends, outside of each of which half of the rest of the mass lies. Of angles in radians, `low` in
-            [-π, π) and the arc runs counter-clockwise to `high`, at most one turn on; either half of it, from the
-            circular median, has half of the mass.
-        low_error, high_error: standard errors of the ends in their unit; 0 where they were computed without draws,
-            infinite where draws do not reach so far.
+        low, high: the ends of the interval; half of the remaining mass lies outside of each end. Angles are in radians:
+            `low` is in [-π, π), and the arc runs counter-clockwise to `high`, at most one turn further. The circular
+            median splits the arc into two parts with half of its mass each.
+        low_error, high_error: standard errors of the ends in their unit; 0 where the ends were computed without draws,
+            infinite where the draws do not reach far enough.
     """
 
     low: Tensor
@@ -52,20 +55,21 @@ class Interval(NamedTuple):
 
     @property
     def drawn(self) -> bool:
-        """Whether an end is left to chance."""
+        """True if an end depends on random draws."""
         return bool(((self.low_error != 0) | (self.high_error != 0)).any())
 
 
 @torch.no_grad()
 def middle(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
-    """The middle `mass` of each number of a density of reals or angles.
+    """Return the central interval with the given mass for each number of a density of reals or angles.
 
     Ends are computed from `normals`, `cdf` or `arc`, or from the Fourier series of an angle's density
     (`circular_moments`), where these are known; otherwise they are order statistics of `draws` draws.
 
     Args:
-        density: event_shape (number,).
-        mass: in (0, 1).
+        density: a density with event_shape (number,).
+        mass: probability of the interval, in (0, 1).
+        draws: number of draws where the ends cannot be computed.
     """
     if isinstance(density, Moved):  # in float64, so that a location far from 0 costs no digit
         inner = middle(density.density, mass, draws)
@@ -78,7 +82,7 @@ def middle(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
         if known is None:
             return _of_draws(density, mass, draws)
         missing = known.low.isnan()
-        # of a density that is NaN nothing is known, and draws say no more
+        # draws do not help where the density is NaN
         lost = missing & ~density.log_prob(density.sample()).isnan().unsqueeze(-1)
         return _where(lost, _of_draws(density, mass, draws), known) if bool(lost.any()) else known
     try:
@@ -94,18 +98,18 @@ def _where(chosen: Tensor, one: Interval, other: Interval) -> Interval:
 
 
 def _exact(low: Tensor, high: Tensor) -> Interval:
-    """Of ends (*batch,) that were computed."""
+    """Return the interval with the computed ends (*batch,), and errors of 0."""
     none = torch.zeros_like(low).unsqueeze(-1)
     return Interval(low.unsqueeze(-1), high.unsqueeze(-1), none, none)
 
 
 def _tails(mass: float) -> Tensor:
-    """Masses below the two ends, (2,)."""
+    """Return the masses below the two ends, (2,)."""
     return torch.tensor([(1 - mass) / 2, (1 + mass) / 2], dtype=torch.float64)
 
 
 def _real(density: Distribution, mass: float) -> Interval | None:
-    """Of one real whose distribution function is known."""
+    """Return the interval of one real number whose distribution function is known; None if it is not."""
     below = _tails(mass)
     known = normals(density)
     if known is not None:
@@ -124,7 +128,7 @@ def _cdf_of(density: Distribution, value: Float[Tensor, "place *batch"]) -> Tens
 
 
 def _of_normals(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, "place *batch"]:
-    """Quantiles of mixtures of normals, which lie between those of the components."""
+    """Return quantiles of mixtures of normals; they lie between the quantiles of the components."""
     z = normal_quantile(below).reshape(-1, *(1,) * known.mean.dim())
     each = known.mean + z * known.scale  # (place, *batch, component)
     if known.mean.shape[-1] == 1:
@@ -147,11 +151,14 @@ def _of_normals(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, 
 def _outward(
     mass_below: Callable[[Tensor], Tensor], below: Float[Tensor, "place"], drawn: Float[Tensor, "draw *batch"]
 ) -> Float[Tensor, "place *batch"]:
-    """Quantiles of any density of one real, in a bracket that grows from a few draws until it holds them."""
+    """Return quantiles of any density of one real number, from a bracket that grows until it contains them.
+
+    The bracket starts from a few draws.
+    """
     center = drawn.median(0).values
     drawn = drawn.sort(0).values
     wide = drawn[-1 - len(drawn) // 4] - drawn[len(drawn) // 4]
-    # of draws that are all the same number the last digit is the width
+    # if all draws are equal, the width is the last digit of this number
     step = torch.maximum(wide, 1e-7 * center.abs()).clamp(min=1e-300)
     wanted = below.reshape(-1, *(1,) * center.dim())
     low, high = (
@@ -170,13 +177,18 @@ def _outward(
 def reached(
     rising: Callable[[Tensor], Tensor], wanted: Tensor, low: Tensor, high: Tensor, center: Tensor
 ) -> Tensor:
-    """Where a function that never falls reaches `wanted`; NaN where the function is.
+    """Return the place where a function that never falls reaches `wanted`; NaN where the function is NaN.
 
-    Inverse quadratic interpolation where it is safe and bisection elsewhere (Chandrupatla 1997), item by item.
+    The search uses inverse quadratic interpolation where it is safe and bisection elsewhere (Chandrupatla 1997), item
+    by item.
 
     Args:
-        low, high: a bracket.
-        center: the bracket ends at EXACT of its distance from here, or where two neighbouring numbers are left.
+        rising: the function, which never falls.
+        wanted: the value that the function shall reach.
+        low: lower end of a bracket.
+        high: upper end of the bracket.
+        center: reference point; the search ends where the bracket is as narrow as EXACT times the distance from it,
+            or where two neighbouring numbers are left.
     """
     wanted, low, high = torch.broadcast_tensors(wanted, low, high)
     a, b = high, low
@@ -213,7 +225,7 @@ def reached(
 
 
 def _angle(density: Distribution, mass: float) -> Interval | None:
-    """Of one angle; NaN where neither arcs nor the Fourier series are known."""
+    """Return the interval of one angle; NaN where neither arcs nor the Fourier series are known."""
     flat = Reshaped(density, (density.batch_shape.numel(),))
     if not len(flat.batch_shape) or flat.batch_shape.numel() == 0:
         return None
@@ -221,7 +233,9 @@ def _angle(density: Distribution, mass: float) -> Interval | None:
     support = density.support
     assert isinstance(support, Circular)
     low, high = support.ranges[0] if support.ranges is not None else (-math.pi, math.pi)
-    if high - low < 2 * math.pi - 1e-9:  # a part of the circle has a first and a last angle
+    if (
+        high - low < 2 * math.pi - 1e-9
+    ):  # a part of the circle has two ends, so the quantiles start at the lower end
         below = _tails(mass).to(flat.sample().device).unsqueeze(-1)
         places = below.new_full((2, flat.batch_shape[0]), low)
 
@@ -240,7 +254,7 @@ def _angle(density: Distribution, mass: float) -> Interval | None:
 def _reach(
     mass_within: Callable[[Tensor], Tensor], wanted: float, center: Float[Tensor, "item"]
 ) -> Float[Tensor, "item"]:
-    """The width, radians up to π, within which the mass is `wanted`."""
+    """Return the width, radians up to π, within which the mass is `wanted`."""
     power = torch.arange(RUNGS, dtype=torch.float64, device=center.device).unsqueeze(-1)
     rungs = (math.pi * NARROWER**-power).expand(RUNGS, len(center))
     enough = (mass_within(rungs) >= wanted).sum(0).clamp(min=1)  # falling
@@ -251,8 +265,10 @@ def _reach(
 
 
 def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
-    """The mass from one angle counter-clockwise to another, (*sample, item) each; NaN of items of which it is not
-    known."""
+    """Return a function that gives the mass from one angle counter-clockwise to another, (*sample, item) each.
+
+    The mass is NaN for items of which it is not known.
+    """
     probe = torch.zeros((*flat.batch_shape, 1), dtype=torch.float64, device=flat.sample().device)
     if arc(flat, probe, probe + 1) is not None:
 
@@ -271,10 +287,11 @@ def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution) -> Float[Tensor, "item"]:
-    """The angle of least expected deviation (thesis eq. 3.23), [-π, π).
+    """Return the angle of least expected deviation (thesis eq. 3.23), in [-π, π).
 
-    The deviation falls where less than half of the mass lies on the half turn behind an angle and rises where more
-    does, so that its minima are where that mass reaches one half; of several the lowest on the nodes is taken.
+    The deviation falls where less than half of the mass lies on the half turn behind an angle, and rises where more
+    than half lies there. So its minima are where this mass reaches one half. Among several minima the lowest one,
+    judged at the nodes, is taken.
     """
     nodes = _nodes(flat)
     behind = law(nodes - math.pi, nodes) - 0.5  # half the slope of the deviation
@@ -290,13 +307,13 @@ def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution
     found = reached(
         lambda angle: law(angle - math.pi, angle), torch.full_like(start, 0.5), start, stop, start
     )
-    # of a density without a middle, the uniform one, any angle will do: its mode
+    # a density without a middle (the uniform one) has no crossing; its mode is as good as any angle
     mode = flat.mode.squeeze(-1).double()
     return wrap(torch.where(crosses.any(0) | behind.isnan().any(0), found, mode))
 
 
 def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
-    """Ascending angles in [-π, π): all around, and about each peak as near as it is narrow."""
+    """Return ascending angles in [-π, π): around the whole circle, and near each peak at steps of its width."""
     places = wrap(peaks(flat).squeeze(-1).double())
     width = scales(flat).double().nan_to_num(nan=1.0, posinf=1.0)
     near = torch.tensor([-3, -1, 0, 1, 3], dtype=torch.float64, device=places.device)
@@ -307,7 +324,10 @@ def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
 
 
 def _of_draws(density: Distribution, mass: float, draws: int) -> Interval:
-    """Order statistics: of n draws the i-th is the quantile i / (n + 1); of angles about their circular median."""
+    """Return an interval of order statistics: of n draws, the i-th is the quantile i / (n + 1).
+
+    Angles are ordered about their circular median.
+    """
     drawn = density.sample(torch.Size((draws,))).double()
     angles = isinstance(density.support, Circular)
     middle_angle = circular_median(drawn) if angles else torch.zeros_like(drawn[0])

@@ -1,4 +1,4 @@
-"""A density of reals in another frame: what is known of Y, asked of X = location + scale · Y."""
+"""The affine transform X = location + scale · Y of a density of reals; Y's density answers the questions about X."""
 
 from collections.abc import Collection
 from typing import ClassVar
@@ -35,7 +35,7 @@ class Moved(Distribution):
     """The density of location + scale · Y, number by number.
 
     Args:
-        density: of Y, over n reals.
+        density: density of Y, over n real numbers.
         location: (*batch, n).
         scale: (*batch, n), above 0.
     """
@@ -62,15 +62,15 @@ class Moved(Distribution):
 
     @property
     def log_volume(self) -> Tensor:
-        """By which log-densities fall, (*batch,), nats: log |det| of the map (change of variables)."""
+        """Log-determinant of the map, log |det|, (*batch,), nats: log-densities fall by it (change of variables)."""
         return self.scale.log().sum(-1)
 
     def inner(self, value: Tensor) -> Tensor:
-        """Y, of X."""
+        """Return the value of Y for a value of X."""
         return (value - self.location) / self.scale
 
     def outer(self, value: Tensor) -> Tensor:
-        """X, of Y."""
+        """Return the value of X for a value of Y."""
         return self.location + self.scale * value
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -164,7 +164,7 @@ def _(density: Moved, value: Tensor) -> Slope | None:
 
 @images.register
 def _(density: Moved, channels: Collection[str]) -> dict[str, Tensor]:
-    return images(density.density, channels)  # the frame is one of numbers: what is seen stays as it is
+    return images(density.density, channels)  # the transform changes numbers, not what an image shows
 
 
 @peaks.register
@@ -178,11 +178,11 @@ def _(density: Moved) -> Tensor:
 
 
 class MovedSet(ValueSet):
-    """The set of Y in the frame of X = location + scale · Y.
+    """The set of Y, transformed by X = location + scale · Y.
 
     Args:
         inner: the set of Y.
-        density: of X.
+        density: the density of X.
     """
 
     def __init__(self, inner: ValueSet, density: Moved) -> None:

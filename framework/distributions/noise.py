@@ -1,4 +1,4 @@
-"""Noise as a function of what it is for: of (seed, step) in training, of (seed, batch, question) in evaluation."""
+"""Random noise that depends on its purpose alone: (seed, step) in training, (seed, batch, question) in evaluation."""
 
 import hashlib
 import random
@@ -14,11 +14,11 @@ from framework.storage.names import as_bytes
 
 @dataclass(frozen=True)
 class Draw:
-    """The noise of one evaluated batch: what a question draws does not depend on what else is asked.
+    """The noise of one evaluated batch; what one question draws does not depend on which other questions are asked.
 
     Attributes:
-        seed: of the run.
-        number: of the batch.
+        seed: seed of the run.
+        number: number of the batch.
     """
 
     seed: int
@@ -26,7 +26,7 @@ class Draw:
 
     @contextmanager
     def __call__(self, question: str) -> Iterator[None]:
-        """Within, `seed_step` of this question; afterwards torch's generators go on where they were."""
+        """Seed the noise for this question within the context; afterwards torch's generators go on where they were."""
         devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
         with torch.random.fork_rng(devices):
             seed_step(self.seed, self.number, question)
@@ -34,14 +34,14 @@ class Draw:
 
 
 def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
-    """Make what follows draw noise that depends on (seed, step, stage, rank) alone.
+    """Make all following noise depend on (seed, step, stage, rank) alone.
 
-    Seeds torch's CPU and CUDA generators, NumPy's legacy one and Python's; 7 µs in all, of which Python's 3.
-    `step` numbers the batches of a stage, not the optimiser's steps: batches whose gradients are accumulated
-    would share their noise.
+    The function seeds torch's CPU and CUDA generators, NumPy's legacy generator and Python's; it takes 7 µs in all, of
+    which Python's takes 3. `step` numbers the batches of a stage, not the optimiser's steps: otherwise batches whose
+    gradients are accumulated would share their noise.
     """
     value = hashed(seed, stage, step, rank)
-    # Not torch.manual_seed: where CUDA is not in use it formats the stack for a later report, 100 µs.
+    # torch.manual_seed is not used: where CUDA is not in use it formats the stack for a later report, 100 µs.
     torch.default_generator.manual_seed(value)
     if torch.cuda.is_initialized():
         torch.cuda.manual_seed(value)
@@ -50,6 +50,6 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
 
 
 def hashed(*parts: int | str) -> int:
-    """64 bits that depend on every part, the same on every machine."""
+    """Return 64 bits that depend on every part and are the same on every machine."""
     digest = hashlib.blake2b(as_bytes("|".join(map(str, parts))), digest_size=8).digest()
     return int.from_bytes(digest, "little")

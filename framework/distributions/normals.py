@@ -1,4 +1,4 @@
-"""Normal densities of several numbers, independent of one another or not; unlike torch's own also of an empty batch."""
+"""Normal densities of several numbers, independent or correlated; unlike torch's, they accept an empty batch."""
 
 import math
 
@@ -10,7 +10,7 @@ from framework.distributions.protocol import marginal, median, tempered
 
 
 class IndependentNormals(Independent):
-    """Normal densities of numbers that are independent of one another.
+    """Normal densities of several independent numbers.
 
     Args:
         mean, scale: (*batch, number).
@@ -28,7 +28,7 @@ class IndependentNormals(Independent):
 
 @median.register
 def _(density: IndependentNormals, samples: int) -> Tensor:
-    # each is symmetric about its mean
+    # each number's density is symmetric about its mean
     return density.mean
 
 
@@ -45,7 +45,7 @@ def _(density: IndependentNormals, temperature: Tensor) -> IndependentNormals:
 
 
 class JointNormal(MultivariateNormal):
-    """The normal density of a covariance R Rᵀ.
+    """The normal density with covariance R Rᵀ.
 
     Args:
         mean: (*batch, number).
@@ -66,14 +66,16 @@ class JointNormal(MultivariateNormal):
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         with torch.autocast(
             self.loc.device.type, enabled=False
-        ):  # which would round the product with the root
+        ):  # autocast would round the product with the root
             return super().rsample(torch.Size(sample_shape))
 
 
 @marginal.register
 def _(density: JointNormal, index: int) -> JointNormal:
     row = density.root[..., index, :]
-    deviation = torch.linalg.vector_norm(row, dim=-1)  # of R Rᵀ's diagonal, without squares that overflow
+    deviation = torch.linalg.vector_norm(
+        row, dim=-1
+    )  # root of R Rᵀ's diagonal, without squares that overflow
     return JointNormal(density.loc[..., index : index + 1], deviation[..., None, None])
 
 

@@ -1,4 +1,4 @@
-"""The entropy of a density of one number, by quadrature whose panels follow its peaks however narrow they are."""
+"""The entropy of a density of one number, by quadrature on panels that follow its peaks, however narrow they are."""
 
 import logging
 import math
@@ -15,21 +15,27 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import about, peaks, scales
 
 AT_ONCE = 2**17
-"""Components evaluated together, and pairs of peaks compared."""
+"""Number of components that are evaluated together, and of pairs of peaks that are compared together."""
 WIDTH = 2.0
-"""Of a first panel in v: the innermost ends 3.6 scales from its peak, each further one e² times as far out."""
+"""Width of a first panel in v.
+
+The innermost panel ends 3.6 scales from its peak, and each further panel ends e² times as far out.
+"""
 REACH = 1e4
-"""How many of the largest scale beyond the last peak a line ends."""
+"""Distance from the last peak to the end of a density's range on the real line, in multiples of its largest scale."""
 ROUNDS, MOST = 40, 4096
-"""Times that a panel is halved, and panels of one item that are: where more are wanted, the mass tells."""
+"""Largest number of times that a panel is halved, and of panels of one item that are halved at once.
+
+Where more are needed, the mass differs from 1 and shows it.
+"""
 TOLERANCE = {torch.float64: 1e-9, torch.float32: 1e-6}
-"""By which the two rules may differ on a panel, by the density's number type; that of the finer is far smaller."""
+"""Largest difference of the two rules on a panel, by the density's number type; the finer rule errs far less."""
 MASS_GAP = 100
-"""How far the mass on all panels may be from 1, in that tolerance."""
+"""Largest difference between 1 and the mass on all panels, in multiples of that tolerance."""
 LARGEST = 4096
-"""Peaks of one density, whose pairs are compared, and each of which is evaluated at the nodes of all."""
+"""Largest number of peaks of one density; all pairs are compared, and each peak is evaluated at the nodes of all."""
 DRAWS = 1024
-"""Of each density that quadrature does not resolve."""
+"""Number of draws of each density that quadrature does not resolve."""
 _log = logging.getLogger(__name__)
 
 _HALF = (
@@ -40,7 +46,7 @@ _WEIGHTS = (
     *(0.20948214108472782, 0.20443294007529889, 0.19035057806478542, 0.1690047266392679),
     *(0.14065325971552592, 0.10479001032225019, 0.06309209262997856, 0.022935322010529224),
 )
-# Kronrod's rule of 15 nodes and, at every second, Gauss's of 7 (Piessens et al. 1983, QK15)
+# Kronrod's rule of 15 nodes and, at every second node, Gauss's rule of 7 (Piessens et al. 1983, QK15)
 NODES = torch.tensor([*(-node for node in _HALF[:0:-1]), *_HALF], dtype=torch.float64)
 FINE = torch.tensor([*_WEIGHTS[:0:-1], *_WEIGHTS], dtype=torch.float64)
 COARSE = torch.zeros(15, dtype=torch.float64)
@@ -48,7 +54,7 @@ COARSE[1::2] = torch.from_numpy(np.polynomial.legendre.leggauss(7)[1])
 
 
 class Panels(NamedTuple):
-    """Parts of items' ranges, x = place + scale · sinh(v) with v from low to high; columns (panel,)."""
+    """Panels of items' ranges, x = place + scale · sinh(v) with v from low to high; each column is (panel,)."""
 
     item: Tensor
     place: Tensor
@@ -57,30 +63,32 @@ class Panels(NamedTuple):
     high: Tensor
 
     def of(self, chosen: Tensor) -> "Panels":
+        """Return the chosen panels."""
         return Panels(*(column[chosen] for column in self))
 
     def halves(self) -> "Panels":
+        """Return the lower halves of all panels, then the upper halves."""
         middle = (self.low + self.high) / 2
         both = zip(self._replace(high=middle), self._replace(low=middle), strict=True)
         return Panels(*map(torch.cat, both))
 
 
 def has_range(density: Distribution) -> bool:
-    """Whether the density is of one number on a circle, a part of it, or the whole line."""
+    """Return whether the density is of one number on a circle, a part of a circle, or the whole real line."""
     support = density.support
     real = isinstance(support, constraints.independent) and support.base_constraint is constraints.real
     return tuple(density.event_shape) == (1,) and (real or isinstance(support, Circular))
 
 
 def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
-    """Entropy of a density of one number, nats: to 1e-9 in float64, and to its rounding in float32.
+    """Return the entropy of a density of one number, nats: to 1e-9 in float64, and to its rounding in float32.
 
-    Panels begin at the density's `peaks`, the first as wide as their `scales`, and are halved until two rules agree;
-    their nodes are given relative to the peak, so that no rounding of the number itself limits how narrow one may be.
-    What is seen is checked by its mass: where that is not 1 to 1e-7 (float32: 1e-4), some peak is none of `peaks`, or a
-    tail is too long, and the mean of -log_prob over DRAWS draws is given instead, which the log says; so it is of a
-    density of more than LARGEST peaks. NaN stays NaN.
-    Differentiable like the density.
+    Panels begin at the density's `peaks`, the first as wide as their `scales`, and are halved until two rules agree.
+    Their nodes are given relative to the peak, so that the rounding of the number itself does not limit how narrow a
+    peak may be. The mass checks the result: where it differs from 1 by more than 1e-7 (float32: 1e-4), some peak is
+    missing from `peaks`, or a tail is too long. Then the mean of -log_prob over DRAWS draws is returned instead, and
+    the log says so. A density with more than LARGEST peaks gets this mean too. NaN stays NaN. The result is
+    differentiable like the density.
     """
     items = density.batch_shape.numel()
     if items == 0:
@@ -105,7 +113,7 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
     mass, entropy = torch.zeros(2, items, dtype=sums.dtype, device=sums.device).index_add(
         1, accepted.item, sums
     )
-    # log of what is normalised on these nodes
+    # entropy of the density normalised on these nodes
     found = entropy / mass + mass.log()
     missed = ((mass - 1).abs() > MASS_GAP * tolerance).detach()
     if bool(missed.any()):
@@ -118,11 +126,11 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
 
 
 def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
-    """The mean of -log_prob over DRAWS draws, nats, and its gradient.
+    """Return the mean of -log_prob over DRAWS draws, nats, with its gradient.
 
-    That of the mean alone has expectation 0, since the draws move with the density too: the gradient of -E log p is
-    -E (log p - b) ∇ log p, whatever b (the score function's, Mohamed et al. 2020, §4). Here b is the mean, whose own
-    estimation takes one draw from DRAWS.
+    The gradient of this mean alone has expectation 0, since the draws also move with the density. The gradient of -E
+    log p is -E (log p - b) ∇ log p, for any b (the score function's, Mohamed et al. 2020, §4). Here b is the mean; its
+    estimation takes one degree of freedom from DRAWS.
     """
     log_prob = density.log_prob(density.sample(torch.Size((DRAWS,))))
     mean = log_prob.mean(0)
@@ -133,11 +141,12 @@ def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
 
 
 def split(panels: Panels, step: int) -> list[Panels]:
+    """Return the panels in groups of at most `step`."""
     return [Panels(*part) for part in zip(*(column.split(step) for column in panels), strict=True)]
 
 
 def sums_on(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
-    """∫ p and -∫ p log p on each panel, (2, panel), and by how much the coarse rule differs in either."""
+    """Return ∫ p and -∫ p log p on each panel, (2, panel), and the coarse rule's largest difference there, (panel,)."""
     like = panels.place
     half = (panels.high - panels.low) / 2
     v = (panels.high + panels.low) / 2 + half * NODES.to(like).unsqueeze(-1)
@@ -153,13 +162,13 @@ def sums_on(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
 def resolved_panels(
     density: Distribution, panels: Panels, step: int, tolerance: float
 ) -> tuple[Panels, Tensor]:
-    """Panels halved until both rules agree, and the sums on them."""
+    """Return panels halved until both rules agree, and the sums on them."""
     items = density.batch_shape.numel()
     done: list[tuple[Panels, Tensor]] = []
     for number in range(ROUNDS + 1):
         parts = [sums_on(density, part) for part in split(panels, step)]
         sums, error = (torch.cat(each, -1) for each in zip(*parts, strict=True))
-        more = error > tolerance  # NaN is not: no halving makes it a number
+        more = error > tolerance  # false for NaN, which halving would not remove
         crowded = torch.bincount(panels.item[more], minlength=items) > MOST
         more &= ~crowded[panels.item] & (number < ROUNDS)
         done.append((panels.of(~more), sums[:, ~more]))
@@ -171,9 +180,10 @@ def resolved_panels(
 
 
 def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Panels:
-    """On both sides of every peak to the middle between two.
+    """Return panels on both sides of every peak, up to the middle between two peaks.
 
     Args:
+        density: the density of one number.
         place: the density's `peaks`.
     """
     scale = known_scales(density)  # (peak, item)
@@ -218,13 +228,13 @@ def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Pa
 
 
 def known_scales(density: Distribution) -> Float[Tensor, "peak item"]:
-    """The density's `scales`, float64; 1 where one is no number above 0."""
+    """Return the density's `scales`, float64; 1 where a scale is not a finite number above 0."""
     scale = scales(density).double()
     return torch.where((scale > 0) & scale.isfinite(), scale, 1.0)
 
 
 def _scale_there(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Tensor:
-    """At each of some peaks the least scale of all whose peak it is on, (some, item)."""
+    """Return at each of some peaks the least scale among all peaks that cover this place, (some, item)."""
     apart = some.unsqueeze(1) - place  # (some, other, item)
     apart = (wrap(apart) if closed else apart).abs()
     return scale.expand_as(apart).where(apart <= 10 * scale, math.inf).amin(1)
@@ -233,7 +243,10 @@ def _scale_there(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Te
 def first_in_cell(
     place: Float[Tensor, "peak item"], scale: Float[Tensor, "peak item"], width: float
 ) -> Bool[Tensor, "peak item"]:
-    """Which ascending peaks are the first in their cell, which is `width` times their scale wide, or down to half."""
+    """Return which of the ascending peaks are the first in their cell.
+
+    A cell is at most `width` times as wide as the peak's scale, and at least half of that.
+    """
     cell = width * scale.log2().floor().exp2()
     key = (place / cell).floor()
     new = torch.ones_like(place, dtype=torch.bool)
@@ -242,7 +255,7 @@ def first_in_cell(
 
 
 def _representatives(place: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Ascending peaks, of which those within four scales of another are read as that one."""
+    """Return the ascending peaks, with peaks within four scales of another peak replaced by that peak."""
     new = first_in_cell(place, scale, 4.0)
     number = torch.arange(len(place), device=place.device).unsqueeze(-1)
     chosen = torch.where(new, number, 0).cummax(0).values

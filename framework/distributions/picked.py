@@ -1,4 +1,4 @@
-"""Draws from mixtures that are components themselves: of each only what is drawn is computed."""
+"""Draws from mixtures whose components are mixtures; only the components that are drawn are computed."""
 
 from typing import ClassVar
 
@@ -11,13 +11,13 @@ from framework.distributions.protocol import pick, take
 
 
 class PickedMixture(Distribution):
-    """Samples of one mixture each of a batch (*batch, K) of them; only `sample` is asked.
+    """Samples of one chosen mixture per item, out of a batch (*batch, K) of mixtures; only `sample` is defined.
 
     Args:
         log_weights: (*batch, K, J), nats, normalised.
-        components: of the mixtures, batch_shape (*batch, K, J).
-        index: (*sample, *batch), which of K.
-        rows: samples that are drawn at once.
+        components: components of the mixtures, with batch_shape (*batch, K, J).
+        index: (*sample, *batch), the chosen mixture among K.
+        rows: number of samples that are drawn at once.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -39,12 +39,12 @@ class PickedMixture(Distribution):
         return drawn.reshape(*lead, *batch, *self.event_shape)
 
     def _drawn(self, index: Tensor) -> Tensor:
-        """Of mixtures at `index` (sample, *batch)."""
+        """Return one sample of each mixture at `index` (sample, *batch)."""
         *_, mixtures, count = self.log_weights.shape
         which = torch.zeros_like(index)
         if count > 1 and index.numel() > 0:  # torch.multinomial refuses to draw nothing
             weights = take(self.log_weights, index).exp()
             which = torch.multinomial(weights.reshape(-1, count), 1).reshape(index.shape)
-        # of every mixture the component that was drawn for the one that is meant; then that one
+        # pick the drawn component number in every mixture, then pick the chosen mixture
         wide = which.unsqueeze(-1).expand(*index.shape, mixtures)
         return pick(pick(self.components, wide), index).sample()

@@ -1,21 +1,21 @@
-"""Everything that a density may be asked: each question, the shapes and units of its answer, and what an answer claims.
+"""The questions that every density can be asked, with the shapes and units of the answers and what these claim.
 
 A density is a `torch.distributions.Distribution`. torch's own questions are `log_prob` (nats), `sample`, `entropy`
-(nats), `mode`, `support` and, of classes, `enumerate_support`. The further ones stand here. Each is a function that
-dispatches on the type of density, so that whoever writes a density registers what it knows:
+(nats), `mode`, `support` and, for classes, `enumerate_support`. The further questions are defined here. Each is a
+function that dispatches on the type of density, so that the author of a density registers what it knows:
 
     @marginal.register
     def _(density: Mine, index: int) -> Mine: ...
 
-**No default claims to be exact.** One that cannot know answers with draws, with an error of NaN, with None ("not known
-in closed form; draws have to say") or with a `UserError` that says what to register. A subclass inherits the claims of
-its base. The structures forward every question to what they are made of: `density.Mixture`, `batch_shapes.Stacked`,
-`batch_shapes.Reshaped`, `tempering.CircularPower`. What torch's densities know is in `closed_forms`.
+**No default claims to be exact.** A default that cannot know the answer returns draws, an error of NaN, None ("not
+known in closed form; use draws") or raises a `UserError` that says what to register. A subclass inherits the claims of
+its base. The structures forward every question to their parts: `density.Mixture`, `batch_shapes.Stacked`,
+`batch_shapes.Reshaped`, `tempering.CircularPower`. The answers of torch's densities are in `closed_forms`.
 
-Three further questions are computed from the answers above, with nothing to register: `class_probabilities`,
-`circular_moments` (says where its grid resolved the density) and `density.circular_grid`.
+Three further quantities are computed from these answers, with nothing to register: `class_probabilities`,
+`circular_moments` (which says where its grid resolved the density) and `density.circular_grid`.
 
-In shapes `*batch` is the batch_shape, `*event` the event_shape, and `*sample` any dimensions before them.
+In shapes, `*batch` is the batch_shape, `*event` the event_shape, and `*sample` any dimensions before them.
 """
 
 import math
@@ -34,12 +34,12 @@ from framework.errors import UserError
 
 @singledispatch
 def marginal(density: Distribution, index: int) -> Distribution:
-    """The density of number `index` of the target alone; keeps an event dimension of one, (1,).
+    """Return the density of number `index` of the target alone, with an event dimension of one, (1,).
 
-    Default: a density of one number is its own marginal. Densities over several numbers register theirs.
+    Default: a density of one number is its own marginal. Densities over several numbers register their own.
 
     Raises:
-        UserError: the density has not said how.
+        UserError: the density has not registered a marginal.
     """
     if density.event_shape == (1,) and index == 0:
         return density
@@ -52,11 +52,11 @@ def marginal(density: Distribution, index: int) -> Distribution:
 
 @singledispatch
 def median(density: Distribution, samples: int) -> Tensor:
-    """The point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
+    """Return the point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
 
-    Default: of classes the mode, since a label is right or wrong and nothing lies between; otherwise the median of
-    `samples` draws (eq. 3.24), of angles on the circle. Who knows it in closed form registers it and draws nothing. Of
-    several components over an image the mean stands for it.
+    Default: for classes the mode, since a label is right or wrong and nothing lies between; otherwise the median of
+    `samples` draws (eq. 3.24), for angles on the circle. A density that knows the median in closed form registers it
+    and draws nothing. A mixture of several components over an image returns the mean instead.
     """
     if density.has_enumerate_support:
         return density.mode
@@ -68,23 +68,24 @@ def median(density: Distribution, samples: int) -> Tensor:
 
 @singledispatch
 def pick(density: Distribution, index: Tensor) -> Distribution:
-    """Of a density with batch_shape (*batch, K) the one at `index` (*sample, *batch) of the last batch dimension.
+    """Return the density at `index` of the last batch dimension of a density with batch_shape (*batch, K).
 
-    Only `sample` is asked of the answer. Default: everything is drawn and all but one of K draws thrown away, which is
-    right but slow; a density with parameters registers one that gathers them (`take`).
+    `index` has the shape (*sample, *batch). Only `sample` of the returned density is used. Default: all K densities are
+    sampled and all but one draw is thrown away, which is right but slow; a density with parameters registers a function
+    that gathers them (`take`).
     """
     return _Picked(density, index)
 
 
 def take(parameter: Tensor, index: Tensor) -> Tensor:
-    """`parameter` (*batch, K, number) at `index` (*sample, *batch) of K: (*sample, *batch, number)."""
+    """Return `parameter` (*batch, K, number) at `index` (*sample, *batch) of K: (*sample, *batch, number)."""
     lead = index.shape[: index.dim() - parameter.dim() + 2]
     wide = parameter.expand((*lead, *parameter.shape))
     return wide.gather(-2, index[..., None, None].expand(*index.shape, 1, parameter.shape[-1])).squeeze(-2)
 
 
 class _Picked(Distribution):
-    """Samples of one component each, by drawing all."""
+    """Samples of one component each, by drawing from all components."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
@@ -104,20 +105,22 @@ class _Picked(Distribution):
 
 @singledispatch
 def about(density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
-    """X - place, where X has the density at `index` of the batch: float64, however near the place values are asked.
+    """Return the density of X - place, in float64, so that values near the place keep their digits.
 
-    Only `log_prob` is asked of the answer. Default: values are rounded where the place is added. A density that knows
-    where it lies registers one that takes the place from its location: then no rounding limits how narrow it may be.
+    X has the density at `index` of the batch. Only `log_prob` of the returned density is used. Default: values are
+    rounded where the place is added. A density with a location registers a function that subtracts the place from the
+    location: then no rounding limits how narrow the density may be.
 
     Args:
-        index: int64, one for each batch dimension; together of shape (*items) where they broadcast.
-        place: (*items, 1), of densities of one number.
+        density: density of one number, event_shape (1,).
+        index: int64, one for each batch dimension; broadcast together they have the shape (*items).
+        place: (*items, 1).
     """
     return _About(density, index, place)
 
 
 class _About(Distribution):
-    """Items of a batch, any of them any number of times, by asking for the whole batch as often as the commonest."""
+    """Items of a batch, each any number of times; the whole batch is evaluated as often as the most frequent item."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
@@ -151,27 +154,27 @@ class _About(Distribution):
 
 @singledispatch
 def tempered(density: Distribution, temperature: Tensor) -> Distribution:
-    """The density proportional to p^(1/T), T > 0 a scalar; same shapes and number type, differentiable in T.
+    """Return the density proportional to p^(1/T), T > 0 a scalar; same shapes and number type, differentiable in T.
 
-    Ask `tempering.temper`, which refuses a T that makes no sense. Default (registered in `tempering`): classes are
+    Call `tempering.temper` instead, which refuses an invalid T. Default (registered in `tempering`): classes are
     enumerated, and the density of one angle over the whole turn is normalised on a grid that is refined until it
     resolves the power.
 
     Raises:
-        UserError: any other density that has not said how, or a power too narrow for the finest grid.
+        UserError: any other density that has not registered its power, or a power too narrow for the finest grid.
     """
     raise TypeError(f"{type(density).__name__} is no torch.distributions.Distribution.")
 
 
 class Estimate(NamedTuple):
-    """A log-density and how far chance, not the model, has moved it; all shaped alike, nats where not said otherwise.
+    """A log-density and its Monte Carlo error; all fields have the same shape, in nats where not said otherwise.
 
     Attributes:
-        log_mean: what log_prob says; in expectation below the truth by about standard_error²/2 (Jensen).
+        log_mean: the value of log_prob; its expectation is below the truth by about standard_error²/2 (Jensen).
         debiased: log_mean + standard_error²/2.
-        standard_error: of log_mean, from random draws inside the density; 0 where nothing is drawn, NaN where nobody
-            knows, infinite where all that was drawn had no weight.
-        samples: draws taken, int64; 0 where nothing is drawn or nobody knows.
+        standard_error: standard error of log_mean, from random draws inside the density; 0 where nothing is drawn, NaN
+            where it is not known, infinite where no draw had any weight.
+        samples: number of draws, int64; 0 where nothing is drawn or the number is not known.
         unresolved: bool, true where a tolerance was asked for and not reached.
     """
 
@@ -182,22 +185,22 @@ class Estimate(NamedTuple):
     unresolved: Tensor
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Estimate":
-        """`change` of every one of the five."""
+        """Return an estimate with `change` applied to each of the five fields."""
         return Estimate(*map(change, self))
 
 
 def with_error(log_mean: Tensor, standard_error: Tensor, samples: Tensor, unresolved: Tensor) -> Estimate:
-    """An estimate whose `debiased` follows from its error; -∞ with an infinite error stays -∞."""
+    """Return an estimate whose `debiased` follows from its error; -∞ with an infinite error stays -∞."""
     correction = torch.where(standard_error == math.inf, 0.0, standard_error.square() / 2)
     return Estimate(log_mean, log_mean + correction, standard_error, samples, unresolved)
 
 
 @singledispatch
 def estimate(density: Distribution, value: Tensor) -> Estimate:
-    """The log-density at `value` (*sample, *batch, *event) with its Monte Carlo error, (*sample, *batch).
+    """Return the log-density at `value` (*sample, *batch, *event) with its Monte Carlo error, (*sample, *batch).
 
-    Default: log_prob with an error of NaN, "not known", since nobody has said whether log_prob draws. A density whose
-    log_prob is computed without drawing registers `exactly`; one that draws registers its own.
+    Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob draws. A density whose
+    log_prob is computed without drawing registers `exactly`; one that draws registers its own function.
     """
     found = exactly(density, value)
     unknown = torch.full_like(found.log_mean, math.nan)
@@ -205,7 +208,7 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
 
 
 def exactly(density: Distribution, value: Tensor) -> Estimate:
-    """The estimate of a density whose log_prob draws nothing: `estimate.register(Mine, exactly)`."""
+    """Return the estimate of a density whose log_prob draws nothing: `estimate.register(Mine, exactly)`."""
     log_prob = density.log_prob(value)
     samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
     return Estimate(log_prob, log_prob, torch.zeros_like(log_prob), samples, samples > 0)
@@ -213,9 +216,9 @@ def exactly(density: Distribution, value: Tensor) -> Estimate:
 
 @singledispatch
 def cdf(density: Distribution, value: Tensor) -> Tensor | None:
-    """P(X ≤ y) of a density of one real, `value` (*sample, *batch, 1), float64 (*sample, *batch); None: not known.
+    """Return P(X ≤ y) of a density of one real, float64 (*sample, *batch), at `value` (*sample, *batch, 1).
 
-    Default: exact where `normals` knows the density as a mixture of normals, otherwise None.
+    Default: exact where `normals` knows the density as a mixture of normals, otherwise None, "not known".
     """
     found = normals(density)
     if found is None:
@@ -230,11 +233,10 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def each_cdf(density: Distribution, value: Tensor) -> Tensor | None:
-    """P(X_i ≤ y_i) of each number i by itself, whatever the others; `value` (*sample, *batch, *event), float64, shaped
-    like it; None: not known.
+    """Return P(X_i ≤ y_i) of each number i on its own; float64, in the shape of `value` (*sample, *batch, *event).
 
-    Default: of a few reals `cdf` of each `marginal`, of an image None. One over images registers its own, since nobody
-    can ask for a hundred thousand marginals.
+    Default: for a vector of reals `cdf` of each `marginal`, or None where a `cdf` is not known; for an image None. A
+    density over images registers its own function, since a hundred thousand marginals would be too many.
     """
     if len(density.event_shape) != 1:
         return None
@@ -246,16 +248,17 @@ def each_cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def arc(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
-    """Mass of the arc from `start` counter-clockwise to `end` of a density of one angle, float64; None: not known.
+    """Return the mass of the arc from `start` counter-clockwise to `end` of a density of one angle; None: not known.
 
-    Shapes as of `cdf`, radians. The arc is less than a whole turn; of equal ends it is empty. Default: None;
-    `circular_moments` then gives the mass where the density is not too narrow.
+    Angles are (*sample, *batch, 1), radians; the mass is float64 (*sample, *batch). The arc is less than a whole turn;
+    between equal ends it is empty. Default: None; `circular_moments` then gives the mass where the density is not too
+    narrow.
     """
     return None
 
 
 def turn(start: Tensor, end: Tensor) -> Tensor:
-    """How far it is from `start` counter-clockwise to `end`, radians in [0, 2π], float64."""
+    """Return the angle from `start` counter-clockwise to `end`, radians in [0, 2π], float64."""
     return torch.remainder(end.double() - start.double(), 2 * math.pi)
 
 
@@ -268,20 +271,23 @@ class Normals(NamedTuple):
 
 
 def one_normal(mean: Tensor, scale: Tensor) -> Normals:
-    """The answer to `normals` of one that is normal itself; both of shape (*batch, 1)."""
+    """Return the answer to `normals` for a single normal density; mean and scale have the shape (*batch, 1)."""
     mean = mean.double()
     return Normals(torch.zeros_like(mean), mean, scale.double())
 
 
 @singledispatch
 def normals(density: Distribution) -> Normals | None:
-    """The normals that a density of one real, event_shape (1,), is a mixture of. Default: None, none are known."""
+    """Return the normals of which a density of one real, event_shape (1,), is a mixture.
+
+    Default: None, not known.
+    """
     return None
 
 
 @singledispatch
 def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
-    """(y - μ)ᵀ Σ⁻¹ (y - μ) of a normal density over any number of reals, float64 (*sample, *batch).
+    """Return (y - μ)ᵀ Σ⁻¹ (y - μ) of a normal density over any number of reals, float64 (*sample, *batch).
 
     Default: None, the density is not known to be normal.
     """
@@ -290,25 +296,28 @@ def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def peaks(density: Distribution) -> Tensor:
-    """Where the density may be highest, (peak, *batch, *event): candidates, not a promise.
+    """Return places where the density may be highest, (peak, *batch, *event), as candidates without any guarantee.
 
-    Default: its mode alone. A density with several humps registers a candidate for each.
+    Default: the mode alone. A density with several peaks registers a candidate for each.
     """
     return density.mode.unsqueeze(0)
 
 
 @singledispatch
 def scales(density: Distribution) -> Tensor:
-    """How wide each of the `peaks` of a density of one number is, (peak, *batch), in the number's unit.
+    """Return the width of each of the `peaks` of a density of one number, (peak, *batch), in the number's unit.
 
-    Default: the standard deviation of the normal density that is as high.
+    Default: the standard deviation of the normal density with the same height.
     """
     places = peaks(density)
     return (-density.log_prob(places).double()).exp() / math.sqrt(2 * math.pi)
 
 
 class Slope(NamedTuple):
-    """log_prob (*sample, *batch), its gradient `pull` and a `stiffness`, both (*sample, *batch, *event)."""
+    """A lower bound of log p that touches it (see `slope`): log_prob (*sample, *batch), gradient `pull`, and `stiffness`.
+
+    `pull` and `stiffness` are (*sample, *batch, *event).
+    """
 
     log_prob: Tensor
     pull: Tensor
@@ -317,26 +326,27 @@ class Slope(NamedTuple):
 
 @singledispatch
 def slope(density: Distribution, value: Tensor) -> Slope | None:
-    """A bound from below that touches log p at `value` y (*sample, *batch, *event); None: not known, the default.
+    """Return a lower bound of log p that touches it at `value` y (*sample, *batch, *event); by default None, not known.
 
-    With pull g and stiffness h, of reals log p(y + d) ≥ log p(y) + Σ (g d - h d²/2), h > 0, and of angles
-    log p(y + d) ≥ log p(y) + Σ (g sin d - h (1 - cos d)), whatever d. A mixture has both as means over its components,
-    weighted by what each has of p(y) (Jensen), so a step to the bound's top never leads down (Dempster, Laird & Rubin
-    1977).
+    With pull g and stiffness h, the bound for reals is log p(y + d) ≥ log p(y) + Σ (g d - h d²/2), h > 0, and for
+    angles log p(y + d) ≥ log p(y) + Σ (g sin d - h (1 - cos d)), for all d. A mixture has as g and h the means over its
+    components, weighted by each component's share of p(y) (Jensen), so a step to the bound's maximum never lowers p
+    (Dempster, Laird & Rubin 1977).
     """
     return None
 
 
 @singledispatch
 def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor]:
-    """What the density's point prediction looks like: the channels asked for and no others, each (*batch, height,
-    width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels` says: "color" is linear light.
+    """Return images of the density's point prediction: exactly the channels asked for.
 
-    Of torch's own densities over images, event_shape (height, width, number), "color" is the mean, taken for light;
-    one over the numbers of files (a target of kind "image") registers its own. Default: it draws none.
+    Each is (*batch, height, width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels` says:
+    "color" is linear RGB. For torch's own densities over images, event_shape (height, width, number), "color" is the
+    mean, taken as linear RGB; a density over the numbers of files (a target of kind "image") registers its own
+    function. Default: the density has no images.
 
     Raises:
-        UserError: nobody has said what the density draws, or it does not draw one of the channels.
+        UserError: no images are registered for the density, or one of the channels is not among them.
     """
     raise UserError(
         f"{type(density).__name__} of event_shape {tuple(density.event_shape)} draws no {', '.join(sorted(channels))}. "
@@ -346,40 +356,41 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
 
 
 class ValueSet(ABC):
-    """The values, one set for each item of the batch, among which the target is said to lie.
+    """A set of values for each item of the batch, in which the target is said to lie.
 
     Attributes:
-        promised: the share of targets that the sets are said to hold at least; None where nothing is said.
+        promised: the least share of targets that the sets are said to contain; None where nothing is said.
     """
 
     promised: float | None = None
 
     @abstractmethod
     def contains(self, value: Tensor) -> Tensor:
-        """Whether each value (*sample, *batch, *event) is in its item's set, bool (*sample, *batch)."""
+        """Return whether each value (*sample, *batch, *event) is in its item's set, bool (*sample, *batch)."""
 
     @abstractmethod
     def size(self) -> Tensor:
-        """Number of labels, radians of one angle, length of one real, volume of several; float64 (*batch)."""
+        """Return the size of each set: labels, radians of one angle, length of one real, volume of several; float64 (*batch)."""
 
     @abstractmethod
     def empty(self) -> Tensor:
-        """Whether nothing is in the set, bool (*batch)."""
+        """Return whether the set is empty, bool (*batch)."""
 
     def parts(self) -> "list[list[int]] | list[list[tuple[float, float]]] | None":
-        """What the set of each item of the flattened batch is made of, ascending: labels of classes; (low, high) of
-        one real; of one angle radians, from low in [-π, π) counter-clockwise to high, at most a turn on.
+        """Return the parts of the set of each item of the flattened batch, ascending.
 
-        Default: None, the set cannot be listed. What is listed is what predictions print.
+        The parts are labels of classes, (low, high) of one real, or (low, high) of one angle in radians, from low in
+        [-π, π) counter-clockwise to high, at most one turn further. Default: None, the set cannot be listed.
+        Predictions print the listed parts.
         """
         return None
 
 
 @singledispatch
 def value_set(density: Distribution) -> ValueSet | None:
-    """The set that comes with the density.
+    """Return the set that comes with the density.
 
-    Default: None, it has none. Structures answer None too: what was promised of a density is not so of a mixture, a
-    power or a marginal of it. In another frame (`moved.Moved`) it is the same set.
+    Default: None, there is no set. Structures return None too: a guarantee for a density does not hold for a mixture, a
+    power or a marginal of it. An affine transform (`moved.Moved`) has the transformed set.
     """
     return None

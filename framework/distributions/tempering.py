@@ -1,4 +1,4 @@
-"""Densities raised to a power 1/T and normalised: broader than before for T > 1, narrower below."""
+"""Densities raised to a power 1/T and normalised: broader than before for T > 1, narrower for T < 1."""
 
 import logging
 import math
@@ -27,33 +27,37 @@ from framework.distributions.protocol import (
 from framework.errors import UserError
 
 POINTS, MOST_POINTS = 1024, 2**15
-"""Of the grid on which the power of any density of one angle is normalised: doubled until it resolves it."""
+"""First and largest number of points of the grid that normalises the power of any density of one angle.
+
+The number is doubled until the grid resolves the power.
+"""
 RESOLVED = 1e-4
-"""Two grids, one twice as fine, that agree on log ∫ p^(1/T) this far, nats, resolve the density."""
+"""Largest difference of log ∫ p^(1/T), nats, between two grids, one twice as fine, that resolve the density."""
 MASS_GAP = 0.01
-"""How far log ∫ p may be from 0 on a grid that seems to resolve p: beyond, a peak lies between its angles."""
+"""Largest |log ∫ p| on a grid that resolves p; beyond it, a peak lies between the grid's angles."""
 HELD = 0.3
 """Share of the mass at one angle from which on a grid is too coarse for p itself, though not for its power."""
 NARROWEST = 3.0
 """Width of the innermost half of a stretched grid, in standard deviations of the power at its mode."""
 QUANTILES = 2048
-"""Further angles at which the distribution function is known for draws."""
+"""Number of further angles at which the distribution function is computed for draws."""
 BROADER = 0.25
-"""Power of the density whose quantiles these are: tails and low peaks get angles too."""
+"""Power of the density whose quantiles give these angles; it is below 1, so that tails and low peaks get angles too."""
 _log = logging.getLogger(__name__)
 
 
 def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distribution:
-    """The density proportional to p^(1/T), of the same shapes and number type; differentiable in T.
+    """Return the density proportional to p^(1/T), of the same shapes and number type; differentiable in T.
 
-    T = 1 gives the density itself, unless a gradient in T is asked for. Of a mixture see `tempered`.
+    T = 1 gives the density itself, unless a gradient in T is wanted. For a mixture see `tempered`.
 
     Args:
+        density: p.
         temperature: T > 0, a scalar.
 
     Raises:
         ValueError: T is not above 0, or not finite.
-        UserError: nothing is known of such a density; says how to register it.
+        UserError: no power of such a density is known; the message says how to register it.
     """
     value = float(temperature.detach())
     if not 0 < value < math.inf:
@@ -80,29 +84,32 @@ def _(density: Distribution, temperature: Tensor) -> Distribution:
 
 @tempered.register
 def _(density: Mixture, temperature: Tensor) -> Distribution:
-    """Of classes the whole mixture. Otherwise its components are tempered and their weights kept: Σ w_k p_k raised to
-    a power has no normaliser in closed form, while this is normalised as its components are, is p at T = 1, and of one
-    component is the same. It keeps apart what the components say of different modes."""
+    """Return the tempered mixture; classes are tempered as a whole, other mixtures keep their weights.
+
+    For these, the components are tempered: Σ w_k p_k raised to a power has no normaliser in closed form. The mixture of
+    tempered components is normalised as its components are, equals p at T = 1, and is exact for one component. It keeps
+    the modes that different components describe apart.
+    """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
     return Mixture(density.log_weights, tempered(density.components, temperature))
 
 
 def tempered_classes(density: Distribution, temperature: Tensor) -> "RescaledClasses":
-    """p_k^(1/T) / Σ_j p_j^(1/T): logits divided by T (Guo et al. 2017, eq. 9), of any density over classes."""
+    """Return p_k^(1/T) / Σ_j p_j^(1/T): logits divided by T (Guo et al. 2017, eq. 9), for any density over classes."""
     log_prob = log_probabilities(density)
-    # the largest first, so that differences and not sizes are rounded; a class that is ruled out stays so
+    # subtract the largest first, so that differences and not sizes are rounded; a probability of 0 stays 0
     heights = log_prob - log_prob.amax(-1, keepdim=True)
     return RescaledClasses(divided(heights, temperature).log_softmax(-1), density, 1 / temperature)
 
 
 def log_probabilities(density: Distribution) -> Float[Tensor, "*batch label"]:
-    """Of every class, nats."""
+    """Return the log-probability of every class, nats."""
     return density.log_prob(density.enumerate_support()).movedim(0, -1)
 
 
 def divided(log_density: Tensor, temperature: Tensor) -> Tensor:
-    """log p / T; -∞ stays, without a gradient."""
+    """Return log p / T; -∞ stays -∞, without a gradient."""
     ruled_out = log_density == -math.inf
     return torch.where(ruled_out, -math.inf, log_density.masked_fill(ruled_out, 0.0) / temperature)
 
@@ -111,9 +118,9 @@ class RescaledClasses(CategoricalDensity):
     """Classes whose log-probabilities are `slope` times those of another density, plus constants, normalised.
 
     Args:
-        logits: of the classes, (*batch, label).
-        density: the other one, whose Monte Carlo error follows.
-        slope: a scalar, 1/T of a temperature.
+        logits: logits of the classes, (*batch, label).
+        density: the other density, which gives the Monte Carlo error.
+        slope: a scalar, 1/T for a temperature T.
     """
 
     def __init__(self, logits: Float[Tensor, "*batch label"], density: Distribution, slope: Tensor) -> None:
@@ -124,8 +131,11 @@ class RescaledClasses(CategoricalDensity):
 
 @estimate.register
 def _(density: RescaledClasses, value: Tensor) -> Estimate:
-    """At most this error: of log q_k = a log p_k - log Σ_j p_j^a + constants, errors e_j of log p_j make the error
-    a (e_k - Σ_j q_j e_j), and they may go together in any way: a ((1 - q_k) s_k + Σ_{j≠k} q_j s_j)."""
+    """Return the estimate with an upper bound of its error.
+
+    For log q_k = a log p_k - log Σ_j p_j^a + constants, errors e_j of log p_j cause the error a (e_k - Σ_j q_j e_j).
+    The errors may be correlated in any way, so the bound is a ((1 - q_k) s_k + Σ_{j≠k} q_j s_j).
+    """
     log_prob = density.log_prob(value)
     with torch.no_grad():
         found = estimate(density.density, density.density.enumerate_support())
@@ -144,15 +154,15 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
 
 
 class CircularPower(Distribution):
-    """p^(1/T) / Z for the density p of one angle, by the trapezium rule.
+    """The density p^(1/T) / Z for the density p of one angle, by the trapezium rule.
 
-    The grid starts at the mode, so that a peak is not missed, and is refined until it resolves the power and until p
+    The grid starts at the mode, so that no peak is missed there. It is refined until it resolves the power and until p
     has its mass on it. A power that is too narrow for MOST_POINTS equally spaced angles gets a grid that is denser
     about the mode: angles mode + 2 atan(s tan(u/2)) of equally spaced u, on which the rule is spectrally exact too.
 
-    Samples are drawn by the inverse of the distribution function. It is known at the angles of the grid and at
-    QUANTILES quantiles of p^(BROADER/T) (at a distance of 0.005 standard deviations where a peak is highest, 0.4 six
-    standard deviations from there), and the density is linear between these.
+    Samples are drawn by the inverse of the distribution function. This function is known at the angles of the grid and
+    at QUANTILES quantiles of p^(BROADER/T) (at a distance of 0.005 standard deviations where a peak is highest, 0.4 at
+    six standard deviations from there), and the density is linear between these angles.
 
     Args:
         density: p, event_shape (1,), over the whole turn.
@@ -174,7 +184,7 @@ class CircularPower(Distribution):
         self.stretch = torch.ones_like(self.start, dtype=torch.float64)
         self.points = POINTS
         off = self._fill()
-        while bool((off > RESOLVED).any()):  # a NaN is not resolved by any grid: log_prob shows it
+        while bool((off > RESOLVED).any()):  # false for NaN, which no grid resolves; log_prob is NaN then
             if self.points < MOST_POINTS:
                 self.points *= 2
             elif bool((self.stretch == 1).all()) and bool((self._narrow() < 1).any()):
@@ -189,7 +199,7 @@ class CircularPower(Distribution):
             off = self._fill()
 
     def _fill(self) -> Float[Tensor, "*batch"]:
-        """Evaluate the power on the grid; return how far log Z is uncertain, nats: infinite where a peak is missed."""
+        """Evaluate the power on the grid; return the uncertainty of log Z, nats: infinite where a peak is missed."""
         self.angles, log_width = self._grid(self.points)
         log_prob = self.density.log_prob(self.angles)  # (points, *batch)
         self.top = log_prob[0]
@@ -214,13 +224,15 @@ class CircularPower(Distribution):
         return torch.where(missed, math.inf, off)
 
     def _grid(self, points: int) -> tuple[Tensor, Tensor]:
-        """Angles, (points, *batch, 1), the first at the mode, and the log of the arc that each stands for,
-        (points, *batch)."""
+        """Return the grid's angles, (points, *batch, 1), and the log of the arc that each represents, (points, *batch).
+
+        The first angle is the mode.
+        """
         u = grid(points, dtype=torch.float64, device=self.start.device) + math.pi
         return self._place(u.reshape(points, *(1,) * self.start.dim()), 2 * math.pi / points)
 
     def _place(self, u: Float[Tensor, "number *batch 1"], step: float) -> tuple[Tensor, Tensor]:
-        """Angles at u, and log(dθ/du · step)."""
+        """Return the angles at u, and log(dθ/du · step)."""
         half_sine, half_cosine = (u / 2).sin(), (u / 2).cos()
         offset = 2 * torch.atan2(self.stretch * half_sine, half_cosine)
         arc = self.stretch / (half_cosine.square() + (self.stretch * half_sine).square())
@@ -228,8 +240,8 @@ class CircularPower(Distribution):
         return angle, (arc.log() + math.log(step)).squeeze(-1).expand(angle.shape[:-1])
 
     def _narrow(self) -> Float[Tensor, "*batch 1"]:
-        """How many times denser than equally spaced a grid is at each mode, at least 1; its inverse."""
-        # of the normal density that is as high; p^(1/T) is √T times as wide
+        """Return how much closer than equally spaced angles a grid must be at each mode, as a factor of at most 1."""
+        # width of the normal density with the same height; p^(1/T) is √T times as wide
         width = (-self.density.log_prob(self.start).detach().double()).exp() / math.sqrt(2 * math.pi)
         width = width * self.temperature.detach().double().sqrt()
         return (NARROWEST * width).nan_to_num(nan=1.0).clamp(1e-12, 1).unsqueeze(-1)
@@ -246,8 +258,8 @@ class CircularPower(Distribution):
         return self.power_of(self.density.log_prob(value))
 
     def power_of(self, log_prob: Tensor) -> Tensor:
-        """log_prob where that of p is `log_prob`."""
-        # below the mode's, so that large log-densities do not cancel
+        """Return log_prob of the power where log_prob of p is `log_prob`."""
+        # relative to the mode's log-density, so that large log-densities do not cancel
         return divided(log_prob - self.top, self.temperature) - self.log_normaliser
 
     @property
@@ -275,7 +287,7 @@ class CircularPower(Distribution):
     @cached_property
     @torch.no_grad()
     def _between(self) -> tuple[Float[Tensor, "item node"], Float[Tensor, "item node"]]:
-        """Ascending angles from the mode to a whole turn on, less the mode, and the height of the power there."""
+        """Ascending angles minus the mode, from 0 to a whole turn, and the height of the power there."""
         batch = self.batch_shape.numel()
         u = (
             2
@@ -296,7 +308,7 @@ class CircularPower(Distribution):
         quantile = u[1] * (cell - 1 + ((share - below) / mass.clamp(min=1e-300)).clamp(0, 1))
         whole = torch.cat([u.expand(batch, -1), quantile], -1).sort(-1).values
         angle, _ = self._place(whole.T.reshape(whole.shape[-1], *self.batch_shape, 1), 1.0)
-        # as the density reads them, not as they were meant
+        # the rounded angles that the density was evaluated at, not the exact ones
         offset = (angle.double() - self.start.double()).clamp(0, 2 * math.pi)
         offset[0], offset[-1] = 0.0, 2 * math.pi
         height = divided(self.density.log_prob(angle).double() - self.top.double(), self.temperature).exp()
@@ -304,13 +316,16 @@ class CircularPower(Distribution):
         return offset, height
 
     def entropy(self) -> Tensor:
-        """log Z less the mean of log p^(1/T), nats, by the trapezium rule."""
+        """Return log Z minus the mean of log p^(1/T), nats, by the trapezium rule."""
         # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
         return self.log_normaliser - (self.mass * self.powers.clamp(min=-1e4)).sum(0)
 
 
 def _cumulated(place: Tensor, height: Float[Tensor, "item node"]) -> Float[Tensor, "item node"]:
-    """The integral from the first place on, by the trapezium rule; the places ascend, of all items or of each."""
+    """Return the integral from the first place on, by the trapezium rule.
+
+    The places ascend; they are the same for all items, or given for each.
+    """
     cells = place.diff(dim=-1) * (height[:, 1:] + height[:, :-1]) / 2
     return torch.nn.functional.pad(cells.cumsum(-1), (1, 0))
 
@@ -326,7 +341,10 @@ def _(density: CircularPower, value: Tensor) -> Slope | None:
 
 @estimate.register
 def _(density: CircularPower, value: Tensor) -> Estimate:
-    """At most this error: those of p and of its normaliser may be of the same draws, and add up."""
+    """Return the estimate with an upper bound of its error.
+
+    The errors of p and of its normaliser may come from the same draws, so they are added.
+    """
     found = estimate(density.density, value)
     log_prob = density.power_of(found.log_mean)
     with torch.no_grad():
@@ -338,9 +356,9 @@ def _(density: CircularPower, value: Tensor) -> Estimate:
 
 @images.register
 def _(density: CircularPower, channels: Collection[str]) -> dict[str, Tensor]:
-    return images(density.density, channels)  # drawn at the mode, which a power keeps
+    return images(density.density, channels)  # they show the mode, which a power does not change
 
 
 @peaks.register
 def _(density: CircularPower) -> Tensor:
-    return peaks(density.density)  # a power rises and falls with the density
+    return peaks(density.density)  # a power rises and falls where the density does

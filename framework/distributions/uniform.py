@@ -1,4 +1,4 @@
-"""The uniform law over what a density declares as its support."""
+"""The uniform distribution over the support that a density declares."""
 
 import math
 from functools import singledispatch
@@ -17,13 +17,13 @@ from framework.errors import UserError
 
 @singledispatch
 def uniform(density: Distribution) -> Distribution:
-    """The law under which no part of the density's support is likelier than another of its size; same shapes.
+    """Return the distribution under which parts of the support of equal size are equally likely; same shapes.
 
-    Default: of classes, and of angles that are each a whole turn. A density on a chart of something else (rotations,
-    say) registers what is uniform there.
+    Default: a distribution for classes, and for angles that each cover the whole circle. A density on a chart of
+    another space (rotations, for example) registers what is uniform there.
 
     Raises:
-        UserError: nothing is uniform over the support, or the density has not said what.
+        UserError: no distribution is uniform over the support, or the density has not registered one.
     """
     if density.has_enumerate_support and density.event_shape == ():
         return Categorical(
@@ -41,10 +41,10 @@ def uniform(density: Distribution) -> Distribution:
 
 
 class UniformAngles(Distribution):
-    """Angles of which none is likelier than another.
+    """Angles that are all equally likely.
 
     Args:
-        like: any tensor of the samples' number type and device.
+        like: any tensor with the samples' number type and device.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
