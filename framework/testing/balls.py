@@ -1,4 +1,4 @@
-"""The simplest density that draws images: where a ball is."""
+"""Density for checks of metrics that read images: its images show a ball."""
 
 from collections.abc import Collection
 from typing import ClassVar
@@ -15,11 +15,12 @@ CHANNELS = frozenset({"color", "mask", "depth"})
 
 
 def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANNELS) -> dict[str, Tensor]:
-    """Pictures of a ball, its first number to the right, its last one downwards, an eighth of a side for each 1.
+    """Return images of a ball whose position shows the place: an eighth of a side for each unit.
 
     Args:
-        place: (batch, number).
-        size: height and width of the pictures, pixels.
+        place: Place, (batch, number); the first number moves the ball to the right, the last one downwards.
+        size: Height and width of the images, pixels.
+        channels: Channels to draw.
     """
     height, width = size
     row, column = ((torch.arange(side, device=place.device) + 0.5) / side for side in size)
@@ -41,14 +42,14 @@ def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANN
 
 
 class Ball(Mixture):
-    """A density, to the last bit, that draws a ball.
+    """Density that equals another to the last bit and draws a ball.
 
     Args:
-        density: any, with batch_shape (batch,).
-        place, size: of its pictures, as of `ball`.
+        density: Density of batch_shape (batch,).
+        place, size: Place and size of the ball's images, see `ball`.
 
     Attributes:
-        asked: channels of every drawing, in turn.
+        asked: Channels of each drawing, in order.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}

@@ -1,4 +1,4 @@
-"""Whether targets go with their inputs, where the one says something of the other: by nearest neighbours."""
+"""Check that targets belong to their inputs, by nearest neighbours, where inputs predict targets at all."""
 
 import torch
 from torch import Tensor
@@ -9,18 +9,24 @@ from framework.testing.data_samples import batches, numbers, parts, trimmed
 from framework.testing.finding import SEED, Worst
 
 LEAST, MOST = 192, 960
-"""Samples of a split: of fewer nothing is said, of more the first are looked at."""
+"""Smallest number of samples of a split that is checked, and largest number that is used."""
 BLOCK = 48
 NEIGHBOURS = 7
 SIZE = 64
-"""Numbers of an input, projected at random where there are more."""
+"""Largest number of values of an input; larger inputs are projected at random to this number."""
 SURE, CHANCE = 0.2, 0.8
-"""Shares of the error of targets dealt at random: below the one inputs tell targets, above the other they do not."""
+"""Bounds on the error relative to that of random targets.
+
+Inputs predict targets if the error is below the first bound, and do not if it is above the second.
+"""
 
 
 def belong(data: Data, worst: Worst) -> None:
-    """No stretch of a split has targets that its inputs say nothing of, where those of most stretches are told by the
-    nearest other samples'; and no split's inputs tell the target of the sample before or after, but not their own."""
+    """Check that no block of a split has inputs that do not predict its targets, where those of most blocks do.
+
+    A target is predicted by the median over the nearest other samples. Where inputs do not predict their own targets,
+    they must not predict those of the sample before or after either.
+    """
     for name, split in parts(data).items():
         asked = numbers(split)[:MOST]
         worst.count(False, f"{name} has {len(asked)} samples")
@@ -36,7 +42,7 @@ def belong(data: Data, worst: Worst) -> None:
             generator = torch.Generator().manual_seed(SEED)
             x = x @ torch.randn(x.shape[1], SIZE, dtype=x.dtype, generator=generator)
         x = (x - x.mean(0)) / x.std(0).clamp(min=1e-12)
-        chance = 2 * y.var(0, correction=0).sum().item()  # of two that are dealt at random
+        chance = 2 * y.var(0, correction=0).sum().item()  # expected squared distance of two targets at random
         if chance == 0:
             continue
         near = torch.cdist(x, x).fill_diagonal_(torch.inf).topk(NEIGHBOURS, largest=False).indices
@@ -60,12 +66,12 @@ def belong(data: Data, worst: Worst) -> None:
 
 
 def _error(targets: Tensor, near: Tensor) -> Tensor:
-    """Squared, of the median of the neighbours' targets."""
+    """Return the squared error of the median of the neighbours' targets."""
     return 2 * (targets - targets[near].median(1).values).square().sum(-1)
 
 
 def _numbers(inputs: Tensor) -> Tensor:
-    """Of one sample: of a cloud, whose points have no order, its moments."""
+    """Return the values of one input; those of a cloud are its moments, since its points have no order."""
     inputs = inputs.double()
     if inputs.dim() != 2:
         return inputs.reshape(-1)
@@ -75,12 +81,12 @@ def _numbers(inputs: Tensor) -> Tensor:
 
 
 def _targets(data: Data, targets: Tensor) -> Tensor:
-    """As numbers of which differences mean something."""
+    """Return targets as numbers whose differences are meaningful, (samples, number)."""
     if data.target.kind == "class":
         return torch.nn.functional.one_hot(targets.long(), len(data.target.names)).double()
     flat = targets.double().flatten(1)
     if data.target.kind == "angle":
         return torch.cat([flat.sin(), flat.cos()], 1)
-    # at most three deviations, so that a few far ones do not say it all
+    # at most three deviations, so that a few far targets do not dominate
     spread = flat.std(0).clamp(min=1e-12)
     return ((flat - flat.median(0).values) / spread).clamp(-3, 3)

@@ -1,4 +1,4 @@
-"""Extreme scenes for any renderer: the picture is right, and no slope from finite numbers is NaN or infinite."""
+"""Extreme scenes for any renderer: the image is right, and no gradient is NaN or infinite."""
 
 import math
 from dataclasses import replace
@@ -14,7 +14,7 @@ FOCAL = 40.0
 
 
 def extremes(renderer: Renderer, worst: Worst) -> None:
-    """Pixels that do not show what they must, and slopes that are not finite."""
+    """Check extreme scenes for pixels with a wrong depth and for gradients that are not finite."""
     if "depth" not in renderer.channels:
         worst.count(False, "draws no depth")
         return
@@ -28,6 +28,7 @@ def extremes(renderer: Renderer, worst: Worst) -> None:
 
 
 def slopes(renderer: Renderer, scene: Scene, name: str, worst: Worst) -> None:
+    """Check that the colours of a scene and their gradients in its parameters are finite."""
     seen = scene.camera
     parts = {
         "vertices": scene.vertices,
@@ -50,7 +51,10 @@ def slopes(renderer: Renderer, scene: Scene, name: str, worst: Worst) -> None:
 
 
 def scenes() -> dict[str, tuple[Scene, torch.Tensor, torch.Tensor]]:
-    """By name: the scene, seen from the origin along z, its depth in metres, and the pixels in which that is sure."""
+    """Return scenes by name, each with its depth in metres and a mask of the pixels in which that is certain.
+
+    The camera is at the origin and looks along z.
+    """
     height, width = SIZE
     row, column = torch.meshgrid(
         *[torch.arange(side).double() - (side - 1) / 2 for side in SIZE], indexing="ij"
@@ -58,7 +62,10 @@ def scenes() -> dict[str, tuple[Scene, torch.Tensor, torch.Tensor]]:
     everywhere, nothing = torch.ones(SIZE, dtype=torch.bool), torch.full(SIZE, math.inf).double()
 
     def seen(corners: list[list[float]], focal: float = FOCAL, away: float = 0.0) -> Scene:
-        """Three corners a face, from either side; the whole world `away` metres from its origin."""
+        """Return faces of three corners each, visible from both sides.
+
+        Camera and corners are shifted by `away` metres along each axis.
+        """
         camera = Camera(torch.eye(3).double(), torch.full((3,), -away).double(), (focal, focal),
                         ((width - 1) / 2, (height - 1) / 2), height, width, focal / 1e6)  # fmt: skip
         faces = torch.arange(len(corners)).reshape(-1, 3)
@@ -69,7 +76,7 @@ def scenes() -> dict[str, tuple[Scene, torch.Tensor, torch.Tensor]]:
             camera,
         )
 
-    triangle = [[-0.5, -0.4], [0.5, -0.4], [0.0, 0.5]]  # of depths, aside
+    triangle = [[-0.5, -0.4], [0.5, -0.4], [0.0, 0.5]]  # corners at depth 1, sideways
     inside = (row / FOCAL > -0.4) & (2 * (column / FOCAL).abs() < 1 - (row / FOCAL + 0.4) / 0.9)
     sure = ((row / FOCAL + 0.4).abs() * FOCAL > 0.1) & (
         (2 * (column / FOCAL).abs() - 1 + (row / FOCAL + 0.4) / 0.9).abs() * FOCAL > 0.4
@@ -81,7 +88,7 @@ def scenes() -> dict[str, tuple[Scene, torch.Tensor, torch.Tensor]]:
             seen([[-1e30, -1e30, 2.0], [1e30, -1e30, 2.0], [0.0, 1e30, 2.0]]), nothing.new_full(SIZE, 2.0), everywhere,
         ),
     }  # fmt: skip
-    for focal in (1e-3, 1.0, 1e3, 1e6):  # the same picture of what is as many times as far
+    for focal in (1e-3, 1.0, 1e3, 1e6):  # same image: the distance grows with the focal length
         far = focal / FOCAL
         shape = [[x, y, 4 * far] for x, y in ((4 * x, 4 * y) for x, y in triangle)]
         found[f"a lens of {focal:g} pixels"] = (seen(shape, focal), nothing.where(~inside, 4 * far), sure)

@@ -1,4 +1,4 @@
-"""An image as one vector of its numbers, so that what is asked of vectors is asked of images too."""
+"""Densities over images as densities over vectors, so that checks of vectors apply to images too."""
 
 from typing import ClassVar
 
@@ -10,12 +10,12 @@ from framework.distributions.protocol import cdf, each_cdf, median
 
 
 def flattened(density: Distribution) -> Distribution:
-    """The density itself unless it is over images."""
+    """Return the density, as one over vectors if it is over images."""
     return Flattened(density) if len(density.event_shape) == 3 else density
 
 
 class Flattened(Distribution):
-    """A density over images (height, width, number), of event_shape (height · width · number,)."""
+    """Density over images (height, width, number) as one over vectors, event_shape (height · width · number,)."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -29,6 +29,7 @@ class Flattened(Distribution):
         return constraints.real_vector
 
     def image(self, value: Tensor) -> Tensor:
+        """Return vectors as images."""
         return value.unflatten(-1, self.density.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -60,6 +61,6 @@ def _(density: Flattened, samples: int) -> Tensor:
 
 @cdf.register
 def _(density: Flattened, value: Tensor) -> Tensor | None:
-    """Of one number."""
+    """Return the distribution function of an image of one number."""
     found = each_cdf(density.density, density.image(value))
     return None if found is None else found[..., 0, 0, 0]

@@ -1,4 +1,4 @@
-"""Flights for the checks of whatever reads or predicts them: what is seen of thrown balls, and where they go."""
+"""Flights for checks of components that read or predict them: observed and future places of thrown balls."""
 
 import numpy as np
 import torch
@@ -11,17 +11,17 @@ from framework.flights.trajectories import flown
 from framework.target import Target
 
 STEP = 0.016
-"""Seconds from frame to frame."""
+"""Time between frames, seconds."""
 SIGMA = 0.003
 """Standard deviation of the noise of `windows_of`, metres."""
 START = np.array([0.8, -4.1, -0.62, -0.6, 6.2, 1.6, 20.0, -30.0, 10.0])
-"""Position, velocity and spin at the first frame of a ball that lands on the table."""
+"""Position, velocity and spin, at the first frame, of a ball that lands on the table."""
 TWO_FRAMES = Target("real", future_names(2, STEP))
 """Target of a ball's places at the next two frames."""
 
 
 def thrown(count: int) -> Float[Tensor, "flight number"]:
-    """Return what is read of six frames of balls that fall."""
+    """Return the observed numbers of six frames of falling balls."""
     since = STEP * torch.arange(-5.0, 1.0).expand(count, -1)
     height = torch.linspace(-0.2, 0.2, count).unsqueeze(-1) - 4.9 * since.square()
     frames = [since, 0.5 * since, 5 * since - 3, height, torch.ones_like(since)]
@@ -31,10 +31,11 @@ def thrown(count: int) -> Float[Tensor, "flight number"]:
 def windows_of(
     count: int, outliers: bool = False
 ) -> tuple[Float[Tensor, "flight 20 5"], Float[Tensor, "flight 35 3"], Float[Tensor, "flight 9"]]:
-    """Return frames read of flights that begin near `START`, the future without noise, and the states at the first.
+    """Return observed frames of flights that begin near `START`, their future without noise, and their first states.
 
     Args:
-        outliers: whether a tenth of the frames is 0.4 m off.
+        count: Number of flights.
+        outliers: Whether a tenth of the frames is 0.4 m off.
     """
     random = np.random.default_rng(0)
     states = torch.from_numpy(

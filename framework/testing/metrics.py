@@ -1,4 +1,4 @@
-"""The contract of a metric: one function a property, each reporting the worst case it saw."""
+"""Contract tests of a metric: one function for each property; each reports its worst case."""
 
 import copy
 import math
@@ -43,18 +43,18 @@ from framework.testing.rows import MetricRow
 Make = Callable[[], Metric]
 SAMPLES = 24
 MANY = 261
-"""Samples at once, more than a test split is commonly fetched by; of images MANY_IMAGES."""
+"""Number of samples in one update, more than a test split is commonly fetched in; MANY_IMAGES for images."""
 MANY_IMAGES = 72
 CASES = 48
-"""Test cases that standard errors are resampled from."""
+"""Number of test cases from which standard errors are resampled."""
 
 
 class Cardioid(Distribution):
-    """(1 + 2ρ cos(φ - μ)) / 2π for each angle (Mardia & Jupp 2000, §3.5.5): the simplest density on the circle.
+    """Density (1 + 2ρ cos(φ - μ)) / 2π of each angle (Mardia & Jupp 2000, §3.5.5), the simplest on the circle.
 
     Args:
         location: μ, (*batch, angle), radians.
-        strength: 2ρ in (0, 1], (*batch); 1 everywhere by default, the narrowest.
+        strength: 2ρ in (0, 1], (*batch); 1 everywhere by default, which is narrowest.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -73,7 +73,7 @@ class Cardioid(Distribution):
         return self.location
 
     def log_prob(self, value: Tensor) -> Tensor:
-        # 1 + cos d = 2 cos²(d/2); kept off its zero, where no metric could compare anything
+        # 1 + cos d = 2 cos²(d/2); kept above 0, where log_prob would be -∞ and no metric could be compared
         near = 2 * torch.cos((value - self.location) / 2).square()
         weight = self.strength.unsqueeze(-1)
         near = 1 - weight + weight * near
@@ -81,13 +81,14 @@ class Cardioid(Distribution):
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape + self.event_shape
-        # with t = tan(θ/2) the density of strength 1 is ∝ 1/(1+t²)²: √3 t is Student's with 3 degrees of freedom
+        # with t = tan(θ/2) the density of strength 1 is ∝ 1/(1+t²)²: √3 t has Student's distribution with 3 degrees
+        # of freedom
         like = {"dtype": self.location.dtype, "device": self.location.device}
         normal = torch.randn(4, *shape, **like)
         found = self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
         if (self.strength == 1).all():
             return found
-        # 1 + s cos d = s (1 + cos d) + (1 - s): that density, or else the uniform one
+        # 1 + s cos d = s (1 + cos d) + (1 - s): a mixture of the density of strength 1 and the uniform density
         anywhere = 2 * math.pi * torch.rand(shape, **like)
         chosen = torch.rand(shape, device=self.location.device)
         return torch.where(chosen < self.strength.unsqueeze(-1), found, anywhere)
@@ -118,15 +119,17 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
 
 
 def numbers_about(target: Target) -> int:
-    """How many numbers `density_about` reads."""
+    """Return the size of the last dimension of the place that `density_about` reads."""
     return len(target.names) if target.kind == "class" else math.prod(target.event_shape)
 
 
 def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) -> Distribution:
-    """The simplest density of the target's kind about a place (*batch, number); for classes their logits.
+    """Return the simplest density of the target's kind about a place (*batch, number); for classes the place is logits.
 
     Args:
-        breadth: 1 or more, (*batch): how many times as broad; classes as much less sure.
+        target: Target of the density.
+        place: Location of the density, or logits of classes, (*batch, number).
+        breadth: Factor on the width, 1 or more, (*batch); logits of classes are divided by it.
     """
     if target.kind == "angle":
         return Cardioid(place, None if breadth is None else 1 / breadth)
@@ -137,7 +140,7 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
     if target.kind == "real":
         # MultivariateNormal, since Independent refuses empty batches
         scale = torch.eye(place.shape[-1], dtype=place.dtype, device=place.device)
-        if breadth is not None and breadth.numel():  # torch asks for no batch of 0 matrices
+        if breadth is not None and breadth.numel():  # torch refuses a batch of 0 matrices
             scale = scale * breadth[..., None, None].to(place)
         return MultivariateNormal(place, scale_tril=scale, validate_args=False)
     return Categorical(
@@ -146,7 +149,7 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
-    """Every property of one metric on predictions of `row.target`."""
+    """Yield one finding for each property of a metric on predictions of `row.target`."""
     reads = bool(build().reads)
     whole = predictions(row, SAMPLES, images=reads)
     many, kind = Many(build, row, images=reads), row.target.kind
@@ -177,17 +180,17 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Predictions:
-    """Index and split → the prediction of those samples of one fixed set.
+    """Predictions for a fixed set of samples, as a function of sample indices and a split.
 
     Attributes:
-        row: whose target they are of.
-        target: of each sample.
-        place: what `density_about` reads, of each sample.
-        breadth: of the densities of the test split; None: the narrowest.
-        outliers: how many times as broad the densities of outliers are. They are those of other samples, so that no two
-            of one index are about the same place.
-        fields: further fields of the batch.
-        images: whether images are read; they show balls.
+        row: Row of the contract, which states the target and the image size.
+        target: Target of each sample.
+        place: Place of the density of each sample, as `density_about` reads it.
+        breadth: Factor on the widths of the densities of the test split; None for the narrowest.
+        outliers: Factor on the widths of the densities of outliers. An outlier has the place of the next sample, so
+            that no two predictions of one index have the same place.
+        fields: Further fields of the batch.
+        images: Whether the predictions have images; they show balls.
     """
 
     row: MetricRow
@@ -212,8 +215,11 @@ class Predictions:
 
 
 def predictions(row: MetricRow, count: int, *, images: bool, near: bool = False) -> Predictions:
-    """One fixed set of predictions, about anywhere, or `near` the targets: as far as each sample is hard, so that the
-    errors of its numbers go together."""
+    """Return predictions at random places or, if `near`, close to the targets.
+
+    Predictions near the targets have a random difficulty for each sample, so that the errors of its numbers are
+    correlated.
+    """
     target = values(row.target, (count,))
     fields = {name: make(count) for name, make in row.fields.items()}
     if images:
@@ -233,7 +239,7 @@ Slices = Callable[[Tensor, Split], Prediction]
 
 
 def _place(row: MetricRow, target: Tensor) -> Tensor:
-    """What `density_about` reads for a density about the target: of classes logits."""
+    """Return the place of a density about the target, as `density_about` reads it; logits for classes."""
     return (
         3.0 * torch.nn.functional.one_hot(target, len(row.target.names))
         if row.target.kind == "class"
@@ -242,7 +248,7 @@ def _place(row: MetricRow, target: Tensor) -> Tensor:
 
 
 def _feed(metric: Metric, some: Slices, part: Tensor) -> None:
-    """These samples of every split that the metric reads."""
+    """Update a metric with samples `part` of every split that it reads."""
     for split in metric.splits:
         metric.update(some(part, split))
 
@@ -256,7 +262,7 @@ def _after(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tens
 
 
 def _on_one_device(build: Make, some: "Predictions", worst: Worst) -> None:
-    """Two updates of every split, the numbers, and the same after a reset."""
+    """Check two updates of every split, the numbers, and both again after a reset, for mixed devices."""
 
     def questions(mode: OneDevice) -> Questions:
         metric = build()
@@ -297,7 +303,7 @@ def _nothing(build: Make, some: Slices, worst: Worst) -> None:
 
 def _quiet(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tensor]:
     with warnings.catch_warnings():
-        # torchmetrics warns of compute before update, which is what is tried here
+        # torchmetrics warns of compute before update, which is tested here
         warnings.filterwarnings("ignore", message=".*compute.*before the.*update.*", category=UserWarning)
         return _after(build, some, parts)
 
@@ -306,8 +312,8 @@ class Many:
     """More predictions than a metric may be used to, and the numbers of all of them at once.
 
     Attributes:
-        some: the predictions.
-        index: all of them.
+        some: Predictions.
+        index: Indices of all predictions.
     """
 
     def __init__(self, build: Make, row: MetricRow, *, images: bool) -> None:
@@ -318,6 +324,7 @@ class Many:
 
     @cached_property
     def at_once(self) -> dict[str, Tensor]:
+        """Return the numbers after one update with all predictions."""
         return _after(self.build, self.some, [self.index])
 
 
@@ -339,7 +346,7 @@ def _order(build: Make, some: Slices, many: Many, worst: Worst) -> None:
 
 
 def _merge(build: Make, some: Slices, worst: Worst) -> None:
-    """What two processes saw, merged as torchmetrics merges them."""
+    """Check that the states of two processes, merged by torchmetrics, give the numbers of all samples."""
     first, second = build(), build()
     _feed(first, some, torch.arange(10))
     _feed(second, some, torch.arange(10, SAMPLES))
@@ -359,10 +366,10 @@ def _reset(build: Make, some: Slices, worst: Worst) -> None:
 
 
 def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
-    """A density about the target is judged better, in every column that has a better way, than one about elsewhere.
+    """Check that a density about the target is judged better than a density about another place.
 
-    A metric that reads outliers sees them broader beside the former, and as narrow as the test samples beside the
-    latter.
+    All columns of `better` are compared. For a metric that reads outliers, densities of outliers are broader in the
+    first case, and as narrow as those of test samples in the second.
     """
     metric = build()
     some = predictions(row, SAMPLES, images=bool(metric.reads))
@@ -391,7 +398,7 @@ def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
 
 
 def _computed_twice(build: Make, some: Slices, worst: Worst) -> None:
-    """Numbers may be asked for in between, and again."""
+    """Check that `compute` after every batch, and twice in a row, does not change the numbers."""
     index = torch.arange(SAMPLES)
     wanted = _after(build, some, index.split(10))
     metric = build()
@@ -400,12 +407,12 @@ def _computed_twice(build: Make, some: Slices, worst: Worst) -> None:
         _feed(metric, some, part)
         metric.compute()
     same("computed after every batch", metric.compute(), wanted, worst)
-    metric.update(some(index[:0], metric.splits[0]))  # so that nothing is kept of the last computation
+    metric.update(some(index[:0], metric.splits[0]))  # so that torchmetrics does not return the cached result
     same("computed again", metric.compute(), wanted, worst)
 
 
 def _untouched(build: Make, some: Slices, worst: Worst) -> None:
-    """Other metrics read the same prediction."""
+    """Check that a metric leaves the prediction as it is, since other metrics read the same one."""
     metric, index = build(), torch.arange(SAMPLES)
     for split in metric.splits:
         seen = some(index, split)
@@ -424,7 +431,7 @@ def _untouched(build: Make, some: Slices, worst: Worst) -> None:
 
 
 def _tensors(prediction: Prediction) -> dict[str, Tensor]:
-    """Of the batch, of the density, and of what was derived from both."""
+    """Return the tensors of the batch and the density of a prediction, and those derived from both, by name."""
     found = {f"batch[{name!r}]": value for name, value in prediction.batch.items()}
     for owner in (prediction, prediction.density):
         for name, value in vars(owner).items():
@@ -441,7 +448,7 @@ def _standard_errors(build: Make, row: MetricRow, worst: Worst) -> None:
 
 
 def _turns(build: Make, row: MetricRow, worst: Worst) -> None:
-    """Whole turns of angles, predicted or true, change nothing; in float64, where they hardly round."""
+    """Check that whole turns of predicted or true angles change nothing; in float64, where they round little."""
     some = predictions(row, SAMPLES, images=bool(build().reads))
     some = replace(some, target=some.target.double(), place=some.place.double())
     index = torch.arange(SAMPLES)
@@ -456,7 +463,7 @@ def _turns(build: Make, row: MetricRow, worst: Worst) -> None:
 
 
 def _unit(build: Make, row: MetricRow, worst: Worst) -> None:
-    """Degrees and radians, nats and bits, and how numbers of reals follow their target's unit."""
+    """Check degrees against radians, nats against bits, and that numbers of reals follow their target's unit."""
     index, kind = torch.arange(SAMPLES), row.target.kind
     some = predictions(row, SAMPLES, images=False, near=True)
     metric = build()
@@ -487,7 +494,7 @@ def _unit(build: Make, row: MetricRow, worst: Worst) -> None:
 
 def _nan(build: Make, row: MetricRow, worst: Worst) -> None:
     some = predictions(row, SAMPLES, images=False, near=True)
-    bad = slice(5, 13)  # so many that a median sees them
+    bad = slice(5, 13)  # so many that a median changes
 
     def judge(place: float | Tensor, breadth: float) -> dict[str, Tensor]:
         places, breadths = some.place.clone(), torch.ones(SAMPLES)
@@ -509,8 +516,8 @@ def _nan(build: Make, row: MetricRow, worst: Worst) -> None:
 
 
 def _images(build: Make, some: Slices, worst: Worst) -> None:
-    """Each asked for alone, since the prediction was not told: those that `reads` names, each once."""
+    """Check that exactly the images of `reads` are drawn, each once and alone, as the prediction announces none."""
     metric, prediction = build(), some(torch.arange(SAMPLES), build().splits[0])
     metric.update(prediction)
-    asked = prediction.density.asked  # type: ignore[attr-defined]  # a Ball
+    asked = prediction.density.asked  # density is a Ball
     worst.same("images drawn", sorted(map(sorted, asked)), sorted([name] for name in metric.reads))

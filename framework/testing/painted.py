@@ -1,4 +1,4 @@
-"""What a renderer says of visible faces, and its gradients; each function reports the worst case it saw."""
+"""Checks of a renderer's normals, barycentric and texture coordinates, and of its gradients."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from framework.testing.scenes import SIZE, sphere, square
 
 
 def normal(renderer: Renderer, worst: Worst) -> None:
-    """Of a finely cut sphere against the way from its centre; 1 - cosine."""
+    """Check normals of a finely cut sphere against the direction from its centre; the error is 1 - cosine."""
     scene = sphere(rings=120)
     found = renderer(replace(scene, colors=None), ("normal", "depth"))
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
@@ -25,7 +25,7 @@ def normal(renderer: Renderer, worst: Worst) -> None:
 
 
 def barycentric(renderer: Renderer, worst: Worst) -> None:
-    """The point of the visible face is seen at its pixel; pixels."""
+    """Check that the barycentric coordinates give the point of the face seen at the pixel; the error is in pixels."""
     scene = replace(sphere(), colors=None)
     found = renderer(scene, ("barycentric", "face"))
     corners = scene.vertices.double()[scene.faces][found["face"].clamp(min=0).long()]
@@ -36,7 +36,7 @@ def barycentric(renderer: Renderer, worst: Worst) -> None:
 
 
 def uv(renderer: Renderer, worst: Worst) -> None:
-    """On a square across the view it is linear in the pixel."""
+    """Check that texture coordinates are linear in the pixel on a square across the view."""
     scene, places = papered(torch.ones(1, 1, 3))
     found = renderer(replace(scene, colors=None), ("uv",))["uv"].double()
     worst.see((found - places).abs().amax(-1), lambda at: f"pixel {at}: {found[at].tolist()}")
@@ -45,7 +45,10 @@ def uv(renderer: Renderer, worst: Worst) -> None:
 
 
 def texture(renderer: Renderer, worst: Worst) -> None:
-    """Of texels as they lie, wrapped in each way, times the colours; or a ValueError where "uv" is not drawn."""
+    """Check texels without smoothing, wrapped in each way, times the vertex colours.
+
+    A renderer without "uv" must refuse a texture with a ValueError.
+    """
     generator = torch.Generator().manual_seed(SEED)
     image = torch.rand(3, 4, 3, generator=generator)
     for wrap in ("repeat", "clamp", "mirror"):
@@ -80,6 +83,7 @@ def texture(renderer: Renderer, worst: Worst) -> None:
 
 
 def wrapped(place: Tensor, count: int, wrap: str) -> Tensor:
+    """Return texel indices within the image for places outside it."""
     if wrap == "clamp":
         return place.clamp(0, count - 1)
     if wrap == "repeat":
@@ -89,7 +93,7 @@ def wrapped(place: Tensor, count: int, wrap: str) -> Tensor:
 
 
 def papered(image: Tensor) -> tuple[Scene, Tensor]:
-    """A square across the view with an image on it, repeated a few times and turned; and uv at each pixel, float64."""
+    """Return a square across the view with an image, repeated and rotated, and its uv at each pixel, float64."""
     scene = square(3.0, side=4.0)
     pixels, _ = scene.camera.projected(scene.vertices.double())
     slope = torch.tensor([[0.041, 0.013], [-0.017, 0.053]], dtype=torch.float64)
@@ -100,7 +104,7 @@ def papered(image: Tensor) -> tuple[Scene, Tensor]:
 
 
 def wrapping(scene: Scene) -> Texture:
-    """A smooth picture laid around a scene once, float64."""
+    """Return a smooth texture that covers a scene once, float64."""
     row, column = torch.meshgrid(torch.arange(16.0), torch.arange(16.0), indexing="ij")
     image = torch.stack([(row / 4 + column / 6 + channel).sin() * 0.3 + 0.6 for channel in range(3)], -1)
     places = 0.5 + 0.4 * scene.vertices[:, :2] + 0.1 * scene.vertices[:, 2:]
@@ -108,14 +112,17 @@ def wrapping(scene: Scene) -> Texture:
 
 
 PART = 4
-"""Pictures along each axis, moved by parts of a pixel, whose mean stands for one of areas."""
+"""Number of images along each axis, shifted by fractions of a pixel, whose mean approximates integrals over pixels."""
 ALONE = 6.0
-"""How many times as far as all together one parameter's gradient may be off."""
+"""Factor by which the gradient in one parameter may be farther off than that in all together."""
 
 
 def gradient(renderer: Renderer, worst: Worst) -> None:
-    """Of a weighted sum of pixels, relative to its differences: one direction in each parameter that `differentiable`
-    names. Weights that change slowly from pixel to pixel leave the grid of pixels no say."""
+    """Check gradients of a weighted sum of pixels against differences, in one direction of each parameter.
+
+    The parameters are those that `differentiable` names. The weights change slowly from pixel to pixel, so that the
+    position of the pixel grid matters little.
+    """
     scene = sphere()
     if "uv" in renderer.channels:
         scene = replace(scene, texture=wrapping(scene))
@@ -188,6 +195,6 @@ def gradient(renderer: Renderer, worst: Worst) -> None:
         for name, a, b in zip(sorted(renderer.differentiable), found, wanted, strict=True)
     )
     worst.see(((one - other).norm() / other.norm()).reshape(1), lambda at: said)
-    # and each by itself, of which edges between pixels leave less that is exact
+    # each parameter alone; edges between pixels make these less exact
     each = (one - other).abs() / other.abs().clamp(min=0.01 * other.norm().item())
     worst.see(each / ALONE, lambda at: said)

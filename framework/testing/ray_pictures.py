@@ -1,4 +1,4 @@
-"""Pictures of few triangles by brute force, in float64: every pixel's ray against every face. And scenes for them."""
+"""Images of few triangles by brute force, in float64: every pixel's ray against every face; and scenes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,22 +11,24 @@ from framework.renderer import Scene
 from framework.testing.finding import SEED
 
 CLEAR = (0.05, 0.15, 0.3, 0.45, 0.6)
-"""Pixels from a pixel's centre at which nothing else may be seen where a picture is compared; the small ones are for
-triangles thinner than half a pixel."""
+"""Distances from a pixel's centre, pixels, at which no other face may be seen for the pixel to be compared.
+
+The small distances are for triangles thinner than half a pixel.
+"""
 AROUND = ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7))
-"""Directions in which the neighbourhood of a pixel's centre is looked at."""
+"""Directions in which the neighbourhood of a pixel's centre is examined."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What is seen in each pixel.
+    """Image of a scene, with one entry for each pixel.
 
     Attributes:
-        face: (height, width) int64, -1 for none.
-        depth: (height, width) metres, inf for none.
-        color: (height, width, channels), 0 for none.
-        weights: (height, width, vertices), how much of each vertex's colour is there.
-        clear: (height, width), whether the same face is seen around.
+        face: Index of the visible face, (height, width) int64; -1 for none.
+        depth: Depth, (height, width), metres; infinite for none.
+        color: Colour, (height, width, channels); 0 for none.
+        weights: Weight of the colour of each vertex, (height, width, vertices).
+        clear: Whether the same face is seen around the pixel, (height, width).
     """
 
     face: Tensor
@@ -37,7 +39,10 @@ class Picture:
 
 
 def picture(scene: Scene) -> Picture:
-    """By the plane of each face and perspective-correct weights of its corners (Möller & Trumbore 1997)."""
+    """Return the image by intersecting rays with the plane of each face (Möller & Trumbore 1997).
+
+    Colours use perspective-correct weights of the corners.
+    """
     assert scene.colors is not None
     face, depth, weights = _first(scene, 0.0, 0.0)
     shares = weights.new_zeros(*face.shape, len(scene.vertices))
@@ -52,7 +57,7 @@ def picture(scene: Scene) -> Picture:
 
 
 def _first(scene: Scene, down: float, across: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Index, depth and weights of the nearest face of every pixel, moved by parts of one."""
+    """Return index, depth and weights of the nearest face at every pixel, shifted by a fraction of a pixel."""
     seen = scene.camera
     row, column = torch.meshgrid(
         torch.arange(seen.height).double() + down, torch.arange(seen.width).double() + across, indexing="ij"
@@ -66,7 +71,7 @@ def _first(scene: Scene, down: float, across: float) -> tuple[Tensor, Tensor, Te
         return torch.full(row.shape, -1), nothing, torch.zeros_like(ray)
     vertices = scene.vertices.double() @ seen.rotation.double().T + seen.translation.double()
     corners = vertices[scene.faces.long()]
-    # with corners (A, B, C) the ray's weights are r·(B×C), r·(C×A), r·(A×B), up to their sum
+    # with corners (A, B, C) the weights of a ray r are r·(B×C), r·(C×A), r·(A×B), up to division by their sum
     sides = torch.stack(
         [torch.linalg.cross(corners[:, (k + 1) % 3], corners[:, (k + 2) % 3]) for k in range(3)], 1
     )
@@ -81,7 +86,7 @@ def _first(scene: Scene, down: float, across: float) -> tuple[Tensor, Tensor, Te
 
 
 def camera(size: tuple[int, int]) -> Camera:
-    """Not one that hides an exchange: pixels are no squares, and the principal point is off the middle."""
+    """Return a camera that reveals swapped axes: pixels are not square, and the principal point is off the centre."""
     plain = look_from(-0.5, 0.3, 0.4, distance=4.0, field_of_view=0.8, size=size)
     (across, down), (column, row) = plain.focal, plain.principal
     return replace(
@@ -90,8 +95,10 @@ def camera(size: tuple[int, int]) -> Camera:
 
 
 def crossing(size: tuple[int, int] = (45, 141), count: int = 40, channels: int = 3) -> Scene:
-    """Large triangles across each other, each turned to the camera, among others that nobody sees: behind the camera,
-    aside, and without area. Vertices in another order, and one that no face has."""
+    """Return a scene of large triangles that intersect, each facing the camera, and of some that are not visible.
+
+    Those lie behind the camera, aside, or have no area. The vertices are shuffled, and one of them belongs to no face.
+    """
     generator = torch.Generator().manual_seed(SEED)
     seen = camera(size)
     depth = 3 + 3 * torch.rand(count, 1, 1, generator=generator, dtype=torch.float64)
@@ -106,7 +113,7 @@ def crossing(size: tuple[int, int] = (45, 141), count: int = 40, channels: int =
 
 
 def floor(size: tuple[int, int] = (40, 53)) -> Scene:
-    """Two triangles from near to far: what is linear on the screen and what is in space are far apart."""
+    """Return two triangles from near to far, so that interpolation on the screen differs much from that in space."""
     generator = torch.Generator().manual_seed(SEED)
     pixels = torch.tensor([[[-9, 44.0], [62, 47], [36, 5]], [[-9, 44], [36, 5], [4, 3]]]).double()
     depth = torch.tensor([[[1.1], [1.4], [30.0]], [[1.1], [30.0], [17.0]]]).double()
@@ -114,7 +121,7 @@ def floor(size: tuple[int, int] = (40, 53)) -> Scene:
 
 
 def _seen(seen: Camera, pixels: Tensor, depth: Tensor, channels: int, generator: torch.Generator) -> Scene:
-    """Triangles (faces, 3) whose corners are seen at these pixels and depths."""
+    """Return a scene of triangles (faces, 3) whose corners are seen at these pixels and depths."""
     focal, principal = (torch.as_tensor(part).double() for part in (seen.focal, seen.principal))
     corners = torch.cat([(pixels - principal) / focal, torch.ones_like(depth)], -1) * depth
     across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

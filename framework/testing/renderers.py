@@ -1,4 +1,4 @@
-"""The contract of a renderer: one function a property, each reporting the worst case it saw."""
+"""Contract tests of a renderer: one function for each property; each reports its worst case."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -26,11 +26,11 @@ from framework.testing.scenes import SIZE, camera, empty, sphere, square
 
 Make = Callable[[], Renderer]
 OF_TRIANGLES = {"no holes", "sphere: depth, metres", "what the near plane cuts", "extreme scenes"}
-"""What nobody asks of one whose row says that it draws sets of points, and which does."""
+"""Properties that are left out for a renderer that draws sets of points, where its row says so."""
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
-    """Every property of one renderer on the scenes below."""
+    """Yield one finding for each property of a renderer."""
     checks: dict[str, tuple[float, Callable[[Renderer, Worst], None]]] = {
         "only the channels asked for": (0.0, _channels),
         "what it cannot draw is refused": (0.0, _refusals),
@@ -115,7 +115,7 @@ def _refusals(renderer: Renderer, worst: Worst) -> None:
 
 
 def _repeatable(renderer: Renderer, worst: Worst) -> None:
-    """Also after another scene in between: no state is left."""
+    """Check that a scene gives the same bits, also after another scene was drawn: the renderer keeps no state."""
     first = renderer(sphere(), sorted(renderer.channels))
     renderer(square(2.0), sorted(renderer.channels))
     for name, again in renderer(sphere(), sorted(renderer.channels)).items():
@@ -123,7 +123,7 @@ def _repeatable(renderer: Renderer, worst: Worst) -> None:
 
 
 def _no_faces(renderer: Renderer, worst: Worst) -> None:
-    """Of one that draws sets of points a row leaves this out."""
+    """Check that a scene without faces shows the background; rows of renderers of point sets leave this out."""
     _is_background(renderer, empty(sphere()), "no faces", worst)
 
 
@@ -151,7 +151,7 @@ def _bad_triangles(renderer: Renderer, worst: Worst) -> None:
         + torch.arange(4.0)[:, None] * (scene.vertices[1:2] - scene.vertices[:1]) / 3,
     }.items():
         _is_background(renderer, replace(scene, vertices=vertices), what, worst)
-    # one bad triangle beside good ones leaves the good ones as they are
+    # a bad triangle beside good ones leaves the good ones unchanged
     mixed = replace(
         scene,
         vertices=torch.cat([scene.vertices, torch.tensor([[math.nan, 0, 0]])]),
@@ -177,7 +177,7 @@ def _is_background(renderer: Renderer, scene: Scene, what: str, worst: Worst) ->
 
 
 def _ties(renderer: Renderer, worst: Worst) -> None:
-    """Two equal surfaces: the lower face index is seen."""
+    """Check that of equal surfaces the one with the lowest face index is seen."""
     if "face" not in renderer.channels:
         worst.count(False, "draws no faces")
         return
@@ -188,7 +188,7 @@ def _ties(renderer: Renderer, worst: Worst) -> None:
 
 
 def _no_holes(renderer: Renderer, worst: Worst) -> None:
-    """A square of thousands of triangles across the view covers every pixel."""
+    """Check that a square of thousands of triangles across the view covers every pixel."""
     scene = square(3.0)
     side = 57
     part = torch.linspace(0, 1, side, dtype=torch.float64)
@@ -200,7 +200,7 @@ def _no_holes(renderer: Renderer, worst: Worst) -> None:
     faces = torch.cat(
         [torch.stack([a, a + side + 1, a + side], -1), torch.stack([a, a + 1, a + side + 1], -1)]
     )
-    faces = torch.cat([faces, faces.flip(-1)])  # seen from either side
+    faces = torch.cat([faces, faces.flip(-1)])  # visible from both sides
     mesh = Scene(vertices.reshape(-1, 3).float(), faces, None, scene.camera)
     if "mask" in renderer.channels:
         worst.count(~renderer(mesh, ("mask",))["mask"], "pixels of a closed surface not covered")
@@ -228,7 +228,7 @@ def _hiding(renderer: Renderer, worst: Worst) -> None:
 
 
 def _sphere(renderer: Renderer, worst: Worst) -> None:
-    """Depth of a finely cut sphere against the ray's own intersection, away from the outline."""
+    """Check the depth of a finely cut sphere against the intersection of each ray, away from the outline; metres."""
     if "depth" not in renderer.channels:
         worst.count(False, "draws no depth")
         return
@@ -244,7 +244,7 @@ def _sphere(renderer: Renderer, worst: Worst) -> None:
         ],
         -1,
     )
-    centre = seen.translation.double()  # of the sphere, in the camera's frame
+    centre = seen.translation.double()  # centre of the sphere in the camera's frame
     along, square_of_ray = ray @ centre, ray.square().sum(-1)
     inside = along.square() - square_of_ray * (centre.square().sum() - 1)
     true = (along - inside.clamp(min=0).sqrt()) / square_of_ray
@@ -268,7 +268,7 @@ def _small(renderer: Renderer, worst: Worst) -> None:
 
 
 def _places(renderer: Renderer, worst: Worst) -> None:
-    """A triangle smaller than a pixel around a pixel's centre, at the depth and place that `Camera.projected` says."""
+    """Check that a triangle inside one pixel is drawn at the pixel and depth that `Camera.projected` returns."""
     if "mask" not in renderer.channels:
         worst.count(False, "draws no mask")
         return
@@ -288,14 +288,14 @@ def _places(renderer: Renderer, worst: Worst) -> None:
                 bool((place - pixels).abs().max() > 1e-4), f"pixel {row, column}: projected to {place}"
             )
             worst.count(bool((far - depth).abs().max() > 1e-4), f"pixel {row, column}: depth {far}")
-            faces = torch.tensor([[0, 1, 2], [0, 2, 1]])  # from either side
+            faces = torch.tensor([[0, 1, 2], [0, 2, 1]])  # visible from both sides
             mask = renderer(Scene(world.float(), faces, None, seen), ("mask",))["mask"]
             found = mask.nonzero().tolist()
             worst.count(found != [[row, column]], f"pixel {row, column}: drawn at {found}")
 
 
 def _cut(renderer: Renderer, worst: Worst) -> None:
-    """A floor that goes on behind the camera: its depth, relative, where it is drawn; or nothing is drawn."""
+    """Check the relative depth of a floor that extends behind the camera; it may also be left out."""
     if "depth" not in renderer.channels:
         worst.count(False, "draws no depth")
         return

@@ -1,4 +1,4 @@
-"""Scenes that renderers are checked on."""
+"""Scenes on which renderers are checked."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,7 @@ SIZE = (48, 64)
 
 
 def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
-    """A sphere about the origin, coloured by place, seen from four metres."""
+    """Return a sphere about the origin, coloured by position, seen from four metres."""
     theta = torch.linspace(0, math.pi, rings + 1, dtype=torch.float64)
     phi = torch.arange(2 * rings, dtype=torch.float64) * (math.pi / rings)
     grid = torch.stack(
@@ -34,11 +34,12 @@ def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
 
 
 def camera() -> Camera:
+    """Return the camera of these scenes, four metres from the origin."""
     return look_from(0.3, 0.2, 0.1, distance=4.0, field_of_view=0.7, size=SIZE)
 
 
 def square(distance: float, side: float = 10.0) -> Scene:
-    """Two triangles across the whole view, `distance` metres in front of the camera, facing it."""
+    """Return a square of two triangles across the view, `distance` metres in front of the camera and facing it."""
     seen = camera()
     corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double() * side / 2
     corners[:, 2] = distance
@@ -48,4 +49,5 @@ def square(distance: float, side: float = 10.0) -> Scene:
 
 
 def empty(scene: Scene) -> Scene:
+    """Return the scene without faces."""
     return replace(scene, faces=scene.faces[:0])
