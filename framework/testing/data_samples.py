@@ -1,4 +1,4 @@
-"""The samples of a split that a check looks at, and whether two are the same."""
+"""Samples of a split that checks look at, and comparisons of samples to the last bit."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,25 +13,28 @@ from framework.data import Batch, Data
 from framework.testing.finding import SEED, Worst
 
 FEW = 400
-"""Samples of a split that are always looked at, where there are as many."""
+"""Number of samples of a split that are always checked, or all where there are fewer."""
 MOST = 5000
-"""Samples of a split at most; of more, so many drawn at random from all of it."""
+"""Largest number of samples of a split that are checked, drawn at random where there are more."""
 BYTES = 2**27
-"""Of the samples of a split that are looked at, where they are more than FEW."""
+"""Limit on the memory of the checked samples of a split beyond FEW, bytes."""
 SECONDS = 1.5
-"""Of processor time in which those are fetched, where they are more than FEW."""
+"""Limit on the processor time to fetch the checked samples of a split beyond FEW, seconds."""
 
 
 def few(length: int, most: int) -> list[int]:
-    """All numbers below `length`, or `most` of them evenly spread, with the first and the last."""
+    """Return all numbers below `length`, or `most` of them, evenly spaced, with the first and the last."""
     if length <= most:
         return list(range(length))
     return np.linspace(0, length - 1, most).round().astype(int).tolist()
 
 
 def numbers(split: Any) -> list[int]:
-    """All samples, or as many as MOST, BYTES and SECONDS allow: one from each of equally long stretches, at random so
-    that nothing periodic hides from them, with the first and the last."""
+    """Return the numbers of all samples, or of as many as MOST, BYTES and SECONDS allow.
+
+    The split is divided into equally long blocks, and one sample is drawn at random from each, so that periodic faults
+    show. The first and the last sample are included.
+    """
     length = len(split)
     if length <= FEW:
         return list(range(length))
@@ -48,23 +51,23 @@ def numbers(split: Any) -> list[int]:
 
 
 def parts(data: Data) -> dict[str, Any]:
-    """The splits by name."""
+    """Return the splits of a data set by name."""
     return data.splits()._asdict()
 
 
 def total(data: Data) -> int:
-    """Samples of all splits."""
+    """Return the number of samples in all splits."""
     return sum(map(len, parts(data).values()))
 
 
 def samples(split: Any) -> Iterator[tuple[int, Batch]]:
-    """Number and sample, as `split[number]` gives it, of a few."""
+    """Yield number and sample, as `split[number]` returns it, of at most FEW samples."""
     for number in few(len(split), FEW):
         yield number, split[number]
 
 
 def batches(asked: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]:
-    """The numbers in batches of these sizes in turn, over and over."""
+    """Yield the numbers in batches of these sizes, which repeat in turn."""
     start = turn = 0
     while start < len(asked):
         size = sizes[turn % len(sizes)]
@@ -73,14 +76,14 @@ def batches(asked: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]:
 
 
 def fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    """Whether an input is of the data set's shape; a cloud, (points, columns), may have fewer points."""
+    """Return whether an input has the data set's shape; a cloud, (points, columns), may have fewer points."""
     if len(wanted) == 2 and len(shape) == 2:
         return 0 < shape[0] <= wanted[0] and shape[1] == wanted[1]
     return shape == wanted
 
 
 def trimmed(inputs: Tensor) -> Tensor:
-    """A cloud without its padding, the rows of NaN at its end; anything else as it is."""
+    """Return a cloud without its padding, the rows of NaN at its end; return any other input as it is."""
     if inputs.dim() != 2 or not inputs.is_floating_point():
         return inputs
     there = (~inputs.isnan().all(-1)).nonzero()
@@ -88,11 +91,11 @@ def trimmed(inputs: Tensor) -> Tensor:
 
 
 Marks = Mapping[str, int]
-"""Of a sample: field → a number that says its type, shape and content, to the last bit."""
+"""Field of a sample → hash of its dtype, shape and content, to the last bit."""
 
 
 def marks(batch: Batch) -> list[Marks]:
-    """Of every sample of a batch; clouds without their padding."""
+    """Return the marks of every sample of a batch; clouds are taken without their padding."""
     rows: dict[str, list[int]] = {}
     for key, values in batch.items():
         if key == "input" and values.dim() == 3 and values.is_floating_point() and values.isnan().any():
@@ -106,18 +109,18 @@ def _mark(values: Tensor) -> list[int]:
     kind = (str(values.dtype), tuple(values.shape[1:]))
     values = values.detach()
     if values.is_floating_point():
-        values = values + 0  # -0 is 0
+        values = values + 0  # so that -0 equals 0
     flat = values.contiguous().reshape(len(values), values[0].numel()).view(torch.uint8).numpy()
     return [hash((kind, row.tobytes())) for row in flat]
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a split held when it was looked at first.
+    """Contents of a split at the first look.
 
     Attributes:
-        length: number of samples.
-        marks: number → that of the sample, of those that are looked at.
+        length: Number of samples.
+        marks: Number of a checked sample → its marks.
     """
 
     length: int
@@ -125,7 +128,7 @@ class Contents:
 
 
 def contents(split: Any, asked: Sequence[int] | None = None) -> Contents:
-    """Of these samples, or of those that are looked at, as `split[number]` gives them."""
+    """Return the marks of the samples `asked`, or of those to check if None, as `split[number]` returns them."""
     asked = numbers(split) if asked is None else asked
     one_by_one = ((number, split[number]) for number in asked)
     found = {
@@ -135,7 +138,7 @@ def contents(split: Any, asked: Sequence[int] | None = None) -> Contents:
 
 
 def equal_marks(found: Marks, wanted: Marks, what: str, worst: Worst, *, only: Sequence[str] = ()) -> None:
-    """The same fields (or `only` these) with the same content; to be quick where they are equal."""
+    """Check that two samples have the same content in all fields, or in those of `only`; quick where they are equal."""
     if not only and found == wanted:
         return
     if not only:
@@ -147,7 +150,7 @@ def equal_marks(found: Marks, wanted: Marks, what: str, worst: Worst, *, only: S
 def equal_splits(
     found: Data, wanted: Mapping[str, Contents], what: str, worst: Worst, *, only: tuple[str, ...] = ()
 ) -> None:
-    """Every split's samples have the same fields (or `only` these) to the last bit."""
+    """Check that the samples of every split have the same content in all fields, or in those of `only`."""
     for name, split in parts(found).items():
         before = wanted[name]
         worst.same(f"{what}: length of {name}", len(split), before.length)
@@ -157,6 +160,7 @@ def equal_splits(
 
 
 def equal_fields(found: Batch, wanted: Batch, what: str, worst: Worst, *, only: tuple[str, ...] = ()) -> None:
+    """Check that two samples or batches agree to the last bit in all fields, or in those of `only`."""
     if not only:
         worst.same(f"{what}: fields", sorted(found), sorted(wanted))
     for key in only or set(found) & set(wanted):

@@ -202,6 +202,7 @@ class Predictions:
     images: bool
 
     def __call__(self, index: Tensor, split: Split) -> Prediction:
+        """Return the prediction of these samples of a split."""
         about, breadth = self.place[index], None if self.breadth is None else self.breadth[index]
         if split == "outliers":
             about = self.place[(index + 1) % len(self.target)]

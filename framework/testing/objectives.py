@@ -1,4 +1,4 @@
-"""The contract of an objective: one function a property, each reporting the worst case it saw."""
+"""Contract tests of an objective: one function for each property; each reports its worst case."""
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
@@ -21,7 +21,7 @@ from framework.testing.rows import ObjectiveRow
 from framework.testing.wrappers import LENGTH
 
 Make = Callable[[float], Objective]
-"""Builds the row's objective with its weight times a factor."""
+"""Function that builds the row's objective with its weight multiplied by a factor."""
 SAMPLES = 12
 STEPS = (1e-5, 1e-6, 1e-7, 1e-8)
 MANY = 130
@@ -29,7 +29,7 @@ DRAWS = 8
 
 
 class Network(nn.Module):
-    """One small network with what keeps state or draws noise: batch norm and dropout."""
+    """Small network with a layer that keeps state and a layer that draws noise: batch norm and dropout."""
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class Network(nn.Module):
         self.dropout = nn.Dropout(0.2)
         self.last = nn.Linear(8, numbers_about(target))
         self.gain = 1.0
-        """Of the raw numbers, to make them extreme."""
+        """Factor on the distribution parameters, which makes them extreme."""
 
     def forward(self, inputs: Tensor) -> Distribution:
         numbers = inputs / 255 if inputs.dtype == torch.uint8 else inputs
@@ -48,7 +48,7 @@ class Network(nn.Module):
 
 
 class Members(Predictor):
-    """What an objective is tried on: `count` networks trained together, as a wrapper trains them; None: one alone."""
+    """Predictor that an objective is checked on: `count` networks that train together, or a single one if None."""
 
     def __init__(self, target: Target, count: int | None = None) -> None:
         super().__init__()
@@ -69,13 +69,14 @@ class Members(Predictor):
         pass
 
     def amplify(self, gain: float) -> None:
+        """Set the factor on the distribution parameters of every network."""
         for network in self.networks:
             assert isinstance(network, Network)
             network.gain = gain
 
 
 def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
-    """Every property of one objective on small predictors of `row.target`, fresh for each."""
+    """Yield one finding for each property of an objective on small predictors of `row.target`, new for each check."""
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, row, worst)),
         "a finite scalar": (0.0, lambda worst: _scalar(build, row, worst)),
@@ -101,15 +102,15 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
 
 
 def predictor_of(row: ObjectiveRow, count: int | None = None) -> Members:
-    """In training mode; the same initial numbers every time."""
+    """Return a predictor in training mode; its initial parameters are the same each time."""
     torch.manual_seed(SEED)
     predictor = Members(row.target, count)
-    predictor(batch_of(row, 32)["input"])  # gives the running moments something to hold
+    predictor(batch_of(row, 32)["input"])  # sets the running moments of batch norm
     return predictor
 
 
 def batch_of(row: ObjectiveRow, count: int) -> Batch:
-    """Seeded: inputs, targets, and whatever else the row's objective reads."""
+    """Return a seeded batch: inputs, targets, and the other fields that the row's objective reads."""
     generator = torch.Generator().manual_seed(SEED + 2)
     return {
         "input": torch.randn(count, LENGTH, generator=generator),
@@ -121,17 +122,18 @@ def batch_of(row: ObjectiveRow, count: int) -> Batch:
 
 
 def in_float64(batch: Batch) -> Batch:
+    """Convert the floating-point fields of a batch to float64."""
     return {name: field.double() if field.is_floating_point() else field for name, field in batch.items()}
 
 
 def penalty(objective: Objective, predictor: Predictor, batch: Batch) -> Tensor:
-    """Seeded, as the framework seeds every step."""
+    """Return the penalty after seeding, as the framework seeds every step."""
     torch.manual_seed(SEED)
     return objective(predictor, batch)
 
 
 def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[str, Tensor]:
-    """Of every parameter that has one."""
+    """Return the gradient of every parameter that has one, by name."""
     predictor.zero_grad()
     penalty(objective, predictor, batch).backward()
     return {
@@ -142,7 +144,7 @@ def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[
 
 
 def _on_one_device(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """The penalty of one model and of three members."""
+    """Check the penalty of one model and of three members for mixed devices."""
 
     def questions(mode: OneDevice) -> Questions:
         for count in (None, 3):
@@ -179,10 +181,10 @@ def _scalar(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _gradient(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """The directional derivative in all parameters against central differences, in evaluation and float64.
+    """Check the directional derivative in all parameters against central differences, in evaluation mode and float64.
 
-    Of several steps the one that agrees best, as for density heads: a larger one may be too coarse for a narrow density
-    or reach across a kink, a smaller one is lost in rounding.
+    Of several steps the one that agrees best counts, as for density heads: a larger step may be too coarse for a narrow
+    density or cross a kink, and a smaller one is lost in rounding.
     """
     objective, predictor = build(1.0), predictor_of(row).eval().double()
     batch = in_float64(batch_of(row, SAMPLES))
@@ -236,13 +238,13 @@ def _repeatable(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _traces(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """What a penalty must not touch: modes, buffers, parameters and their gradients, the batch."""
+    """Check that a penalty leaves training modes, buffers, parameters, their gradients and the batch as they are."""
     for training in (True, False):
         predictor, batch = predictor_of(row), batch_of(row, SAMPLES)
         predictor.train(training)
         first = predictor.networks[0]
         assert isinstance(first, Network)
-        first.norm.train(not training)  # one that a user keeps otherwise
+        first.norm.train(not training)  # a mode that differs from the predictor's, as a user may set it
         modes = {name: module.training for name, module in predictor.named_modules()}
         state = copy.deepcopy(predictor.state_dict())
         before = {name: field.clone() for name, field in batch.items()}
@@ -262,7 +264,7 @@ def _traces(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _order(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Without dropout, whose masks belong to places in the batch."""
+    """Check that the order of samples does not matter; without dropout, whose masks follow batch positions."""
     predictor, batch = predictor_of(row).eval(), batch_of(row, SAMPLES)
     backwards = {name: field.flip(0) for name, field in batch.items()}
     wanted = penalty(build(1.0), predictor, batch).item()
@@ -271,7 +273,7 @@ def _order(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _each_sample(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """In a batch of MANY the first, the last and one between have a part in the penalty; in evaluation."""
+    """Check that the first, middle and last of MANY samples each change the penalty, in evaluation mode."""
     objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, MANY)
     wanted = penalty(objective, predictor, batch).item()
 
@@ -289,9 +291,9 @@ def _each_sample(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _mean(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """A batch in which every sample comes twice has the same penalty: a weight means the same in a batch of any size.
+    """Check that a batch that holds every sample twice has the same penalty, so that the batch size does not scale it.
 
-    Of one that draws random numbers on average over DRAWS seeds, and about.
+    The penalty of an objective that draws random numbers is a mean over DRAWS seeds, and a tolerance is added.
     """
     objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, SAMPLES)
     twice = {name: torch.cat([field, field]) for name, field in batch.items()}
@@ -310,7 +312,7 @@ def _mean(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _different_members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """The penalty is the mean of those of the members alone, and each one's gradient its own; without dropout."""
+    """Check that penalty and gradients of different members are the mean of their own; without dropout."""
     objective, together, batch = build(1.0), predictor_of(row, 3).eval(), batch_of(row, SAMPLES)
     whole = gradients(objective, together, batch)
     found, each = penalty(objective, together, batch).item(), []
@@ -329,7 +331,7 @@ def _different_members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _told(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Scalars without a graph, of the last batch."""
+    """Check that the terms to be logged are finite scalars of the last batch without a graph."""
     objective = build(1.0)
     penalty(objective, predictor_of(row), batch_of(row, SAMPLES))
     worst.count(False, "none")
@@ -340,7 +342,7 @@ def _told(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _generator(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """What others draw after a penalty still depends on the seed before it."""
+    """Check that random numbers drawn after a penalty still depend on the seed set before it."""
     objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, SAMPLES)
     drawn = []
     for number in (0, 1):
@@ -351,7 +353,7 @@ def _generator(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _nan(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """A network that gives NaN has a penalty of NaN, or is refused."""
+    """Check that a network that returns NaN has a penalty of NaN or is refused."""
     predictor = predictor_of(row).eval()
     with torch.no_grad():
         for network in predictor.networks:
@@ -366,7 +368,7 @@ def _nan(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Members that are alike: the penalty, and each one's gradient, are those of one alone; without dropout."""
+    """Check that equal members have the penalty, and each the gradient, of one alone; without dropout."""
     alone = predictor_of(row).eval()
     together = predictor_of(row, 3).eval()
     for network in together.networks:
@@ -385,7 +387,7 @@ def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """The penalty has the predictor's type; inputs may be images as bytes."""
+    """Check that the penalty has the predictor's dtype, and that inputs may be images as bytes."""
     objective = build(1.0)
     for kind in (torch.float32, torch.float64):
         predictor = predictor_of(row).to(kind)
@@ -401,7 +403,7 @@ def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Raw numbers to ±1e4: a network that has become sure of everything."""
+    """Check distribution parameters up to ±1e4, as of an overconfident network."""
     for kind in (torch.float32, torch.float64):
         for size in (1e2, 1e4):
             predictor = predictor_of(row).to(kind)
@@ -414,7 +416,10 @@ def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _small(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """In evaluation, since batch norm cannot train on one sample; no samples must not make the loss NaN."""
+    """Check batches of no sample and of one, in evaluation mode, as batch norm cannot train on one sample.
+
+    A batch without samples must not make the loss NaN.
+    """
     for count in (0, 1):
         predictor = predictor_of(row).eval()
         found = penalty(build(1.0), predictor, batch_of(row, count))

@@ -1,4 +1,4 @@
-"""Small files as a user may have them, for rows of data sets: images, and meshes."""
+"""Small files as a user may have them, for rows of data sets: images and meshes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,11 @@ from framework.testing.finding import SEED
 
 
 def noise_image(file: Path, number: int, size: tuple[int, int] = (20, 20)) -> Path:
-    """An image of (height, width) in colour, no two numbers alike; in the format that the name's end says."""
+    """Write a colour image of random pixels and return its path.
+
+    The image has `size` (height, width), and its pixels differ for each `number`. The suffix of `file` decides the
+    format.
+    """
     pixels = np.random.default_rng([SEED, number]).integers(0, 256, (*size, 3), np.uint8)
     file.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(file)
@@ -18,13 +22,13 @@ def noise_image(file: Path, number: int, size: tuple[int, int] = (20, 20)) -> Pa
 
 
 def images(folder: Path) -> Sequence[Path]:
-    """A wide one and a tall one, of two formats."""
+    """Write a wide and a tall image in two formats, and return their paths."""
     wide, tall = folder / "wide.png", folder / "tall.jpg"
     return noise_image(wide, 0, (30, 40)), noise_image(tall, 1, (50, 20))
 
 
 def surface(number: int, side: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (side², 3) and triangles of a rough piece of land off the origin, no two numbers alike."""
+    """Return vertices (side², 3) and triangles of a rough surface off the origin, which differs for each `number`."""
     random = np.random.default_rng([SEED, number])
     row, column = np.divmod(np.arange(side**2), side)
     vertices = np.stack([row, column, random.normal(size=side**2)], -1) + random.normal(3, 1, 3)
@@ -34,12 +38,12 @@ def surface(number: int, side: int = 6) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_off(file: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
-    """A mesh as the Object File Format has it."""
+    """Write a mesh in the Object File Format, and return its path."""
     return _write(file, ["OFF", f"{len(vertices)} {len(faces)} 0"], vertices, faces)
 
 
 def write_ply(file: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
-    """A mesh as ASCII PLY."""
+    """Write a mesh as ASCII PLY, and return its path."""
     head = [
         "ply",
         "format ascii 1.0",
@@ -61,6 +65,6 @@ def _write(file: Path, head: Sequence[str], vertices: np.ndarray, faces: np.ndar
 
 
 def meshes(folder: Path) -> Sequence[Path]:
-    """Two pieces of land, in two formats."""
+    """Write two rough surfaces in two formats, and return their paths."""
     first, second = surface(0), surface(1, side=7)
     return write_ply(folder / "first.ply", *first), write_off(folder / "second.off", *second)

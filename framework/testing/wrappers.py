@@ -1,6 +1,6 @@
-"""The contract of an uncertainty wrapper: one function a property, each reporting the worst case it saw.
+"""Contract tests of an uncertainty wrapper: one function for each property; each reports its worst case.
 
-What must hold of its calibration is in framework.testing.calibration.
+The properties of its calibration are checked in framework.testing.calibration.
 """
 
 import copy
@@ -25,20 +25,20 @@ from framework.uncertainty import Uncertainty
 
 Make = Callable[[], Uncertainty]
 Build = Callable[[Target], Uncertainty]
-"""Builds the row's wrapper around `Plain`, for the row's target in any unit."""
+"""Function that builds the row's wrapper around `Plain`, for the row's target in any unit."""
 LENGTH = 6
 UNITS = ((200.0, 50.0), (-3.0, 1e-3))
-"""Locations and scales of reals, beside 0 and 1."""
+"""Locations and scales of real targets, beside 0 and 1."""
 
 
 class Plain(Predictor):
-    """What is wrapped: one linear layer to the place and the breadth of the simplest density of the target's kind.
+    """Model to wrap: one linear layer to place and breadth of the simplest density of the target's kind.
 
-    What `calibrate` does to it does not depend on the samples: so whoever wraps it can be compared with whoever wraps
-    one that was calibrated before.
+    The effect of `calibrate` does not depend on the samples. A wrapper around this model can therefore be compared with
+    a wrapper around a model that was calibrated before.
 
     Attributes:
-        calibrated: 1 after `calibrate`, a buffer.
+        calibrated: Buffer that is 1 after `calibrate`, else 0.
     """
 
     calibrated: Tensor
@@ -46,7 +46,7 @@ class Plain(Predictor):
     def __init__(self, target: Target) -> None:
         super().__init__()
         self.target = target
-        self.dropout = nn.Dropout(0.1)  # for wrappers that need one
+        self.dropout = nn.Dropout(0.1)  # for wrappers that need a dropout layer
         self.layer = nn.Linear(LENGTH, numbers_about(target) + 1)
         self.register_buffer("calibrated", torch.zeros(()))
 
@@ -69,22 +69,25 @@ class Plain(Predictor):
     def calibrate(self, batches: Iterable[Batch]) -> None:
         rows = sum(
             len(batch["target"]) for batch in batches
-        )  # of batches that come only once, nothing is left
+        )  # batches that come only once are used up if they were read before
         self.calibrated.fill_(float(rows > 0))
 
 
 def wrapped(wrapper: Uncertainty) -> list[Plain]:
-    """Whatever is inside; none, where a wrapper keeps the parameters in another form."""
+    """Return the models inside the wrapper; none where it keeps their parameters in another form."""
     return [module for module in wrapper.modules() if isinstance(module, Plain)]
 
 
 def examine_wrapper(
     row: WrapperRow, build: Build, build_identity: Callable[[Callable[[], Predictor]], Uncertainty] | None
 ) -> Iterator[Finding]:
-    """Every property of one wrapper around `Plain`, fresh for each.
+    """Yield one finding for each property of a wrapper around `Plain`, new for each check.
 
     Args:
-        build_identity: builds it around a given model such that it must be that model; None where it cannot be.
+        row: Row of the contract.
+        build: Function that builds the row's wrapper for a target.
+        build_identity: Function that builds the wrapper around a given model such that it must equal that model; None
+            where it cannot.
     """
     from framework.testing.calibration import Calibration
 
@@ -111,7 +114,7 @@ def examine_wrapper(
     }
     calibration = Calibration(row, build)
     checks |= {name: (limit, check) for name, limit, check in calibration.checks()}
-    # of a mixture of densities it is the best of some candidates
+    # the mode of a mixture of densities is the best of some candidates
     limit = 1e-6 if row.target.kind == "class" else 0.2
     checks["mode"] = (limit, lambda worst: _of_densities(calibration.many, asked.mode_is_highest, worst))
     for name, limit, check in questions(row.target):
@@ -124,7 +127,7 @@ def examine_wrapper(
 
 
 def questions(target: Target) -> Iterator[tuple[str, float, asked.Check]]:
-    """What densities over the target are asked, of those in framework.testing.densities, with limits."""
+    """Yield name, limit and check of each property in framework.testing.densities that suits the target."""
     numbers = 0 if target.kind == "class" else len(target.names)
     yield "integral", 1e-5, asked.integral
     yield "samples follow log_prob", 5.0, asked.samples_follow_log_prob if numbers != 2 else _drawn_on_a_grid
@@ -141,7 +144,7 @@ def questions(target: Target) -> Iterator[tuple[str, float, asked.Check]]:
 
 
 def _drawn_on_a_grid(density: Distribution, worst: Worst) -> None:
-    """Of reals only where the grid resolves them: in the unit of the standardised target."""
+    """Check that draws follow log_prob; for reals only where the grid resolves the density."""
     broad = bool((density.mode.abs() < 10).all() and (density.entropy() > 0).all())
     if isinstance(density.support, Circular) or broad:
         asked.samples_follow_log_prob(density, worst)
@@ -150,7 +153,7 @@ def _drawn_on_a_grid(density: Distribution, worst: Worst) -> None:
 
 
 def in_units(target: Target) -> list[Target]:
-    """The target, and of reals the same in other units."""
+    """Return the target; for reals also the same target in other units."""
     if target.kind != "real":
         return [target]
     many = len(target.names)
@@ -159,19 +162,19 @@ def in_units(target: Target) -> list[Target]:
 
 
 def inputs(count: int, number: int = 0) -> Tensor:
-    """Seeded; another `number` gives others."""
+    """Return seeded inputs (count, LENGTH), which differ for each `number`."""
     return torch.randn(count, LENGTH, generator=torch.Generator().manual_seed(SEED + 100 * number))
 
 
 def batches(row: WrapperRow) -> list[Batch]:
-    """A small labelled validation set."""
+    """Return a small labelled validation set as batches."""
     target = values(row.target, (40,))
     parts = zip(inputs(40).split(16), target.split(16), strict=True)
     return [{"input": some, "target": labels} for some, labels in parts]
 
 
 def _on_one_device(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Losses, calibration, and all that its densities can be asked after it."""
+    """Check losses, calibration and every function of the densities after it for mixed devices."""
     from framework.testing.questions import every_question
 
     def questions(mode: OneDevice) -> Questions:
@@ -220,7 +223,7 @@ def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _number_types(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """float64 stays float64, before and after calibrate."""
+    """Check that float64 stays float64, before and after `calibrate`."""
     for kind in (torch.float32, torch.float64):
         wrapper = make().to(kind)
         typed = [
@@ -236,7 +239,7 @@ def _number_types(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Also after other inputs, and of two that were calibrated: a wrapper keeps nothing between calls."""
+    """Check that results repeat, also after other inputs and between two wrappers after the same calibration."""
     target = values(row.target, (5,))
 
     def everything(wrapper: Uncertainty) -> dict[str, Tensor]:
@@ -264,7 +267,7 @@ def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """What is said of row 2 does not change with the others, nor has its loss a gradient in them."""
+    """Check that results of row 2 do not change with other rows, and that its loss has no gradient in their inputs."""
     wrapper, target, given = make(), values(row.target, (5,)), inputs(5)
     other = torch.where(torch.arange(5).unsqueeze(-1) == 2, given, 1 - 3 * given)
     for what in ("as built", "calibrated"):
@@ -282,7 +285,7 @@ def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
                 answers["loss"] = wrapper.loss(some, target)
                 found.append({name: answer[2].double() for name, answer in answers.items()})
         for name, alone in found[0].items():
-            # quadratures of a batch share their nodes, and entropies may be of draws
+            # quadratures of a batch share their nodes, and an entropy may be estimated by draws
             least = 10.0 if name == "entropy" else 1.0
             error = (found[1][name] - alone).abs() / alone.abs().clamp(min=least)
             worst.see(error, f"{name} of row 2 where the others change, {what}")
@@ -294,7 +297,7 @@ def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _traces(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """What an answer must not touch: modes, buffers, parameters; calibrate keeps the modes."""
+    """Check that predictions change no training modes, buffers or parameters, and calibrate no modes."""
     target = values(row.target, (5,))
     for training in (True, False):
         wrapper = make().train(training)
@@ -316,7 +319,7 @@ def _traces(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _knobs(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Attributes that may be set at any time, their declared values ascending; the smallest two work."""
+    """Check that values of the knobs are in ascending order and that the smallest two can be set and work."""
     wrapper = make()
     worst.count(False, "none declared")
     for name, dial in wrapper.knobs.items():
@@ -341,7 +344,7 @@ def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _trains(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """A small step down the loss makes every model inside better; in evaluation, without dropout."""
+    """Check that a small step down the loss improves every model inside, in evaluation mode without dropout."""
     wrapper = make().double()
     given, target = inputs(64).double(), values(row.target, (64,))
     target = target.double() if target.is_floating_point() else target
@@ -366,7 +369,10 @@ def _trains(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _training_densities(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Of one model or of every member, by gradient; a mixture lies between its members at every value."""
+    """Check that training densities are of one model or of every member, and pass gradients to all models inside.
+
+    The log-density of a mixture must lie between those of its members at every value.
+    """
     wrapper, target = make(), values(row.target, (5,))
     density = wrapper.training_densities(inputs(5))
     worst.count(
@@ -389,10 +395,10 @@ def _training_densities(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _round_trip(make: Make, build: Make, row: WrapperRow, worst: Worst) -> None:
-    """What calibrate fitted is stored too."""
+    """Check that a stored wrapper gives the same bits, with all that `calibrate` fitted."""
     wrapper = make()
     wrapper.calibrate(batches(row))
-    seed(SEED + 7)  # so that a parameter which is not stored starts elsewhere
+    seed(SEED + 7)  # so that a parameter that is not stored has another value
     other = build().eval()
     other.load_state_dict(wrapper.state_dict())
     target = values(row.target, (5,))
@@ -404,7 +410,7 @@ def _round_trip(make: Make, build: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _calibration(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Does not train: parameters stay, and the densities after it are finite, on ordinary and on hopeless labels."""
+    """Check that `calibrate` keeps parameters and yields finite densities, for ordinary and identical labels."""
     for what, labelled in {"ordinary": batches(row), "all alike": _alike(row)}.items():
         wrapper = make()
         before = {name: parameter.clone() for name, parameter in wrapper.named_parameters()}
@@ -432,7 +438,7 @@ def _of_densities(
 def _identity(
     build_identity: Callable[[Callable[[], Predictor]], Uncertainty], row: WrapperRow, worst: Worst
 ) -> None:
-    """With the row's `identity` config the wrapper's density is the wrapped model's."""
+    """Check that a wrapper with the row's `identity` parameters equals the model that it wraps, to the last bit."""
     seed(SEED)
     member = Plain(row.target).eval()
     wrapper = build_identity(lambda: member).eval()
