@@ -1,1 +1,1 @@
-"""Files on this machine: the cache, and what is written whole or not at all."""
+"""Files on this machine: atomic writing, the cache, and safe readers for untrusted files."""

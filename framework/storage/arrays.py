@@ -1,4 +1,7 @@
-"""Reads NumPy's files, which may be damaged: nothing is allocated that a file does not bring, nothing is unpickled."""
+"""Readers for NumPy files that may be damaged.
+
+They allocate no more memory than the file's own bytes account for, and they never unpickle objects.
+"""
 
 import io
 import math
@@ -18,10 +21,10 @@ KINDS = "biufcUS"
 
 
 def array(content: bytes) -> NDArray:
-    """The numbers or texts of an .npy file.
+    """Return the array of numbers or texts that an .npy file stores.
 
     Raises:
-        ValueError: it is none, or damaged; objects and records are refused.
+        ValueError: The bytes are no .npy file, or are damaged, or hold Python objects or records.
     """
     stream = io.BytesIO(content)
     version = layout.read_magic(stream)
@@ -32,7 +35,7 @@ def array(content: bytes) -> NDArray:
         raise ValueError(
             f"an array of {shown(kind)} {shown(shape)}; wanted plain numbers or text, no objects"
         )
-    count, start = math.prod(shape), stream.tell()  # whole numbers of Python: nothing overflows
+    count, start = math.prod(shape), stream.tell()  # Python integers cannot overflow
     if count * kind.itemsize > len(content) - start:
         raise ValueError(
             f"an array of {kind} {shape} takes {count * kind.itemsize} bytes, but {len(content) - start} follow"
@@ -44,10 +47,10 @@ def array(content: bytes) -> NDArray:
 
 
 def real(values: object, what: str) -> NDArray:
-    """An array as float64, of complex numbers too if none has an imaginary part.
+    """Return an array as float64; complex numbers are accepted if every imaginary part is zero.
 
     Raises:
-        ValueError: some have; what a cast would drop without a word.
+        ValueError: A number has an imaginary part, which a cast would drop silently.
     """
     found = np.asarray(values)
     if found.dtype.kind == "c":
@@ -61,11 +64,11 @@ def real(values: object, what: str) -> NDArray:
 
 
 def archive(content: bytes, names: Collection[str] | None = None) -> dict[str, NDArray]:
-    """Those of the arrays of an .npz file that have one of these names, or all.
+    """Return the arrays of an .npz file by name: only those in `names`, or all where `names` is None.
 
     Raises:
-        ValueError: it unfolds to far more than it is, or an array as above.
-        Exception: what `zipfile` raises on damage.
+        ValueError: The file decompresses to far more bytes than it has, or `array` refuses one of its arrays.
+        Exception: `zipfile` raises several kinds for a damaged file.
     """
     if content.startswith(MAGIC):
         raise ValueError("it is a single array; name it .npy")
@@ -80,7 +83,7 @@ def archive(content: bytes, names: Collection[str] | None = None) -> dict[str, N
             if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError(f"{shown(name)} is compressed by method {part.compress_type}")
             with packed.open(part) as stream:
-                # so many bytes: asked for all, zipfile would first unfold whatever there is
+                # the size is given because zipfile would otherwise decompress everything, however much it is
                 content = stream.read(part.file_size)
             try:
                 found[name] = array(content)

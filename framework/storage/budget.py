@@ -1,10 +1,12 @@
-"""Stops what builds or runs a model of a stranger's description before it allocates more than the file accounts for.
+"""Limit on the memory that building or running a model from an untrusted checkpoint may allocate.
 
-A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. That the weights do not fit is found when they are
-copied into the model, which must be built first. Here every operation of torch is looked at before it runs: what it
-would allocate is computed from shapes alone, and an error ends the building while the memory is still free.
+A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. A mismatch of the weights is found only when they
+are copied into the model, and by then the model has been built. The limit therefore inspects every operation of torch
+before it runs. It computes the size of the result from shapes alone, and raises an error while the memory is still
+free.
 
-The sizes have formulas here. torch computes shapes too, on its device "meta", but imports its compiler for some, 0.9 s.
+The sizes are computed by formulas in this module. torch can compute shapes on its device "meta", but for some
+operations that imports its compiler, which takes 0.9 s.
 """
 
 import math
@@ -24,15 +26,15 @@ from framework.storage import limits
 
 
 class Budget(TorchDispatchMode):
-    """While it is active, operations of torch allocate so much, and no more.
+    """Context in which the operations of torch may allocate a limited number of bytes.
 
     Args:
-        path: the checkpoint, for the message.
-        most_bytes: of what is allocated and not freed.
-        most_calls: operations of torch.
+        path: Path of the checkpoint, for the error message.
+        most_bytes: Largest number of bytes that may be allocated and not yet freed.
+        most_calls: Largest number of operations of torch.
 
     Raises:
-        CheckpointError: an operation would allocate more; it was not run.
+        CheckpointError: An operation would exceed one of the limits; it was not run.
     """
 
     def __init__(self, path: str, most_bytes: int, most_calls: int | float = math.inf) -> None:
@@ -42,7 +44,7 @@ class Budget(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # torch would import its compiler, 0.9 s, to leave alone what nobody compiles
+        return False  # otherwise torch imports its compiler (0.9 s), although nothing is compiled
 
     def __torch_dispatch__(
         self,
@@ -76,7 +78,7 @@ class Budget(TorchDispatchMode):
 
 
 def building(path: str, weights: Iterable[Tensor]) -> Budget:
-    """What a model that has these weights may take while it is built and filled."""
+    """Return the budget of a model with these weights while it is built and its weights are copied into it."""
     held = list(weights)
     return Budget(
         path,
@@ -86,7 +88,7 @@ def building(path: str, weights: Iterable[Tensor]) -> Budget:
 
 
 def predicting(path: str, weights: Iterable[Tensor], inputs: Tensor) -> Budget:
-    """What a model that has these weights may take for these inputs."""
+    """Return the budget of a model with these weights while it predicts from these inputs."""
     accounted = stored_bytes(weights) + inputs.numel() * max(inputs.element_size(), 4)
     rows = len(inputs) if inputs.dim() else 1
     most = limits.PREDICTING_BYTES + limits.PREDICTING_ROW * rows + limits.PREDICTING_TIMES * accounted
@@ -94,7 +96,7 @@ def predicting(path: str, weights: Iterable[Tensor], inputs: Tensor) -> Budget:
 
 
 def stored_bytes(tensors: Iterable[Tensor]) -> int:
-    """Bytes of memory that tensors hold; what several share, or one repeats, counts once."""
+    """Return the bytes of memory that tensors hold; storage that several tensors share or repeat counts once."""
     storages = {
         storage.data_ptr(): storage.nbytes()
         for storage in (one.untyped_storage() for one in tensors if one.layout is torch.strided)
@@ -103,10 +105,10 @@ def stored_bytes(tensors: Iterable[Tensor]) -> int:
 
 
 def result_bytes(func: Any, args: tuple[Any, ...], given: Mapping[str, Any]) -> int:
-    """What an operation allocates for its result, in bytes, computed before it runs.
+    """Return the bytes that an operation will allocate for its result.
 
-    Operations without a formula count as much as they are given: their results are no larger, or their shapes hang on
-    numbers.
+    An operation without a formula counts as many bytes as its arguments. Its result is no larger than they are, or the
+    shape of the result depends on the values of the arguments.
     """
     operation = _operation(func)
     if not operation.allocates:
@@ -126,12 +128,12 @@ def result_bytes(func: Any, args: tuple[Any, ...], given: Mapping[str, Any]) -> 
         if "size" in called and operation.name not in _SAME_SIZE:
             return width * math.prod(map(int, called["size"]))
     except (ArithmeticError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
-        pass  # wrong arguments: the operation itself says so
+        pass  # the arguments are wrong, and the operation itself raises the error
     return width * sum(one.numel() for one in tensors)
 
 
 class _Operation(NamedTuple):
-    """What `result_bytes` needs to know of an operation of torch."""
+    """Properties of an operation of torch that `result_bytes` reads."""
 
     name: str
     arguments: tuple[str, ...]
@@ -142,7 +144,7 @@ class _Operation(NamedTuple):
 
 @cache
 def _operation(func: Any) -> _Operation:
-    """Read the schema of an operation, once: every operation of every prediction is looked at."""
+    """Return the properties of an operation, cached because every operation of every prediction is inspected."""
     schema = func._schema
     formula = _FORMULAS.get(schema.name.removeprefix("aten::"))
     return _Operation(
@@ -155,7 +157,7 @@ def _operation(func: Any) -> _Operation:
 
 
 def _tensors(values: Iterable[Any]) -> list[Tensor]:
-    """Return the tensors among arguments and in their lists; operations of torch nest no deeper."""
+    """Return the tensors among the arguments and in lists among them; arguments of torch operations nest no deeper."""
     found = []
     for value in values:
         if isinstance(value, Tensor):
@@ -248,4 +250,7 @@ _FORMULAS: dict[str, Callable[[Mapping[str, Any]], int | float]] = {
     "diag_embed": lambda called: called["self"].numel() * called["self"].shape[-1],
     "histc": lambda called: called["bins"],
 }
-"""Numbers of the results of operations that give more than they are given, by their names in torch."""
+"""Formulas for the number of elements in the result of operations that can return more than their arguments hold.
+
+The keys are the names of the operations in torch.
+"""

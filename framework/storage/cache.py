@@ -1,4 +1,4 @@
-"""Where generated data is kept between runs."""
+"""Location of the cache, which keeps generated data between runs."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,12 @@ from framework.errors import DataError
 
 
 def folder(name: str) -> Path:
-    """The cache folder `name`, under FRAMEWORK_CACHE, else XDG_CACHE_HOME, else ~/.cache; made if missing.
+    """Return the cache folder `name`, and create it if it is missing.
+
+    It lies under FRAMEWORK_CACHE if that variable is set, else under XDG_CACHE_HOME, else under ~/.cache.
 
     Raises:
-        DataError: it cannot be made.
+        DataError: The folder cannot be created.
     """
     root = os.environ.get("FRAMEWORK_CACHE")
     if not root:

@@ -1,4 +1,7 @@
-"""Checkpoints that are whole or absent: written aside, synced, renamed; verified before they are read."""
+"""Checkpoint files that are whole or absent.
+
+A checkpoint is written to a temporary file, synced to disk and renamed, and it is verified before it is read.
+"""
 
 import hashlib
 import os
@@ -18,9 +21,9 @@ from framework.storage.plain_tensors import load, require_admitted_pickles, requ
 from framework.storage.plain_values import Foreign
 from framework.storage.reading import opened
 
-# A checkpoint is what `torch.save` writes (`torch.load` reads it as ever), then this mark and the SHA-256 of
-# all before it. The checksums inside torch's zip would not do: they leave out its directory, where a flipped
-# bit can make torch 2.13 return uninitialised memory for a tensor.
+# A checkpoint is the output of `torch.save` (which `torch.load` can still read), followed by this mark and the
+# SHA-256 of everything before the mark. The checksums inside torch's zip do not suffice: they leave out the zip
+# directory, where a flipped bit can make torch 2.13 return uninitialised memory for a tensor.
 MARK = b"\nsha256 of above:"
 TRAILER = len(MARK) + hashlib.sha256().digest_size
 
@@ -28,11 +31,11 @@ TRAILER = len(MARK) + hashlib.sha256().digest_size
 def write(checkpoint: Mapping[str, Any], path: Path) -> None:
     """Write a tree of dicts, lists, tuples, plain values and tensors, whole or not at all.
 
-    Holds across SIGKILL and power loss: the bytes are on disk before the name points at them.
+    This holds across SIGKILL and power loss, because the bytes are on disk before the file gets its name.
 
     Raises:
-        CheckpointError: the disk has no room (nothing was written), or the contents are not plain values;
-            the file that was there before is untouched.
+        CheckpointError: The disk has too little room (nothing was written), or the contents are not plain values.
+            A file that was there before is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent)
@@ -47,7 +50,7 @@ def write(checkpoint: Mapping[str, Any], path: Path) -> None:
                 file.write(MARK + hashed.digest.digest())
             _require_plain(partial, path, checkpoint)
     except (OSError, RuntimeError) as error:
-        # torch fails once more when it closes a file that took no more
+        # after a failed write, torch raises a second error when it closes the file
         fault = error if isinstance(error, OSError) else error.__context__
         if isinstance(fault, OSError) and full(fault):
             raise _no_room(path, needed) from fault
@@ -55,11 +58,11 @@ def write(checkpoint: Mapping[str, Any], path: Path) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint, on the CPU, after all its bytes passed the checksum.
+    """Return the contents of a checkpoint, with tensors on the CPU, after its bytes passed the checksum.
 
     Raises:
-        CheckpointError: missing, empty, cut, damaged, or holding anything but plain values. The message names
-            the newest whole checkpoint beside it, where there is one.
+        CheckpointError: The file is missing, empty, cut short or damaged, or holds anything but plain values. The
+            message names the newest whole checkpoint in the same folder, if there is one.
     """
     if not path.is_file():
         raise CheckpointError(f"There is no checkpoint {path}. {_remedy(path)}")
@@ -80,14 +83,14 @@ def read(path: Path) -> dict[str, Any]:
                 f"The checkpoint {path} holds more than dicts, lists, numbers, strings and dense tensors, namely "
                 f"{named}, which could run code or harm. This framework did not write it: do not use it."
             ) from None
-        except Exception as error:  # its checksum is right and its content is not: torch raises a dozen kinds
+        except Exception as error:  # with a correct checksum and wrong contents, torch raises a dozen kinds
             raise CheckpointError(
                 f"The checkpoint {path} cannot be used: {shown(error)}. {_remedy(path)}"
             ) from error
 
 
 def _require_unfolded(file: BinaryIO) -> None:
-    """Refuse parts that are compressed: torch does not write such, and a small file could take any memory by them."""
+    """Refuse compressed parts, which torch never writes and which let a small file decompress to any size."""
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
         size = os.fstat(file.fileno()).st_size
@@ -96,13 +99,21 @@ def _require_unfolded(file: BinaryIO) -> None:
 
 
 def verify(path: Path) -> str | None:
-    """What is wrong with a checkpoint file, as a clause, or None. Reads it once and unpickles nothing."""
+    """Return what is wrong with a checkpoint file as a clause, or None where it is whole.
+
+    The file is read once, and nothing is unpickled.
+    """
     with path.open("rb") as file:
         return _fault(file)
 
 
 def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | None:
-    """The most recently written checkpoint of a folder that verifies; of these `names` only, where given."""
+    """Return the most recently written checkpoint of a folder that passes `verify`, or None.
+
+    Args:
+        folder: Folder that holds the checkpoints.
+        names: File names to consider, or None for all.
+    """
     files = [
         path
         for path in folder.glob("*.ckpt")
@@ -137,22 +148,24 @@ def _remedy(path: Path) -> str:
 
 
 class _Hashed:
-    """The part of a file that `torch.save` writes to, and the checksum of what it wrote."""
+    """Output file for `torch.save` that also computes the checksum of the bytes written to it."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file = file
         self.digest = hashlib.sha256()
 
     def write(self, data: bytes | memoryview) -> int:
+        """Write bytes and add them to the checksum."""
         self.digest.update(data)
         return self.file.write(data)
 
     def flush(self) -> None:
+        """Flush the file."""
         self.file.flush()
 
 
 def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse what `read` would not give back."""
+    """Refuse contents that `read` would refuse to return."""
     try:
         with partial.open("rb") as file:
             require_admitted_pickles(file)
@@ -174,7 +187,7 @@ def _no_room(path: Path, needed: int) -> CheckpointError:
 
 
 def _bytes_needed(checkpoint: object) -> int:
-    """An upper estimate of the file's size: each storage and text once, and what pickle and zip add."""
+    """Return an upper estimate of the file's size in bytes: each storage and text once, and what pickle and zip add."""
     needed = 8192
     seen: set[int] = set()
     stack: list[Any] = [checkpoint]
@@ -184,7 +197,7 @@ def _bytes_needed(checkpoint: object) -> int:
         if not isinstance(item, Tensor | Mapping | list | tuple | set | str | bytes):
             continue
         if isinstance(item, Tensor) and item.layout is not torch.strided:
-            continue  # has no storage of its own to ask; a disk that fills up is met when it does
+            continue  # it has no storage whose size could be read; a disk that fills up is handled when that happens
         identity = item.untyped_storage().data_ptr() if isinstance(item, Tensor) else id(item)
         if identity in seen:
             needed += 128

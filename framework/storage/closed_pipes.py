@@ -1,4 +1,4 @@
-"""Streams whose reader may end first, as in `... | head`: what is written to nobody is dropped."""
+"""Output streams whose reader may end first, as in `... | head`; later output is then dropped."""
 
 import io
 import os
@@ -10,13 +10,14 @@ from typing import Any, final
 
 @final
 class DroppingWriter(io.FileIO):
-    """A pipe or socket that is written to as long as somebody reads it.
+    """Writer to a pipe or socket that drops the output once no process reads it any more.
 
-    Then its descriptor becomes that of the null device, so that child processes lose nothing but their output, too.
+    At that moment its file descriptor is redirected to the null device. Child processes, which inherit the descriptor,
+    then lose their output as well but do not fail.
     """
 
     def write(self, data: Any, /) -> int | None:
-        """Write, or drop where nobody reads any more."""
+        """Write the data, or drop it where no process reads the stream any more."""
         try:
             return super().write(data)
         except (BrokenPipeError, ConnectionResetError):
@@ -27,7 +28,7 @@ class DroppingWriter(io.FileIO):
 
 
 def survive_closed_pipes() -> None:
-    """Let this process go on where the reader of its output ends: a training is not over when `head` is."""
+    """Let this process continue after the reader of its output has ended, so that `| head` does not end a training."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper) and _is_pipe(stream):
@@ -45,7 +46,7 @@ def survive_closed_pipes() -> None:
 
 
 def _is_pipe(stream: io.TextIOWrapper) -> bool:
-    """Return whether a stream leads to another process: files and terminals have no reader that ends."""
+    """Return whether a stream is a pipe or socket; files and terminals have no reader that could end."""
     try:
         mode = os.fstat(stream.fileno()).st_mode
     except (OSError, ValueError):

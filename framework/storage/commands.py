@@ -1,4 +1,4 @@
-"""Runs the `main` of a command beside `python -m framework`: errors are sentences, and `| head` ends nothing."""
+"""Start of the commands other than `python -m framework`: errors become sentences, and `| head` does not end them."""
 
 import sys
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from framework.storage.files import unwritable
 def run_command(main: Callable[[list[str]], object]) -> None:
     """Call `main` with the arguments of this process.
 
-    The process exits with 0, 1 (refused or failed) or 130 (interrupted); argparse exits with 2. Where the reader of its
-    output ends, as in `... | head -1`, the rest of the output is dropped and the command goes on.
+    The process exits with 0, 1 (refused or failed) or 130 (interrupted); argparse exits with 2. If the reader of the
+    output ends, as in `... | head -1`, the rest of the output is dropped and the command continues.
     """
     survive_closed_pipes()
     try:

@@ -1,8 +1,9 @@
-"""Run folders that may be a stranger's: plain files inside the folder, opened without following a link.
+"""Safe access to run folders from untrusted sources: only plain files inside the folder are opened, never links.
 
-A folder that somebody sends can hold a symbolic or a hard link, a pipe or a device in place of any file. Whoever
-followed it would read, change or cut off a file of the user, or wait for ever. So a command calls `require_enclosed`
-before it uses a folder, and opens single files through `open_plain`, `read_plain` or `require_plain_within`.
+A folder from somebody else can hold a symbolic or a hard link, a pipe or a device in place of any file. A program that
+followed such an entry would read, change or truncate a file of the user, or wait for ever. A command therefore calls
+`require_enclosed` before it uses a folder, and opens single files through `open_plain`, `read_plain` or
+`require_plain_within`.
 """
 
 import os
@@ -13,21 +14,22 @@ from typing import BinaryIO
 from framework.errors import DataError, UserError, shown
 
 MOST_ENTRIES = 1_000_000
-"""Files and folders that a run or sweep folder may hold; more are not looked through."""
+"""Largest number of files and folders in a run or sweep folder; a folder with more is refused."""
 REMEDY = "A run folder may be a stranger's, so no link in it is followed. Replace it by a copy or remove it."
 
 
 def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
-    """Refuse a folder that holds anything but folders and plain files of its own; one that does not exist passes.
+    """Refuse a folder that holds anything but folders and plain files; a folder that does not exist passes.
 
-    The folder itself may be a link: its name comes from the user.
+    The folder itself may be a link, because its name comes from the user.
 
     Args:
-        folder: of a run, a sweep, or what another command writes into.
-        error: class of the error.
+        folder: Folder of a run or a sweep, or another folder that a command writes into.
+        error: Class of the error.
 
     Raises:
-        error: an entry is a link, has a second name elsewhere (a hard link), or is no regular file; names the first.
+        error: An entry is a link, has a second name elsewhere (a hard link), or is no regular file. The message names
+            the first such entry.
     """
     if not folder.exists():
         return
@@ -58,7 +60,11 @@ def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
 
 
 def require_plain_within(file: Path, folder: Path, error: type[UserError] = DataError) -> None:
-    """Refuse a file below `folder` that a link leads to; errors as `require_enclosed`. A missing file passes."""
+    """Refuse a file whose path below `folder` contains a link; a missing file passes.
+
+    Raises:
+        error: The file or a folder on its path is an entry that `require_enclosed` refuses.
+    """
     below = file.relative_to(folder)
     for part in (*reversed(below.parents[:-1]), below):
         path = folder / part
@@ -71,17 +77,17 @@ def require_plain_within(file: Path, folder: Path, error: type[UserError] = Data
 
 
 def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
-    """Open a file of a run folder as `os.open` does, but never through a link; the descriptor.
+    """Open a file of a run folder as `os.open` does, but never through a link, and return the descriptor.
 
-    `flags` never hold O_TRUNC, which would cut off a file before it is known whose it is.
+    `flags` must not contain O_TRUNC, which would truncate a file before it is known to be one of the folder's own.
 
     Raises:
-        DataError: it is a link, has a second name elsewhere, or is no regular file.
-        OSError: as `os.open`.
+        DataError: The entry is a link, has a second name elsewhere (a hard link), or is no regular file.
+        OSError: `os.open` cannot open it.
     """
     assert not flags & os.O_TRUNC
     try:
-        # without O_NONBLOCK the opening of a pipe would wait for its other end
+        # without O_NONBLOCK, opening a pipe would wait for its other end
         descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode)
     except OSError:
         if path.is_symlink():
@@ -94,16 +100,16 @@ def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
 
 
 def read_stream(path: Path) -> BinaryIO:
-    """Open a file of a run folder for reading; errors as `open_plain`, and whoever asks closes it."""
+    """Open a file of a run folder for reading; the caller closes it. Raises the errors of `open_plain`."""
     return os.fdopen(open_plain(path, os.O_RDONLY), "rb")
 
 
 def read_plain(path: Path, most: int) -> bytes:
-    """Return all of a file of a run folder.
+    """Return the whole content of a file of a run folder.
 
     Raises:
-        DataError: as `open_plain`, or it has more than `most` bytes.
-        OSError: as `os.open`.
+        DataError: `open_plain` refuses the file, or it has more than `most` bytes.
+        OSError: `os.open` cannot open it.
     """
     with read_stream(path) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -115,7 +121,7 @@ def read_plain(path: Path, most: int) -> bytes:
 
 
 def _fault(status: os.stat_result) -> str:
-    """What an entry is that it may not be; empty for a folder or a plain file."""
+    """Return what kind of forbidden entry a status describes; an empty text for a folder or a plain file."""
     if stat.S_ISLNK(status.st_mode):
         return "a link"
     if stat.S_ISDIR(status.st_mode):

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and locks between processes."""
+"""Atomic writing of files, which are whole or absent afterwards, and locks between processes."""
 
 import errno
 import fcntl
@@ -30,12 +30,12 @@ _CLOSED = (
 
 
 def full(error: OSError) -> bool:
-    """Whether a disk has no more room, or its user may use no more."""
+    """Return whether an error says that the disk is full or the user's quota is used up."""
     return error.errno in _FULL
 
 
 def unwritable(error: BaseException) -> str | None:
-    """What is wrong with a place that takes nothing, and what to do, as a sentence; None for any other error."""
+    """Return a sentence on why a place cannot be written and what to do; None for an error of another kind."""
     if not isinstance(error, OSError) or not (error.errno in (*_FULL, *_CLOSED) or _unmade(error)):
         return None
     where = f"{error.filename} cannot be written" if error.filename else "A file cannot be written"
@@ -44,19 +44,20 @@ def unwritable(error: BaseException) -> str | None:
 
 
 def _unmade(error: OSError) -> bool:
-    """Return whether a folder could not be made; /proc, say, then says that there is no such file."""
+    """Return whether an error comes from creating a folder; /proc, for example, then reports "no such file"."""
     frames = [frame.f_code.co_name for frame, _ in walk_tb(error.__traceback__)]
     return error.errno == errno.ENOENT and frames[-1:] == ["mkdir"]
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write; it takes that name, its bytes synced, when the block ends without an error.
+    """Yield a temporary path beside `path`; if the block ends without an error, that file is synced and renamed to it.
 
-    A crash, SIGKILL or power cut leaves the old file or the new one; an error leaves the old one. Its folder is made.
+    A crash, SIGKILL or power cut leaves either the old file or the new one; an error leaves the old one. The folder of
+    `path` is created if it is missing.
 
     Raises:
-        OSError: there is no room, or no right to write.
+        OSError: There is no room on the disk, or no permission to write.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(
@@ -72,24 +73,24 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Replace a file by `content`, on the disk when this returns; see `replacing`."""
+    """Replace a file by `content` atomically, as `replacing` does; the bytes are on disk when this returns."""
     with replacing(path) as partial:
         partial.write_bytes(content)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what processes of this machine that are no more began to write in `folder`."""
+    """Delete temporary files of `replacing` in `folder` that ended processes of this machine have left."""
     for partial in folder.glob(f".*.{socket.gethostname()}.*.partial"):
         try:
             os.kill(int(partial.suffixes[-2][1:]), 0)
         except ProcessLookupError:
             partial.unlink(missing_ok=True)
         except (PermissionError, ValueError):
-            continue  # the process lives, under another user; or the name is none of ours
+            continue  # the process still runs under another user, or the file is not one of `replacing`
 
 
 def sync(path: Path) -> None:
-    """Ask the disk for a file's bytes, or for the names in a folder."""
+    """Force a file's bytes, or the names in a folder, onto the disk (fsync)."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -98,11 +99,11 @@ def sync(path: Path) -> None:
 
 
 def lock_within(descriptor: int, seconds: float) -> None:
-    """Take the POSIX record lock of a file, which is this process's alone until it closes any descriptor of the file.
+    """Take the POSIX record lock of a file; this process holds it until it closes any descriptor of that file.
 
     Raises:
-        BlockingIOError, PermissionError: after so many seconds another process still holds it.
-        OSError: the file system has no locks.
+        BlockingIOError, PermissionError: Another process still holds the lock after `seconds`.
+        OSError: The file system has no locks.
     """
     deadline = time.monotonic() + seconds
     while True:
@@ -116,10 +117,10 @@ def lock_within(descriptor: int, seconds: float) -> None:
 
 @contextmanager
 def alone(path: Path) -> Iterator[None]:
-    """Hold the lock `path`; waits for other processes and threads. It ends with the process, whatever ends that.
+    """Hold the lock file `path` during the block, after waiting for other processes and threads.
 
-    A file system without `flock` (Lustre and NFS as some mount them) gets a POSIX record lock, and one without either
-    a warning.
+    The lock is released when the process ends, in whatever way it ends. A file system without `flock` (some mounts of
+    Lustre and NFS) gets a POSIX record lock; on a file system without either, a warning is logged.
     """
     lock = FileLock(path, thread_local=False)
     try:
@@ -137,13 +138,13 @@ def alone(path: Path) -> Iterator[None]:
 
 
 def unlockable(error: BaseException) -> bool:
-    """Return whether a file system has no such locks."""
+    """Return whether an error says that the file system does not support the lock."""
     return isinstance(error, NotImplementedError) or (isinstance(error, OSError) and error.errno in _NO_LOCKS)
 
 
 @contextmanager
 def _alone_by_record(path: Path) -> Iterator[None]:
-    with _THREADS:  # a record lock is the whole process's
+    with _THREADS:  # a record lock belongs to the whole process, so threads need a lock of their own
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             try:
@@ -158,6 +159,6 @@ def _alone_by_record(path: Path) -> Iterator[None]:
 
 
 def warn_unlocked(path: Path, error: BaseException) -> None:
-    """Say that nothing keeps other processes away."""
+    """Log a warning that no lock keeps other processes away from the folder of `path`."""
     why = error.strerror if isinstance(error, OSError) else error
     _log.warning("%s: no locks on this file system (%s); let one command at a time use it.", path.parent, why)

@@ -1,13 +1,13 @@
-"""Which of the processes that train together writes files and speaks."""
+"""Choice of the process that writes files and prints, where several processes train together."""
 
 import os
 
 
 def first_rank() -> bool:
-    """Whether this process keeps the run's record: the only one, or the first of several that train together.
+    """Return whether this process keeps the run's record: it is the only one, or rank 0 of those that train together.
 
-    A launcher (Lightning, torchrun, srun) says which rank this is and of how many. A rank without a number of ranks is
-    somebody else's variable.
+    A launcher (Lightning, torchrun, srun) sets the rank and the number of ranks in the environment. A rank without a
+    number of ranks was set by another program and is ignored.
     """
     for rank, ranks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS")):
         if rank in os.environ and os.environ.get(ranks, "1") != "1":

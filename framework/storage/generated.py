@@ -1,4 +1,4 @@
-"""Generated data in the cache: written whole or not at all, by one process at a time, and marked as synthetic."""
+"""Generated data sets in the cache: written whole or not at all, by one process at a time, and marked as synthetic."""
 
 import json
 import shutil
@@ -14,17 +14,19 @@ from framework.storage.progress import tracked
 
 MARK = "synthetic.json"
 PAINTERS = 2
-"""Threads that draw at once."""
+"""Number of threads that draw files at the same time."""
 
 
 def generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> Path:
-    """The generated `root` itself; written now unless it is there.
+    """Return the folder `root` of generated data, after writing it if it does not exist.
 
-    `write` fills an empty folder, which takes its place when it is whole. `mark` holds everything the content
-    depends on, as JSON values; it is kept beside the content in `synthetic.json`.
+    Args:
+        root: Folder of the generated data.
+        mark: Everything that the content depends on, as JSON values; stored beside the content in `synthetic.json`.
+        write: Function that fills an empty folder, which is renamed to `root` when it is complete.
 
     Raises:
-        DataError: the cache cannot be written, or holds something else in its place.
+        DataError: The cache cannot be written, or `root` holds data with another mark.
     """
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
@@ -45,10 +47,10 @@ def generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]
 
 
 def read_mark(root: Path) -> dict[str, Any] | None:
-    """What `synthetic.json` says of a root; None where there is none: the data are real.
+    """Return the content of `synthetic.json` in a folder, or None where there is no such file: the data are recorded.
 
     Raises:
-        DataError: the file cannot be read.
+        DataError: The file cannot be read.
     """
     if not (root / MARK).exists():
         return None
@@ -56,7 +58,7 @@ def read_mark(root: Path) -> dict[str, Any] | None:
 
 
 def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
-    """Call `draw` with 0 … count - 1, some at once; `what` is drawn."""
+    """Call `draw` with 0 … count - 1, in several threads; `what` names the result in the progress report."""
     with ThreadPoolExecutor(PAINTERS) as painters:
         try:
             for _ in tracked(painters.map(draw, range(count)), f"drawing {what}", count, "files"):
@@ -68,7 +70,9 @@ def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
 
 def _write(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> None:
     part = root.with_name(f".{root.name}.part")
-    shutil.rmtree(part, ignore_errors=True)  # of a process that was killed: the lock is ours
+    shutil.rmtree(
+        part, ignore_errors=True
+    )  # left by a process that was killed, because this one holds the lock
     try:
         part.mkdir()
         write(part)

@@ -1,4 +1,4 @@
-"""Compiled functions that are kept on disk, and made anew where a file that has part in them has changed."""
+"""Compiled functions that are cached on disk, and compiled again where one of their source files has changed."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -13,9 +13,11 @@ from framework.storage.cache import folder
 
 
 def kept_in(name: str, sources: Iterable[Path]) -> str | None:
-    """A folder of these sources' own, since numba looks for changes in a function's file but not in what it calls.
+    """Return the cache folder for functions that are compiled from these source files.
 
-    Below NUMBA_CACHE_DIR, else the framework's cache; None where that cannot be written: then every process compiles.
+    Its name contains a hash of all the sources, because numba notices changes in a function's own file but not in the
+    files of the functions that it calls. The folder lies below NUMBA_CACHE_DIR if that is set, else in the framework's
+    cache. None is returned where it cannot be written; then every process compiles.
     """
     digest = sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()[:16]
     try:
@@ -29,14 +31,19 @@ def kept_in(name: str, sources: Iterable[Path]) -> str | None:
 
 
 def compiler(place: str | None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator: compiled for this processor at the first call, kept in a folder of `kept_in`.
+    """Return a decorator that compiles a function for this processor at its first call.
 
-    Without bounds checks or the GIL; real numbers as IEEE 754 has them, unless `options` of numba.njit say otherwise.
+    The compiled function has no bounds checks, releases the GIL, and computes as IEEE 754 prescribes unless `options`
+    say otherwise.
+
+    Args:
+        place: Folder from `kept_in` that keeps the compiled function, or None to keep it in memory only.
+        options: Further options of `numba.njit`.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
         before = vars(config)["CACHE_DIR"]
-        vars(config).update(CACHE_DIR=place or before)  # type: ignore[reportAttributeAccessIssue]  # read here and now
+        vars(config).update(CACHE_DIR=place or before)  # type: ignore[reportAttributeAccessIssue]  # njit reads it immediately
         try:
             return njit(nogil=True, error_model="numpy", cache=place is not None, **options)(function)
         finally:

@@ -1,102 +1,112 @@
-"""The table of limits: what a stranger's file may make this program take. Every reader takes its bounds from here.
+"""Limits on the memory and time that an untrusted file can make this program use; every reader takes its limits here.
 
-A bound is checked before anything is allocated. Most are far above what sound files need, and low enough that a file of
-a few megabytes ends in less than 1 GB and 5 s, in a model or in a sentence.
+A limit is checked before anything is allocated. Most limits are far above what valid files need. They are low enough
+that reading a file of a few megabytes takes less than 1 GB and 5 s, whether it succeeds or ends with an error message.
 """
 
-# what a checkpoint describes
+# models that a checkpoint describes
 
 BUILDING_TIMES, BUILDING_BYTES = 8, 2**27
-"""Memory that building a stored model may hold: so many times its weights, and so many bytes beside.
+"""Memory that building a stored model may hold: this multiple of the size of its weights, plus this number of bytes.
 
-Members that are laid side by side are allocated twice, orthogonal first weights three times; bases of point sets and
-tables of constants need no weights.
+Members that are stacked are allocated twice, and orthogonal initial weights three times. Bases of point sets and tables
+of constants take memory although they have no weights.
 """
 CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 10_000
-"""Operations of torch for building a stored model: so many for each tensor of its weights, and so many beside.
+"""Operations of torch for building a stored model: this number for each tensor of its weights, plus this number.
 
-A layer takes about ten; the second number takes less than a second.
+A layer takes about ten operations; the second number of operations takes less than a second.
 """
 PREDICTING_TIMES, PREDICTING_BYTES, PREDICTING_ROW = 8, 2**27, 2**26
-"""Memory that the first prediction of a stored model may hold: so many times its weights and inputs, so many bytes
-beside, and so many for each sample, an occupancy grid of side 256 say.
+"""Memory that the first prediction of a stored model may hold.
+
+It is this multiple of the size of weights and inputs, plus this number of bytes, plus this number of bytes for each
+sample (for an occupancy grid of side 256, for example).
 """
 SMALL_RESULT = 2**17
-"""Numbers, or bytes, of a result that nobody counts: its size is not computed before it is there."""
+"""Size, in bytes, up to which the result of an operation is not counted."""
 MOST_INPUT = 2**24
-"""Numbers of one input, or of one target, that a checkpoint may describe: an image of 2,364 × 2,364 in colour.
+"""Largest number of elements of one input or target in a checkpoint: a colour image of 2,364 × 2,364 pixels.
 
-A user's file of any size is scaled to an input of this size, so that it is the checkpoint that asks for the memory.
+An image file of any size is scaled to the size that the checkpoint states, so the checkpoint determines the memory.
 """
 MOST_SIDES = 8
-"""Dimensions of one input."""
+"""Largest number of dimensions of one input."""
 MOST_NAMES, LONGEST_NAME = 100_000, 1000
-"""Names of numbers, classes or columns in a checkpoint, and letters of one."""
+"""Largest number of names of targets, classes or columns in a checkpoint, and of characters in one name."""
 MOST_DRAWS = 2**17
-"""Samples of a density that a stored setting may ask for; the usual number is 1000."""
+"""Largest number of samples of a density that a stored setting may ask for; the usual number is 1000."""
 MOST_DRAWN = 2**26
-"""Numbers that all of them together may be, of one density; up to 1000 samples may be of any density."""
+"""Largest number of elements in all samples of one density together; up to 1000 samples may be drawn in any case."""
 
 # compressed files
 
 UNFOLDED_BYTES, UNFOLDED_TIMES = 2**27, 20
-"""A compressed file may unfold to the larger of so many bytes, and so many times its size."""
+"""A compressed file may decompress to this number of bytes or this multiple of its size, whichever is larger."""
 
 # images
 
 MOST_PIXELS, LONGEST_SIDE = 2**25 + 2**24, 2**16
-"""Of an image as it is stored: 8,688 × 5,792, a camera's of 50 megapixels. Decoded, Pillow holds 4 bytes for each; with
-alpha, or where its square is padded, it is there twice.
+"""Largest number of pixels of a stored image (8,688 × 5,792, from a camera of 50 megapixels), and of its longer side.
+
+Pillow holds 4 bytes for each decoded pixel. An image with an alpha channel, or one that is padded to a square, is held
+twice.
 """
 MOST_PIXELS_OF = {"WEBP": 2**25, "JPEG2000": 2**25, "AVIF": 2**25}
-"""Of formats whose decoders hold the image two or three times beside."""
+"""Largest number of pixels in formats whose decoders hold two or three further copies of the image."""
 MOST_PADDED = 2**26
-"""Pixels of a square; where one that must be padded has more, it is scaled down before."""
+"""Largest number of pixels of an image padded to a square; a larger one is scaled down before the padding."""
 AT_ONCE = 2**25
-"""Pixels of images that several threads decode at the same time."""
+"""Largest number of pixels of all images that several threads decode at the same time."""
 
 # meshes and point clouds
 
 MOST_ANNOUNCED = 2**31
-"""Vertices or faces that a header may announce; more is damage."""
+"""Largest number of vertices or faces that a header may announce; a larger number means that the file is damaged."""
 MOST_COLUMNS = 1000
-"""Numbers that a vertex may have."""
+"""Largest number of values of a vertex."""
 MOST_NUMBERS = 2**24
-"""Numbers that a compressed archive of points or of a body may unfold to, or as many as it has bytes; each takes 8
-bytes when it is read.
+"""Number of values to which a compressed archive of points or of a body may decompress, whatever its size.
+
+A file with more bytes than this may hold as many values as it has bytes. Each value takes 8 bytes when it is read.
 """
 
 # volumes
 
 MOST_OF_SPECTRA, MOST_VOXELS = 2**24, 2**22
-"""Numbers in a volume of spectra, and its voxels, or as many as its file has bytes: 128 kB of zeros would unfold to 134
-million.
+"""Number of values and number of voxels that a volume of spectra may hold, whatever the size of its file.
+
+A larger file may hold as many values as it has bytes, and a quarter as many voxels. Without the limit, 128 kB of
+compressed zeros would decompress to 134 million values.
 """
 
 # scenes
 
 MOST_PARTS, MOST_MATERIALS = 10_000, 10_000
-"""Parts of a scene, each of one material; each takes a millisecond."""
+"""Largest number of parts of a scene (each has one material and takes a millisecond), and of materials."""
 MOST_TEXELS, FEW_TEXELS, TEXELS_PER_BYTE = 2**25, 2**24, 16
-"""Of all textures of a scene together, two of 4096 × 4096; one where they have more than so many for each byte of their
-files, as photographs have not. Drawn, each takes 44 bytes.
+"""Largest number of texels in all textures of a scene, which fits two textures of 4096 × 4096.
+
+The limit is the second number (one such texture) where the textures have more texels than the third number for each
+byte of their files, which photographs never have. A texel takes 44 bytes while the scene is drawn.
 """
 SCENE_BYTES = 2**25
-"""Bytes that a small glTF file may become: where several nodes show a mesh, it is there for each. A larger file may
-become as much as a compressed one.
+"""Number of bytes to which a small glTF file may expand, because a mesh is copied for each node that shows it.
+
+A larger file may expand by the same factor as a compressed file (`UNFOLDED_TIMES`).
 """
 MOST_JOINT_SETS = 4
-"""Sets of four joints that a vertex follows."""
+"""Largest number of sets of four joints that move a vertex."""
 MOST_SAMPLES = 2**25
-"""Of a picture, a camera file's say: 2560 × 1440 pixels of 9 samples. With colours and depth they take 1 GB."""
+"""Largest number of samples of an image: 2560 × 1440 pixels of 9 samples. With colour and depth they take 1 GB."""
 
 # other files
 
 MOST_ARRAYS, DEEPEST_ARRAYS = 300_000, 32
-"""Arrays in a MATLAB file, cells and fields of structs among them, and how many hold one another."""
+"""Largest number of arrays in a MATLAB file, cells and struct fields included, and largest depth of nesting."""
 MOST_TABLE_COLUMNS = 100_000
-"""Columns of a CSV table."""
+"""Largest number of columns of a CSV table."""
 MOST_FRAMES = 1_000_000
-"""Frames of a motion: two hours at 120 a second."""
+"""Largest number of frames of a motion: two hours at 120 frames per second."""
 MOST_DISPLACEMENTS = 2**24
-"""Numbers of the joints' displacements of a body, joints × 3 × coefficients; published bodies have below 2**17."""
+"""Largest size of a body's joint displacements (joints × 3 × coefficients); published bodies have less than 2**17."""

@@ -1,7 +1,7 @@
-r"""File names as text: what they hold beside UTF-8 is written out.
+r"""File names as text, in which bytes that are not UTF-8 are escaped.
 
-On Linux a name is any bytes; one of an old archive may be Latin-1. Python stands for such a byte by a lone surrogate,
-which no text file, font or database takes.
+A file name on Linux consists of arbitrary bytes; a name from an old archive may be Latin-1. Python represents a byte
+that is not UTF-8 by a lone surrogate, which no text file, font or database accepts.
 """
 
 import os
@@ -14,10 +14,10 @@ _UNSAFE = re.compile("[\ud800-\udfff\x00-\x1f\x7f]")
 
 
 def spelled(name: str | os.PathLike[str]) -> str:
-    r"""Return the name of a file as one line of text, from which `path_of` finds the name again.
+    r"""Return the name of a file as one line of text, from which `path_of` recovers the name.
 
-    Bytes that are not UTF-8, and those that end lines or steer terminals, are written out as \xe9. Where a name holds
-    any of them, or \x itself, its backslashes are doubled.
+    Bytes that are not UTF-8, line ends and terminal control characters are escaped, for example as \xe9. If a name
+    contains one of them or the characters \x, its backslashes are doubled.
     """
     text = os.fspath(name)
     if "\\x" not in text and not _UNSAFE.search(text):
@@ -27,7 +27,7 @@ def spelled(name: str | os.PathLike[str]) -> str:
 
 
 def path_of(spelling: str) -> Path:
-    """Return the path that `spelled` made a text of."""
+    """Return the path whose text `spelled` returned."""
     if "\\x" not in spelling:
         return Path(spelling)
     name = re.sub(rb"\\(\\|x([0-9a-f]{2}))", _read, os.fsencode(spelling))
@@ -35,7 +35,7 @@ def path_of(spelling: str) -> Path:
 
 
 def as_bytes(name: str | os.PathLike[str]) -> bytes:
-    """Return a file's name in bytes that tell it from others, UTF-8 where it is text: for what hashes names."""
+    """Return a file's name as bytes for hashing: UTF-8, and different for different names."""
     return os.fspath(name).encode("utf-8", "surrogatepass")
 
 

@@ -1,4 +1,4 @@
-"""Annotations of texts in a config that name files, or never do; `framework.configuration.paths` reads them."""
+"""Annotations that say whether a text in a config names a file; `framework.configuration.paths` reads them."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 
 @dataclass(frozen=True)
 class Mark:
-    """What an annotation says of a text."""
+    """Annotation that says whether a text is a path."""
 
     path: bool
 
@@ -14,4 +14,4 @@ class Mark:
 FilePath = Annotated[str, Mark(path=True)]
 """Annotation of a parameter that names a file or folder."""
 Words = Annotated[str, Mark(path=False)]
-"""Annotation of a parameter whose text is never used as a path, as "km/h" of a column."""
+"""Annotation of a parameter whose text is never used as a path, such as the unit "km/h" of a column."""

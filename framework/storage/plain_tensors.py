@@ -1,8 +1,8 @@
-"""Reads what `torch.save` writes: plain values and dense tensors, and nothing else that torch would make of a file.
+"""Reader for files of `torch.save` that admits plain values and dense tensors only.
 
-`torch.load(weights_only=True)` runs no code, but it makes sparse, nested and quantised tensors whose insides it takes
-as they are, storages of any size, and views of one number as millions. So the pickle is looked through before torch
-reads it, and the tensors afterwards.
+`torch.load(weights_only=True)` runs no code. It does, however, build sparse, nested and quantised tensors without
+checking their internal arrays, storages of any size, and tensors that show one number millions of times. The pickle is
+therefore inspected before torch reads it, and the tensors afterwards.
 """
 
 import math
@@ -35,17 +35,17 @@ NUMBERS = {
     "uint32": "",
     "uint64": "",
 }
-"""Types of numbers that a tensor may have, and their storages; the last have none of their own."""
+"""Data types that a tensor may have, with the prefix of their storage class; the last three have no such class."""
 CALLED = frozenset(
     {
         "collections OrderedDict",
-        "collections Counter",  # of a schedule's milestones
+        "collections Counter",  # milestones of a learning-rate schedule
         "builtins set",
         "builtins complex",
-        "_codecs encode",  # of bytes
+        "_codecs encode",  # bytes, as protocol 2 stores them
         "torch Size",
         "torch device",
-        "torch.nn.parameter Parameter",  # in files of torch before 0.4
+        "torch.nn.parameter Parameter",  # files of torch before 0.4
         *(f"torch._utils {name}" for name in TENSORS),
     }
 )
@@ -56,26 +56,29 @@ NAMED = frozenset(
         *(f"torch {name}Storage" for name in NUMBERS.values() if name),
     }
 )
-"""What a pickle of plain values and dense tensors calls and names: "module name", as Python 3 has them."""
+"""Globals that a pickle of plain values and dense tensors names without calling them, as "module name" of Python 3.
+
+`CALLED` holds the globals that it calls.
+"""
 TYPES = frozenset(getattr(torch, name) for name in NUMBERS)
 MOST_EXPANDED = 1000
-"""Numbers of a tensor that may be more than its storage holds."""
+"""Number of elements up to which a tensor may have more elements than its storage, as an expanded tensor has."""
 MOST_SHARED = 1000
-"""All tensors together may have so many times the numbers that a file holds: members may share weights."""
+"""Ratio of the bytes of all tensors to the bytes of the file that is allowed, since members may share weights."""
 PICKLES_BEFORE_ZIP = 5
-"""In files of torch before 1.6: a mark, a version, the system, the values, and the names of the storages."""
+"""Number of pickles in a file of torch before 1.6: mark, version, system, values, and names of the storages."""
 LENGTH_OF_MARK = 20
 
 
 def load(file: BinaryIO) -> Any:
-    """What `torch.save` wrote, on the CPU.
+    """Return the object that `torch.save` wrote to a file, with its tensors on the CPU.
 
     Args:
-        file: as `framework.storage.reading.opened` gives it.
+        file: File that `framework.storage.reading.opened` returned.
 
     Raises:
-        Foreign: it is made of something else than plain values and dense tensors.
-        Exception: it is damaged; torch, pickle and zipfile raise a dozen kinds.
+        Foreign: The file holds something other than plain values and dense tensors.
+        Exception: The file is damaged; torch, pickle and zipfile raise a dozen kinds.
     """
     size = os.fstat(file.fileno()).st_size
     require_admitted_pickles(file)
@@ -86,16 +89,16 @@ def load(file: BinaryIO) -> Any:
 
 
 def require_admitted_pickles(file: BinaryIO) -> None:
-    """Look through what `torch.save` wrote, without making anything of it; errors as `load`."""
+    """Inspect the pickles of a file of `torch.save` without building any object; raises the errors of `load`."""
     for pickled in _pickles(file):
         require_plain_pickle(pickled, CALLED, NAMED)
 
 
 def _pickles(file: BinaryIO) -> Iterator[bytes]:
-    """Those of a file from which torch makes what it holds.
+    """Yield the pickles of a file from which torch builds objects.
 
     Raises:
-        ValueError: it is a zip archive in which Python and torch find different things.
+        ValueError: The file is a zip archive in which Python and torch find different parts.
     """
     file.seek(0)
     if file.read(4) != b"PK\x03\x04":
@@ -122,7 +125,7 @@ def _reader(file: BinaryIO) -> Any:
 
 
 def _record_size(reader: Any, name: str) -> int:
-    """Return the bytes of a record as torch finds them; torch before 2.13 says them only of what it has read."""
+    """Return the size of a record in bytes as torch sees it; torch before 2.13 must read the record to know it."""
     if hasattr(reader, "get_record_size"):
         return reader.get_record_size(name)
     return len(reader.get_record(name))
@@ -141,14 +144,15 @@ def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
 
 
 def require_dense(content: Any, size: int | float = math.inf) -> None:
-    """Check every tensor in dictionaries, lists, tuples and sets.
+    """Check that every tensor in dictionaries, lists, tuples and sets is dense.
 
     Args:
-        size: bytes of the file that held them.
+        content: Values read from a file, or to be written to one.
+        size: Bytes of the file.
 
     Raises:
-        Foreign: one is of another layout, type or class.
-        ValueError: one is a view of far fewer numbers than it has, or all have far more than the file.
+        Foreign: A tensor has another layout, data type or class.
+        ValueError: A tensor has far more elements than its storage, or all tensors have far more bytes than the file.
     """
     seen: set[int] = set()
     left = MOST_SHARED * size
@@ -168,7 +172,7 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
 
 
 def _require_dense(tensor: Tensor, name: str) -> int:
-    """Bytes of its numbers; errors as above."""
+    """Check one tensor, as `require_dense` does, and return the bytes of its elements."""
     if type(tensor) not in (Tensor, nn.Parameter) or tensor.layout != torch.strided:
         raise Foreign(f"{shown(name)}, a {type(tensor).__name__} of layout {tensor.layout}")
     if tensor.dtype not in TYPES or tensor.is_nested or tensor.is_conj() or tensor.is_neg():

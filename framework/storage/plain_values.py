@@ -1,4 +1,4 @@
-"""Reads JSON and YAML files, a run's or a stranger's: plain values only, and no more of them than the file has."""
+"""Readers for untrusted JSON, YAML and pickle files: plain values only, and no more of them than the file can hold."""
 
 import json
 import pickletools
@@ -15,12 +15,12 @@ from framework.storage.reading import RESTORE, guarded, read_bytes
 from framework.storage.text import decoded
 
 LARGEST_JSON, LARGEST_YAML = 2**24, 2**17
-"""Bytes."""
+"""Largest size of a file, in bytes."""
 DEEPEST, MOST_ITEMS = 64, 100_000
 
 
 class PlainLoader(yaml.SafeLoader):
-    """A reader of YAML whose numbers are written as programs write them; 1_0, 0x10, 010 and 1:30 are text."""
+    """YAML loader that reads only decimal numbers as programs write them; 1_0, 0x10, 010 and 1:30 are text."""
 
 
 PlainLoader.yaml_implicit_resolvers = {
@@ -36,10 +36,10 @@ PlainLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_json(file: Path, wanted: str, remedy: str = RESTORE) -> dict[str, Any]:
-    """The object in a file.
+    """Return the object that a JSON file holds.
 
     Raises:
-        DataError: it is missing, damaged, or holds something else; says that `wanted` was.
+        DataError: The file is missing or damaged, or holds something other than an object. The message names `wanted`.
     """
     with guarded(file, wanted, remedy):
         found = json.loads(decoded(_content(file, LARGEST_JSON)))
@@ -49,11 +49,11 @@ def read_json(file: Path, wanted: str, remedy: str = RESTORE) -> dict[str, Any]:
 
 
 def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserError] = DataError) -> Any:
-    """The values in a file.
+    """Return the values that a YAML file holds.
 
     Raises:
-        error: it is missing or damaged, has a tag that stands for an object, or an alias: of these a few lines could
-            stand for more values than any memory holds.
+        error: The file is missing or damaged, or contains a tag that stands for a Python object, or an alias. With
+            aliases, a few lines could stand for more values than any memory holds.
     """
     with guarded(file, wanted, remedy, kind=error):
         text = decoded(_content(file, LARGEST_YAML))
@@ -66,15 +66,17 @@ def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserEr
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:
-    """Return whether a value of JSON or YAML is a number: true and false are integers to Python, and are none."""
+    """Return whether a value of JSON or YAML is a number; true and false are not, although Python's bool is an int."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def plain_numbers(value: Any) -> Any:
-    """Return a value of JSON or YAML that is a number, or lists of numbers; NumPy and torch also read true and text.
+    """Return a value of JSON or YAML after checking that it is a number or nested lists of numbers.
+
+    The check is needed because NumPy and torch also accept true and text.
 
     Raises:
-        ValueError: something in it is no number; says what.
+        ValueError: An item is no number; the message quotes it.
     """
     if isinstance(value, list | tuple):
         return [plain_numbers(item) for item in value]
@@ -84,19 +86,19 @@ def plain_numbers(value: Any) -> Any:
 
 
 class Foreign(ValueError):
-    """A file holds something else than plain values and dense tensors; its text names it."""
+    """Error for a file that holds something other than plain values and dense tensors; its text names that content."""
 
 
 @dataclass(slots=True)
 class _Item:
-    """A value on the stack of a pickle, which is not made.
+    """Description of a value on the stack of a pickle; the value itself is not built.
 
     Attributes:
-        size: of its text, or of what it holds.
-        values: how many a tuple stands for.
-        name: of a global: "module name"; "" for any other value.
-        text: of a short string, or of the last one of a tuple.
-        mark: whether it is a mark.
+        size: Size of its text or of its contents.
+        values: Number of values that a tuple stands for.
+        name: Name of a global as "module name"; "" for any other value.
+        text: Text of a short string, or of the last string of a tuple.
+        mark: Whether the value is a mark.
     """
 
     size: int = 1
@@ -110,10 +112,10 @@ PUTS = frozenset(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"))
 GETS = frozenset(("GET", "BINGET", "LONG_BINGET"))
 TUPLES = frozenset(("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"))
 ADDS = {"APPEND": 1, "SETITEM": 2, "BUILD": 1, "APPENDS": 0, "SETITEMS": 0, "ADDITEMS": 0}
-"""Instructions that put values into the one below, and how many; 0: all above the mark."""
+"""Instructions that add values to the object below them, with the number of values; 0 means all above the mark."""
 OTHERS = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID", "DUP"}
 OTHERS |= {"NEXT_BUFFER", "READONLY_BUFFER"}
-"""Instructions that `torch.save` does not write, nor torch read."""
+"""Instructions that `torch.save` never writes and torch does not read."""
 VALUES = frozenset(
     opcode.name
     for opcode in pickletools.opcodes
@@ -121,33 +123,33 @@ VALUES = frozenset(
     and len(opcode.stack_after) == 1
     and opcode.name not in {*GETS, *OTHERS, "MARK", "GLOBAL"}
 )
-"""Instructions that put a new value on the stack: a number, a text, an empty list."""
+"""Instructions that push a new value onto the stack, such as a number, a text or an empty list."""
 RENAMED = {"__builtin__": "builtins"}
-"""Modules of Python 2, as pickles of protocol 2 name them, and of Python 3."""
+"""Names of Python 2 modules, as pickles of protocol 2 use them, with their names in Python 3."""
 ENCODE = "_codecs encode"
-"""Of bytes, as protocol 2 writes them."""
+"""Function that a pickle of protocol 2 calls to build bytes."""
 TIMES_ITSELF = 4
-"""What is made by calls may be so many times the pickle."""
+"""Ratio of the size of all objects built by calls to the size of the pickle that is allowed."""
 HIGHEST = 2**62
 MOST_INSTRUCTIONS = 1_000_000
-"""Of a pickle: a tensor takes 30, a number 1 or 2."""
+"""Largest number of instructions in a pickle; a tensor takes 30 of them, a number 1 or 2."""
 
 
 def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Collection[str] = ()) -> None:
-    """Look through a pickle without making anything of it.
+    """Inspect a pickle without building any object.
 
-    A tuple may not stand for more than MOST_ITEMS values, as one does that holds the same tuple again and again: as a
-    key such a one is hashed for ever.
+    A tuple may not stand for more than MOST_ITEMS values. A few nested tuples that each repeat the one below can stand
+    for so many values that hashing them as a key would never end.
 
     Args:
-        pickled: one pickle.
-        called: the globals that it may name and call: "module name", as Python 3 has them.
-        named: those that it may name, and not call.
+        pickled: Bytes of one pickle.
+        called: Globals that it may name and call, as "module name" of Python 3.
+        named: Globals that it may name but not call.
 
     Raises:
-        Foreign: it names another one, or calls something else.
-        ValueError: it would make far more of itself than it is.
-        Exception: it is damaged.
+        Foreign: It names another global, or calls something else.
+        ValueError: It would build objects far larger than itself.
+        Exception: It is damaged.
     """
     stack: list[_Item] = []
     memo: dict[int, _Item] = {}
@@ -181,7 +183,7 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
             stack.append(_Item(name=found))
         elif name in ADDS:
             inner = [stack.pop() for _ in range(ADDS[name])] or _above_mark(stack)
-            # one that holds itself would double each time
+            # the size of an object that is added to itself would double each time
             stack[-1].size = min(stack[-1].size + sum(item.size for item in inner), HIGHEST)
         elif name in ("REDUCE", "NEWOBJ"):
             given, function = stack.pop(), stack.pop()
@@ -207,10 +209,10 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
 
 
 def instructions(pickled: Any) -> Iterator[tuple[pickletools.OpcodeInfo, Any, int | None]]:
-    """Those of one pickle, as `pickletools.genops`.
+    """Yield the instructions of one pickle, as `pickletools.genops` does.
 
     Raises:
-        ValueError: there are more than MOST_INSTRUCTIONS: they would take seconds.
+        ValueError: There are more than MOST_INSTRUCTIONS, which would take seconds.
     """
     for number, found in enumerate(pickletools.genops(pickled)):
         if number == MOST_INSTRUCTIONS:
@@ -219,7 +221,7 @@ def instructions(pickled: Any) -> Iterator[tuple[pickletools.OpcodeInfo, Any, in
 
 
 def _above_mark(stack: list[_Item]) -> list[_Item]:
-    """What stands above the last mark, which is taken away with it."""
+    """Remove the last mark and the items above it from the stack, and return those items."""
     place = len(stack) - 1
     while not stack[place].mark:
         place -= 1

@@ -1,4 +1,4 @@
-"""What long work says of itself while it goes on: a bar on a terminal, in a log a line every half minute."""
+"""Progress reports of long work: a bar on a terminal, or a line every half minute in a log."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -12,24 +12,27 @@ from framework.storage.first_rank import first_rank
 
 Item = TypeVar("Item")
 SHORT, APART = 2.0, 30.0
-"""Seconds: shorter work says nothing, and lines of a log are so far apart."""
+"""Seconds that work takes before it reports anything, and seconds between two lines in a log."""
 WIDE = 160
-"""Characters of a line of a log."""
+"""Number of characters in a line of a log."""
 
 
 def output() -> Console:
-    """Where people read results: a log has no edge to wrap at, and ranks other than the first print nothing."""
+    """Return the console for results: it wraps lines of a log at `WIDE`, and prints on the first rank only."""
     console = Console(quiet=not first_rank())
     return console if console.is_terminal else Console(quiet=console.quiet, width=WIDE)
 
 
 @final
 class Work:
-    """Work of `total` units: says how far it is, on the error stream; ranks other than the first say nothing.
+    """Progress of work that consists of `total` units, reported on the error stream by the first rank only.
 
     Args:
-        what: is done, and `units` of what: "testing", "samples".
-        clock: seconds.
+        what: Name of the work, such as "testing".
+        total: Number of units.
+        units: Name of the units, such as "samples".
+        console: Console to print on; None for the error stream.
+        clock: Function that returns the time in seconds.
     """
 
     def __init__(
@@ -59,7 +62,7 @@ class Work:
             self._bar.stop()
 
     def advance(self, count: int = 1) -> None:
-        """Another `count` units are done."""
+        """Report that another `count` units are done."""
         self.done += count
         now = self.clock()
         if self.console.quiet or now - self._start < SHORT:
@@ -84,7 +87,7 @@ class Work:
 def tracked(
     items: Iterable[Item], what: str, total: int, units: str, size: Callable[[Item], int] = lambda _: 1
 ) -> Iterator[Item]:
-    """The items, whose consumer is the work; `size` is how many units an item has."""
+    """Yield the items and report progress as the consumer takes them; `size` returns the number of units of an item."""
     with Work(what, total, units) as work:
         for item in items:
             yield item

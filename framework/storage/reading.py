@@ -1,6 +1,7 @@
-"""Reads files that may be damaged or a stranger's: regular ones, within bounds; what goes wrong is one sentence.
+"""Readers for files that may be damaged or come from an untrusted source; every failure becomes a one-sentence error.
 
-What a file may unfold to is bounded by its size, before anything is allocated: `room`.
+Only regular files are read. The size to which a file may decompress is limited by its own size (`room`), and the limit
+is checked before anything is allocated.
 """
 
 import io
@@ -22,12 +23,16 @@ SMALL, MOST_TIMES = limits.UNFOLDED_BYTES, limits.UNFOLDED_TIMES
 def guarded(
     file: Path, wanted: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
 ) -> Iterator[None]:
-    """Everything that damage leads a library to becomes an error of one `kind`, a UserError stays; all name the file.
+    """Turn every exception that a damaged file causes inside the block into an error of class `kind`.
+
+    A `UserError` keeps its class. Every message names the file.
 
     Args:
-        wanted: what the file should be, "a MATLAB file" say.
-        remedy: what to do about a damaged file.
-        missing: what to say of one that is not there, beside that.
+        file: File that is read in the block.
+        wanted: Description of the expected content, such as "a MATLAB file".
+        remedy: Advice for a damaged file.
+        missing: Further text of the message for a missing file.
+        kind: Class of the error.
     """
     try:
         yield
@@ -43,10 +48,10 @@ def guarded(
 
 
 def opened(file: Path) -> "Bounded":
-    """A file to read; whoever asks closes it.
+    """Open a regular file for reading; the caller closes it.
 
     Raises:
-        OSError: it is missing, or no regular file: a pipe could block for ever, a device go on without end.
+        OSError: The file is missing or is no regular file. A pipe could block for ever, and a device may never end.
     """
     stream = Bounded(io.FileIO(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
@@ -56,9 +61,10 @@ def opened(file: Path) -> "Bounded":
 
 
 class Bounded(io.BufferedReader):
-    """A file of which no more is read than it has: Python allocates what is asked for before it reads.
+    """File whose `read` never asks for more bytes than the file still has.
 
-    A chunk of an image, or a text of a pickle, announces 4 GB in four bytes.
+    Python allocates the requested size before it reads. A chunk of an image or a text of a pickle can announce 4 GB in
+    four bytes.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -68,36 +74,42 @@ class Bounded(io.BufferedReader):
 
 
 def read_bytes(file: Path) -> bytes:
-    """All of a file; errors as `opened`."""
+    """Return the whole content of a file; raises the errors of `opened`."""
     with opened(file) as stream:
         return stream.read()
 
 
 def room(size: int) -> int:
-    """Bytes that a compressed file of `size` bytes may unfold to."""
+    """Return the number of bytes to which a compressed file of `size` bytes may decompress."""
     return max(SMALL, MOST_TIMES * size)
 
 
 def require_numbers(numbers: int, small: int, size: int) -> None:
-    """Refuse what unfolds to more than `small` numbers, and to more than the `size` of its file in bytes.
+    """Refuse a file that decompresses to more than `small` numbers and to more numbers than its `size` in bytes.
 
-    A number of one byte takes eight when it is computed with, and files of zeros unfold a thousandfold.
+    A number of one byte takes eight bytes in computations, and a file of zeros decompresses to a thousand times its
+    size.
 
     Raises:
-        ValueError: says how many.
+        ValueError: There are more numbers than that; the message states how many.
     """
     if numbers > max(small, size):
         raise ValueError(f"it unfolds to {numbers} numbers; at most {max(small, size)} in {size} bytes")
 
 
 def inflated(data: bytes, most: int, *, part: bool = False) -> bytes:
-    """What zlib or gzip compressed; `part`: the first `most` bytes of it will do.
+    """Return the decompressed bytes of zlib or gzip data.
+
+    Args:
+        data: Compressed bytes.
+        most: Largest number of decompressed bytes.
+        part: Return the first `most` bytes only, and accept more of them and a missing end.
 
     Raises:
-        ValueError: it is cut short, or more than `most` bytes.
-        zlib.error: it is damaged.
+        ValueError: The data are cut short, or decompress to more than `most` bytes.
+        zlib.error: The data are damaged.
     """
-    unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)  # either header
+    unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)  # accept the header of zlib or of gzip
     found = unpacker.decompress(data, most if part else most + 1)
     if not part and (len(found) > most or not unpacker.eof):
         raise ValueError(f"what is compressed is cut short, or unfolds to more than {most} bytes")

@@ -1,8 +1,8 @@
-"""Text files as people and programs write them: their encoding, the names of columns, and the numbers in them.
+"""Decoding of text files, names of columns, and parsing of the numbers that people and programs write.
 
-Every reader of text decodes, names and parses here, so that a cell means the same in a table, a cloud, a mesh, a
-flight, a list of offsets and a motion. A number that is written in another way than programs write it is either read
-here, where it can mean one number alone (a Unicode minus, Fortran's exponent), or described by `mended`, for a message.
+Every reader of text uses these functions, so that a cell means the same in a table, a point cloud, a mesh, a flight, a
+list of offsets and a motion. A number in an unusual form is read if it can mean only one number (a Unicode minus,
+Fortran's exponent). Any other is described by `mended`, for the error message.
 """
 
 import codecs
@@ -17,34 +17,34 @@ from framework.errors import quoted
 
 SAVE = "Save it as UTF-8"
 WIDE = (
-    (codecs.BOM_UTF32_LE, "UTF-32"),  # before UTF-16, whose mark it begins with
+    (codecs.BOM_UTF32_LE, "UTF-32"),  # before UTF-16, because this mark begins with the mark of UTF-16
     (codecs.BOM_UTF32_BE, "UTF-32"),
     (codecs.BOM_UTF16_LE, "UTF-16"),
     (codecs.BOM_UTF16_BE, "UTF-16"),
 )
 LONGEST = 64
-"""Letters of what may be a number, written otherwise; patterns take more than linear time."""
+"""Largest number of characters in a word that `mended` examines, since its patterns take more than linear time."""
 LOOKED_AT = 64
-"""Bytes at the beginning by which UTF-16 without a mark is known: every second one is 0."""
+"""Number of leading bytes in which UTF-16 without a byte-order mark is detected: every second byte is 0."""
 MINUS = str.maketrans(
     dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}\N{SMALL HYPHEN-MINUS}\N{FULLWIDTH HYPHEN-MINUS}", "-")
 )
-"""What stands for a minus before digits. A number with one inside, such as the range 1–5, stays no number."""
+"""Characters that stand for a minus before digits. A word with one inside, such as the range 1–5, is no number."""
 NOT_FINITE = re.compile(r"[+-]?1\.#([A-Za-z]+)\d*")
-"""How Microsoft's C library writes NaN and infinity: 1.#INF, -1.#IND, 1.#QNAN, cut after some letters."""
+"""Pattern of NaN and infinity as Microsoft's C library writes them: 1.#INF, -1.#IND, 1.#QNAN, sometimes truncated."""
 FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)|([+-]?\d+)[dD]([+-]\d+)")
 FIGURE = re.compile(r"\d")
 FIGURES = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 BLANKS = " \N{NO-BREAK SPACE}\N{THIN SPACE}\N{NARROW NO-BREAK SPACE}"
 INVISIBLE = "\ufeff\u200b\u200c\u200d\u200e\u200f\u2060"
-"""Characters without width, which copies from web pages and office programs bring along."""
+"""Zero-width characters, which text copied from web pages and office programs contains."""
 
 
 def plain(content: bytes) -> bytes:
-    """Return a text, or a file that begins with text, without its byte-order mark.
+    """Return the bytes of a text, or of a file that begins with text, without the byte-order mark of UTF-8.
 
     Raises:
-        ValueError: it is UTF-16 or UTF-32.
+        ValueError: The text is UTF-16 or UTF-32.
     """
     for mark, name in WIDE:
         if content.startswith(mark):
@@ -57,10 +57,10 @@ def plain(content: bytes) -> bytes:
 
 
 def decoded(content: bytes) -> str:
-    """Return a text in UTF-8, without its byte-order mark.
+    """Return the text that UTF-8 bytes encode, without its byte-order mark.
 
     Raises:
-        ValueError: it is in another encoding; names the line.
+        ValueError: The bytes have another encoding; the message names the line.
     """
     content = plain(content)
     try:
@@ -73,16 +73,16 @@ def decoded(content: bytes) -> str:
 
 
 def lines_of(content: bytes) -> list[str]:
-    """Return the lines of a text, which end as those of any system, and not at the other letters that Python takes.
+    """Return the lines of a text, split at the line ends of any system but not at Python's other line separators.
 
     Raises:
-        ValueError: as `decoded`.
+        ValueError: `decoded` refuses the bytes.
     """
     return re.split(r"\r\n|\r|\n", decoded(content))
 
 
 def words_of(written: str) -> list[str]:
-    """Return what blanks, tabs and ends of lines separate; a no-break space stays in its word, as in 1 234."""
+    """Return the words between blanks, tabs and line ends; a no-break space does not separate words, as in 1 234."""
     return (
         written.split()
         if written.isascii()
@@ -91,7 +91,7 @@ def words_of(written: str) -> list[str]:
 
 
 def trimmed(cell: str) -> str:
-    """Return a cell without blanks and characters without width at its ends."""
+    """Return a cell without blanks and zero-width characters at its ends."""
     cell = cell.strip()
     while cell and (cell[0] in INVISIBLE or cell[-1] in INVISIBLE):
         cell = cell.strip(INVISIBLE).strip()
@@ -99,7 +99,7 @@ def trimmed(cell: str) -> str:
 
 
 def column_name(cell: str) -> str:
-    """Return what a header calls a column: trimmed, without quotation marks around it, letters composed (NFC)."""
+    """Return the name of a column from its header cell: trimmed, without quotation marks, composed (NFC)."""
     name = trimmed(cell)
     if len(name) > 1 and name[0] == name[-1] and name[0] in "\"'":
         name = trimmed(name[1:-1])
@@ -107,10 +107,10 @@ def column_name(cell: str) -> str:
 
 
 def require_distinct(names: Sequence[str], what: str = "column") -> None:
-    """Refuse names of which one stands twice; nameless columns may.
+    """Refuse a list of names in which a name occurs twice; empty names may repeat.
 
     Raises:
-        ValueError: names the first.
+        ValueError: A name occurs twice; the message quotes the first such name.
     """
     twice = [name for name, count in Counter(names).items() if count > 1 and name]
     if twice:
@@ -118,12 +118,13 @@ def require_distinct(names: Sequence[str], what: str = "column") -> None:
 
 
 def value(word: str) -> float | None:
-    """Return the number that a word says, perhaps NaN or infinite; None where it says none.
+    """Return the number that a word represents, which may be NaN or infinite; None where it represents none.
 
-    Beside what Python reads: a Unicode minus, Fortran's 1.5D+3, and 1.#INF or -1.#IND of Microsoft's C library.
+    In addition to the forms of Python, it reads a Unicode minus, Fortran's 1.5D+3, and 1.#INF or -1.#IND of Microsoft's
+    C library.
     """
     if "_" in word:
-        return None  # 1_0: Python reads it and no file means it
+        return None  # Python reads 1_0 as 10, but no file means that
     try:
         return float(word)
     except ValueError:
@@ -144,14 +145,14 @@ def value(word: str) -> float | None:
 
 
 class Mended(NamedTuple):
-    """What a word would be as a number, after mending.
+    """Description of a word that would be a number if it were written differently.
 
     Attributes:
-        what: how it is written: "with a decimal comma".
-        number: how to write it instead.
-        settings: of the keys of `framework.datasets.csv_columns.Writing` those that read it, with their values; one
-            set for each meaning that it may have.
-        unit: what stands beside the number.
+        what: How the number is written, such as "with a decimal comma".
+        number: How to write it instead.
+        settings: Settings of `framework.datasets.csv_columns.Writing` that would read the word, by key; one dictionary
+            for each meaning that the word can have.
+        unit: Unit beside the number.
     """
 
     what: str
@@ -167,7 +168,7 @@ GROUPED: dict[Sign, str] = {
     "space": rf"\d{{1,3}}(?:[{BLANKS}]\d{{3}})+",
     "apostrophe": r"\d{1,3}(?:['\N{RIGHT SINGLE QUOTATION MARK}]\d{3})+",
 }
-"""Figures in groups of three, by what stands between the groups."""
+"""Patterns of digits in groups of three, by the separator between the groups."""
 BETWEEN: dict[Sign, str] = {
     "comma": ",",
     "point": ".",
@@ -182,16 +183,16 @@ OTHERS: tuple[tuple[str, str, str], ...] = (
     (rf"([+-]?{FIGURES})\s*[x×*·]\s*10\s*\^?\s*([+-]?\d+)", "as a product with a power of ten", r"\1e\2"),
     (rf"[<>≤≥~≈]\s*([+-]?{FIGURES})", "as a bound", r"\1"),
 )
-"""Patterns of numbers that no setting reads, how each is written, and how to write it instead."""
+"""Patterns of numbers that no setting reads, with a description of each form and the replacement in plain form."""
 UNIT = re.compile(
     r"([+-]?)([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})?\s*([+-]?[\d.,].*?)\s*"
     r"([^\W\d_]{1,8}(?:/[^\W\d_]{1,4})?[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
 )
-"""A sign, a unit before the number ($, EUR), the number, and a unit behind it (%, kg, mm²)."""
+"""Pattern of a sign, a unit before the number ($, EUR), the number, and a unit behind it (%, kg, mm²)."""
 
 
 def mended(word: str) -> Mended | None:
-    """Return how a word that is no number could become one: decimal commas, thousands separators, units and others."""
+    """Return how to write a word as a number (decimal comma, thousands separators, unit, …), or None."""
     word = trimmed(word).translate(MINUS)
     if len(word) > LONGEST or not any(letter.isdigit() for letter in word):
         return None
@@ -206,7 +207,7 @@ def mended(word: str) -> Mended | None:
 
 
 def _separated(sign: str, figures: str) -> Mended | None:
-    """A number with another decimal sign than the point, or with figures in groups."""
+    """Return how to write a number that has a decimal comma or digits in groups, or None."""
     decimal = {"decimal": "comma"}
     if re.fullmatch(r"\d*,\d+(?:[eE][+-]?\d+)?|\d+,", figures):
         number = sign + figures.replace(",", ".")
@@ -219,7 +220,7 @@ def _separated(sign: str, figures: str) -> Mended | None:
         if found is None or found[2] == BETWEEN[name]:
             continue
         if name == "point" and found[2] is None and figures.count(".") == 1:
-            continue  # 1.234
+            continue  # 1.234 is a plain number
         whole = re.sub(r"\D", "", found[1]) + (f".{found[3]}" if found[3] else "")
         settings = {"thousands": name} | (decimal if found[2] == "," else {})
         return Mended("with figures in groups", sign + whole, (settings,))
@@ -231,7 +232,7 @@ def _with_unit(word: str) -> Mended | None:
     if found is None or not (found[2] or found[4]) or (found[1] and not found[2]):
         return None
     unit = found[2] or found[4]
-    if (found[2] and found[4]) or found[3].endswith("."):  # the name of a file, 0.png
+    if (found[2] and found[4]) or found[3].endswith("."):  # a file name such as 0.png
         return None
     inner = found[1] + found[3]
     if value(inner) is not None:
@@ -247,7 +248,7 @@ def _with_unit(word: str) -> Mended | None:
 
 
 def line_of_word(text: str, number: int) -> int:
-    """Return the line (from 1) of a word of a text, counted from 0."""
+    """Return the line, counted from 1, that holds the word with this number, counted from 0."""
     line = 1
     for line, words in enumerate(re.split(r"\r\n|\r|\n", text), 1):
         number -= len(words_of(words))
@@ -257,10 +258,15 @@ def line_of_word(text: str, number: int) -> int:
 
 
 def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[float]:
-    """Return the numbers of some words of a text; `first` is the place of the first of them among all its words.
+    """Return the numbers that some words of a text represent.
+
+    Args:
+        words: Consecutive words of the text.
+        text: Whole text, from which an error message takes the line.
+        first: Index of the first of the words among all words of the text.
 
     Raises:
-        ValueError: a word is none; names the line.
+        ValueError: A word is no number; the message names its line.
     """
     try:
         found = list(map(float, words))
@@ -276,7 +282,7 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 
 
 def no_number(word: str, where: str = "") -> str:
-    """Return a sentence about a word where a number was wanted, with how to mend it."""
+    """Return an error message for a word where a number was wanted, with a correction if there is one."""
     remedy = mended(word)
     why = f": a number {remedy.what}; write {remedy.number}" if remedy else ""
     return f"wanted a number, got {quoted(word)}{where}{why}"

@@ -1,4 +1,4 @@
-"""Threads: how those of OpenMP wait, and a pool for compiled code, which runs without the interpreter's lock."""
+"""Waiting policy of OpenMP threads, and a thread pool for compiled code, which runs without the interpreter's lock."""
 
 import os
 from collections.abc import Callable
@@ -6,18 +6,18 @@ from concurrent.futures import ThreadPoolExecutor
 
 
 def wait_passively() -> None:
-    """Have OpenMP's threads sleep between two parallel operations; call it before torch is imported.
+    """Make OpenMP threads sleep between two parallel operations; call this before torch is imported.
 
-    They spin by default. As soon as another process wants a core, each thread spins while it waits for one that does
+    They spin by default. As soon as another process uses a core, a thread spins while it waits for a thread that does
     not run. A training with two threads then took several times the processor time and the wall time of one thread.
-    What the user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT stands.
+    Values that the user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT are kept.
     """
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 class Pool:
-    """Threads that are started when first needed, and anew in a child process: threads do not survive a fork."""
+    """Pool of threads that are started on first use, and started again in a child process, since a fork ends them."""
 
     def __init__(self) -> None:
         self.threads: ThreadPoolExecutor | None = None
@@ -25,10 +25,11 @@ class Pool:
         os.register_at_fork(after_in_child=self.forget)
 
     def forget(self) -> None:
+        """Drop the threads, which do not exist in a child process."""
         self.threads = None
 
     def run(self, work: Callable[[int], object], threads: int) -> None:
-        """work(0) … work(threads - 1) at the same time, the first in this thread; work itself asks for no threads."""
+        """Call work(0) … work(threads - 1) at the same time, the first in this thread; `work` must not use the pool."""
         if threads <= 1:
             work(0)
             return
@@ -41,7 +42,7 @@ class Pool:
             one.result()
 
     def share(self, work: Callable[[int], object], count: int, threads: int) -> None:
-        """work(0) … work(count - 1), each by the thread that is free next."""
+        """Call work(0) … work(count - 1), each in the thread that is free next."""
         waiting = iter(range(count))
 
         def some(_: int) -> None:
@@ -49,7 +50,7 @@ class Pool:
                 for number in waiting:
                     work(number)
             finally:
-                list(waiting)  # where one failed, the other threads stop too
+                list(waiting)  # empty the iterator, so that the other threads stop after a failure
 
         self.run(some, min(threads, count))
 

@@ -1,4 +1,4 @@
-"""Weights trained elsewhere: fills a network from a local file of named tensors, or says what differs."""
+"""Loading of pretrained weights from a local file of named tensors, with a message on what does not fit."""
 
 import logging
 import zipfile
@@ -22,23 +22,23 @@ from framework.storage.reading import opened, room
 _log = logging.getLogger(__name__)
 
 LISTED = 5
-"""Names of weights that a message lists before it counts the rest."""
+"""Number of names of weights that a message lists before it counts the rest."""
 NUMBERS = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32)
-"""What weights may be made of; complex numbers would lose half of theirs without a word."""
+"""Data types that weights may have; complex numbers would lose their imaginary parts silently."""
 
 
 def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...], within: str = "") -> None:
     """Copy the weights of `file` into `network`, name by name.
 
     Args:
-        network: whose `state_dict` names the weights.
-        file: what `read_weights` reads.
-        ignored: beginnings of names the network has no use for, such as the classifier's; they may be absent.
-        within: what the file's names begin with beside the network's, all or none of them: "features." say.
+        network: Network whose `state_dict` names the weights.
+        file: Path of a file that `read_weights` reads.
+        ignored: Prefixes of names that the network does not use, such as the classifier's; they may be absent.
+        within: Prefix of all names in the file (or of none) that the network's names lack, such as "features.".
 
     Raises:
-        ConfigError: there is no such file.
-        CheckpointError: it cannot be read, or its names or shapes are not the network's.
+        ConfigError: There is no such file.
+        CheckpointError: The file cannot be read, or its names or shapes differ from the network's.
     """
     found = read_weights(file)
     kept = {name: tensor for name, tensor in found.items() if not name.startswith(ignored)}
@@ -47,7 +47,7 @@ def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...], with
         _log.info("%s: ignored %s, not used here.", file, names)
     kept = {name.removeprefix(within): tensor for name, tensor in kept.items()}
     wanted = network.state_dict()
-    # Batch norm counts its batches since torch 0.4.1 only; older files lack the count, and nothing reads it.
+    # Batch norm counts its batches since torch 0.4.1; older files lack the count, which nothing reads.
     counters = {name: tensor for name, tensor in wanted.items() if name.endswith(".num_batches_tracked")}
     kept = counters | kept
     mismatch = describe_mismatch(wanted, kept)
@@ -59,15 +59,15 @@ def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...], with
 
 
 def read_weights(file: str) -> dict[str, Shaped[Tensor, "..."]]:
-    """Named tensors, on the CPU, from a `.safetensors` file or from what `torch.save` wrote (`.pth`, `.pt`).
+    """Return the named tensors of a `.safetensors` file or a file of `torch.save` (`.pth`, `.pt`), on the CPU.
 
     The tensors of a torch file may lie under the key "state_dict" or "model", and their names may begin with
-    "module.", as training scripts write them. Damage is found by the checksums of torch's format;
-    `.safetensors` and files older than torch 1.6 have none, so there only damage to the structure shows.
+    "module.", as training scripts write them. Damage is found by the checksums of torch's format. Files of
+    `.safetensors` and files older than torch 1.6 have no checksums, so only damage to their structure is found.
 
     Raises:
-        ConfigError: there is no such file.
-        CheckpointError: it is damaged, holds more than plain values, or no named tensors.
+        ConfigError: There is no such file.
+        CheckpointError: The file is damaged, holds more than plain values, or has no named tensors.
     """
     path = Path(file).expanduser()
     if not path.is_file():
@@ -91,7 +91,7 @@ def _torch(path: Path) -> Any:
         # torch does not check the checksums in its own zip: a flipped bit would load as another number
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
-                # nor does it read a part marked as a folder (attribute 0x10): its tensor stays uninitialised
+                # nor does torch read a part marked as a folder (attribute 0x10): that tensor stays uninitialised
                 folders = [part.filename for part in archive.infolist() if part.external_attr & 0x10]
                 size = sum(part.file_size for part in archive.infolist())
                 if size > room(path.stat().st_size):
@@ -106,7 +106,7 @@ def _torch(path: Path) -> Any:
             f"{path} is no file of plain tensors ({_first_line(error)}). Reading anything else could run "
             "code: save it again where it comes from, with `torch.save(network.state_dict(), ...)`."
         ) from None
-    except Exception as error:  # on damaged bytes zipfile and torch raise a dozen kinds, AssertionError too
+    except Exception as error:  # for damaged bytes zipfile and torch raise a dozen kinds, even AssertionError
         raise _damaged(path, _first_line(error)) from None
 
 
@@ -134,13 +134,15 @@ def _first_line(error: Exception) -> str:
 def describe_mismatch(
     wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Any], any_shape: tuple[str, ...] = ()
 ) -> str | None:
-    """One sentence on how the weights of a file differ from those a model wants, or None where they fit.
+    """Return one sentence on how the weights of a file differ from those of a model, or None where they fit.
 
-    Floating-point numbers may be of any width: they are cast when they are copied. Nothing else is: a complex number
-    would lose its imaginary part, and an integer its upper half, without an error.
+    Floating-point numbers may have any width, because they are cast when they are copied. Other types must agree: a
+    complex number would lose its imaginary part, and an integer its upper half, without an error.
 
     Args:
-        any_shape: beginnings of names whose weights may be of any shape, or lacking.
+        wanted: Weights of the model, by name.
+        found: Weights of the file, by name.
+        any_shape: Prefixes of names whose weights may have any shape or be absent.
     """
     names = {name for name in (*wanted, *found) if not name.startswith(any_shape)}
     missing = [name for name in wanted if name in names and name not in found]
@@ -171,14 +173,16 @@ def describe_mismatch(
 
 LARGEST = torch.finfo(torch.float64).max
 FINITE, FROM_0, ABOVE_0 = (-LARGEST, LARGEST), (0.0, LARGEST), (torch.finfo(torch.float64).tiny, LARGEST)
-"""What the numbers of a buffer may be: least and most."""
+"""Bounds of the values of a buffer: least and largest."""
 
 
 def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tensor, Tensor]) -> None:
-    """Let `load_state_dict` refuse buffers of the module that are not what was fitted: of another shape, out of bounds.
+    """Make `load_state_dict` refuse buffers of the module that have another shape or values out of bounds.
 
     Args:
-        bounds: the least and the most that a buffer's numbers may be, all or each, by its name; NaN is neither.
+        module: Module that owns the buffers.
+        bounds: Least and largest value of each buffer, by its name; a tensor bounds each element separately. NaN is
+            out of bounds.
     """
     module.register_load_state_dict_pre_hook(partial(_require_state, bounds))
 
