@@ -1,4 +1,4 @@
-"""Quadrature of a density of one or two numbers that follows it, however narrow: boxes split where they disagree."""
+"""Adaptive quadrature of a density of one or two numbers, however narrow: boxes are split where two rules disagree."""
 
 import math
 from collections.abc import Callable
@@ -15,28 +15,33 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import peaks
 
 RULES = {1: (10, 6), 2: (8, 5)}
-"""Gauss-Legendre points a side; a box whose two sums differ is split."""
+"""Gauss-Legendre points per side of the two rules; a box on which their sums differ is split."""
 TOLERANCE = {1: 1e-10, 2: 1e-8}
 ROUNDS = {1: 60, 2: 40}
 MOST = {1: 128, 2: 48}
-"""Boxes of a batch row split in one round."""
+"""Largest number of boxes of a batch row that are split in one round."""
 MOST_PEAKS = 64
 HIDDEN = 2.0
-"""A box is split where its integrand is known to be so many times what it is at the highest node."""
+"""Ratio of a known value of the integrand to that at the highest node above which a box is split."""
 REACH = 36.0
-"""Values are mode + a sinh(s), a the density's own width: of reals to sinh 36 = 2e15 widths, of angles half a turn."""
+"""Bound on the coordinate s of values mode + a sinh(s), where a is the density's own width.
+
+For reals the quadrature reaches sinh 36 = 2e15 widths, for angles half a turn.
+"""
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """What the quadrature leaves of a density with batch_shape (rows,).
+    """Result of the quadrature of a density with batch_shape (rows,).
 
     Attributes:
-        value: (node, rows, number), where the density was evaluated last; log_prob: (node, rows), nats.
-        weight: (node, rows) volume of each node. Σ weight · exp(log_prob) is the integral.
-        border: of one number (box + 1, rows) ascending, mass (box, rows) between them.
-        way: the coordinates in which boxes are cut.
-        low, high: of the boxes in these coordinates, (box, rows, number).
+        value: Values at which the density was evaluated last, (node, rows, number).
+        log_prob: Log-density at `value`, (node, rows), nats.
+        weight: Volume of each node, (node, rows); Σ weight · exp(log_prob) is the integral.
+        border: Borders of the boxes of one number, ascending, (box + 1, rows).
+        mass: Mass of each box, (box, rows).
+        way: Coordinates in which the boxes are cut.
+        low, high: Corners of the boxes in these coordinates, (box, rows, number).
     """
 
     value: Tensor
@@ -49,17 +54,19 @@ class Boxes:
     high: Tensor
 
     def mean(self, of: Tensor) -> Tensor:
-        """∫ p f of f (node, rows)."""
+        """Return ∫ p f for a function f with values (node, rows)."""
         share = self.weight * self.log_prob.exp()
         return torch.where(share > 0, share * of, 0.0).sum(0)
 
     def entropy(self) -> Tensor:
+        """Return the entropy, (rows,), nats."""
         return -self.mean(self.log_prob)
 
     def doubt(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """How far ∫ p f, f of values, may be off, (rows): boxes are cut for p, not for f, and end somewhere.
+        """Return a bound on the error of ∫ p f for a function f of values, (rows,).
 
-        By how much the coarser rule differs, and what a tail that falls as slowly as a power leaves beyond the ends.
+        The boxes are cut for p rather than for f, and they end at a finite distance. The bound is the difference of the
+        two rules, plus what a tail that falls like a power has beyond the ends.
         """
         shares = []
         for points in RULES[self.low.shape[-1]]:
@@ -74,8 +81,10 @@ class Boxes:
         return rules + 100 * torch.where(outermost, shares[0].abs(), 0.0).sum(0)
 
     def below(self, value: Tensor) -> Tensor:
-        """Mass from the first border to `value` (several, rows) of one number; of angles from half a turn before the
-        mode."""
+        """Return the mass from the first border to `value` (several, rows) of one number.
+
+        For angles the first border is half a turn before the mode.
+        """
         place = self.way.back(value.unsqueeze(-1))
         border = self.way.back(self.border.unsqueeze(-1))[..., 0]
         border[0], border[-1] = (end[:, 0] for end in self.way.ends)
@@ -89,9 +98,9 @@ class Boxes:
 
 
 class _Map:
-    """Coordinates in which boxes are cut → values: sinh along the density's own axes, in its own widths.
+    """Map from the coordinates in which boxes are cut to values: sinh along the density's own axes, in its own widths.
 
-    About the highest of some candidates, since a mode may be wrong.
+    The origin is the highest of some candidates, since the density's mode may be wrong.
     """
 
     def __init__(self, density: Distribution, candidates: Tensor) -> None:
@@ -121,7 +130,7 @@ class _Map:
         return self.density.log_prob(value.to(like.dtype)).double()
 
     def _widths(self) -> Tensor:
-        """How far from the mode along each axis the density has fallen by half a nat, (rows, number)."""
+        """Return the distance along each axis at which log p is half a nat below the mode, (rows, number)."""
         steps = 2.0 ** torch.arange(-40, 2 if self.angles else 60, dtype=torch.float64)
         top = self.log_prob(self.mode)
         found = []
@@ -132,12 +141,15 @@ class _Map:
             fallen = (top - self.log_prob(there) > 0.5).int()
             first = torch.where(
                 fallen.amax(0) > 0, fallen.argmax(0), 40
-            )  # a width of 1 where it does not fall
+            )  # width 2^0 = 1 where p does not fall
             found.append(steps[first])
         return torch.stack(found, -1)
 
     def _whiten(self) -> None:
-        """Slope of the second number's conditional mode in the first, from mixed differences of the width's size."""
+        """Set the slope of the second number's conditional mode in the first.
+
+        The slope comes from mixed differences over the widths.
+        """
         first, second = self.scale[:, 0], self.scale[:, 1]
         corner = {}
         for one, two in product((-1, 0, 1), repeat=2):
@@ -147,7 +159,7 @@ class _Map:
         bend = corner[0, 1] + corner[0, -1] - 2 * corner[0, 0]
         slope = -mixed / bend * second / first
         self.slope = torch.where(slope.isfinite(), slope, 0.0)
-        # along the first axis the second number follows: the width is that of the marginal
+        # along the conditional mode of the second number the width of the first is that of its marginal
         steps = 2.0 ** torch.arange(0, 40, dtype=torch.float64)
         offset = torch.stack([first, self.slope * first], -1)
         fallen = (corner[0, 0] - self.log_prob(self.mode + steps[:, None, None] * offset) > 0.5).int()
@@ -155,7 +167,7 @@ class _Map:
         self.scale = torch.stack([first * wider, second], -1)
 
     def to(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Values and the volume of the map there, from coordinates (node, rows, number)."""
+        """Return values and the volume of the map at coordinates (node, rows, number)."""
         offset = self.scale * place.sinh()
         volume = (self.scale * place.cosh()).prod(-1)
         if place.shape[-1] == 2:
@@ -163,7 +175,7 @@ class _Map:
         return self.mode + offset, volume
 
     def back(self, value: Tensor) -> Tensor:
-        """Coordinates of values."""
+        """Return the coordinates of values."""
         offset = (wrap(value.double()) if self.chart else value.double()) - self.mode
         if self.angles and not self.chart:
             offset = wrap(offset)
@@ -173,7 +185,7 @@ class _Map:
 
 
 def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
-    """Nodes (points^numbers, numbers) of the unit box and their weights."""
+    """Return nodes (points^numbers, numbers) of the unit box and their weights."""
     node, weight = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
     nodes = torch.cartesian_prod(*[(node + 1) / 2] * numbers).reshape(-1, numbers)
     weights = torch.cartesian_prod(*[weight / 2] * numbers).reshape(-1, numbers).prod(-1)
@@ -182,9 +194,9 @@ def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=4)
 def boxes(density: Distribution) -> Boxes:
-    """The density of one or two numbers, batch_shape (rows,), in boxes on which two rules agree.
+    """Return a density of one or two numbers, batch_shape (rows,), in boxes on which two rules agree.
 
-    Peaks are found by candidates: the mode, `peaks` and draws. A box is also split while it hides one, or a ridge.
+    Candidates for peaks are the mode, `peaks` and draws. A box is also split while it may hide a peak or a ridge.
     """
     humps = peaks(density)[:MOST_PEAKS].double()
     drawn = density.sample(torch.Size((24,))).double()
@@ -200,12 +212,12 @@ def boxes(density: Distribution) -> Boxes:
     low = way.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
     high = way.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
     if numbers == 1:
-        # a kink at a peak near a border is beyond the outermost node of either rule: a border is put there
+        # A kink at a peak near a border may lie beyond the outermost nodes of both rules, so a border is put there.
         edges = torch.cat([low.expand(-1, *humps.shape[1:]), high[-1:].expand(-1, *humps.shape[1:]), humps])
         edges = edges.sort(0).values
         low, high = edges[:-1], edges[1:]
     parts = _summed(way, low, high, place, height, humps)
-    # float32 does not agree with itself to more digits
+    # float32 does not reproduce more digits
     tolerance = TOLERANCE[numbers] if density.log_prob(density.mode).dtype == torch.float64 else 1e-4
     for _ in range(ROUNDS[numbers]):
         split = int((parts[3] > tolerance).sum(0).max())
@@ -224,14 +236,14 @@ def boxes(density: Distribution) -> Boxes:
 
 
 def _taken(part: Tensor, index: Tensor) -> Tensor:
-    """`part` (box, rows, ...) at index (some, rows)."""
+    """Return the entries of `part` (box, rows, ...) at index (some, rows)."""
     if part.dim() == 3:
         index = index.unsqueeze(-1).expand(*index.shape, part.shape[-1])
     return part.gather(0, index)
 
 
 def _nodes(way: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Values (box · node, rows, number), log-densities and weights (box, node, rows)."""
+    """Return values (box · node, rows, number), and log-densities and weights (box, node, rows)."""
     nodes, weights = _rule(points, low.shape[-1])
     place = low.unsqueeze(1) + (high - low).unsqueeze(1) * nodes[:, None]
     value, volume = way.to(place.flatten(0, 1))
@@ -243,10 +255,11 @@ def _nodes(way: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, T
 def _summed(
     way: _Map, low: Tensor, high: Tensor, place: Tensor, height: Tensor, humps: Tensor
 ) -> tuple[Tensor, ...]:
-    """Borders and masses (box, rows), how urgent it is to split each, and the number in which (box, rows, number).
+    """Return boxes, their masses, the urgency to split each, and the number in which to split it.
 
-    Urgent are boxes whose two sums differ, and those where a candidate, or what is known of a peak, is far above every
-    node.
+    Boxes are their corners, low and high. Masses and urgency have shape (box, rows). The number is a mask (box, rows,
+    number). A split is urgent where the two sums differ, or where a candidate or the estimate from a known peak is far
+    above every node.
     """
     numbers = low.shape[-1]
     sums, highest, rough = [], torch.zeros_like(low[..., 0]), torch.zeros_like(low)
@@ -254,7 +267,7 @@ def _summed(
         _, log_prob, weight = _nodes(way, low, high, points)
         share = weight * log_prob.exp()
         sums.append(share.sum(1))
-        even = share / _rule(points, numbers)[1][:, None]  # had the node the whole box
+        even = share / _rule(points, numbers)[1][:, None]  # mass of the box if this node stood for all of it
         highest = torch.maximum(highest, even.nan_to_num().amax(1))
         if points == RULES[numbers][0]:
             rough = _roughness(even.nan_to_num(), points, numbers)
@@ -262,22 +275,24 @@ def _summed(
     inside = ((place.unsqueeze(1) >= low) & (place.unsqueeze(1) <= high)).all(-1)  # (candidate, box, rows)
     _, volume = way.to(place)
     peak = torch.where(inside, (height.exp() * volume).unsqueeze(1), 0.0).amax(0) * size
-    # beside a peak split in its longest number, across a ridge
+    # a box with a peak in or near it is split in its longest number, a box with a ridge across the ridge
     known = torch.cat([peak.unsqueeze(0), _known(way, low, high, humps) * size])
     hidden, which = torch.where(known > HIDDEN * highest, known.clamp(max=1.0), 0.0).max(0)
     longest = (high - low).argmax(-1)
     number = torch.where(which < 2, longest, which - 2)
     number = torch.where(hidden > 0, number, rough.argmax(-1))
     across = torch.nn.functional.one_hot(number, numbers).bool()
-    # narrower ones hold a peak that float64 does not resolve
+    # a narrower box holds a peak that float64 does not resolve
     wide = (high - low).where(across, 0.0).amax(-1) > 1e-13
     urgency = torch.maximum((sums[0] - sums[1]).abs(), hidden)
     return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0), across
 
 
 def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
-    """How much of the integrand (box, node, rows) the two highest polynomials of each number hold, (box, rows, number):
-    where it is most, nodes are too few."""
+    """Return the share of the integrand (box, node, rows) in the two highest polynomials of each number.
+
+    The result has shape (box, rows, number). The nodes are too few in the number in which it is largest.
+    """
     if numbers == 1:
         return torch.zeros_like(integrand[:, :1]).movedim(1, -1)
     grid = integrand.unflatten(1, (points, points))
@@ -292,7 +307,7 @@ def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
 
 
 def _highest_polynomials(points: int) -> Tensor:
-    """Node values → coefficients of the Legendre polynomials of the two highest degrees, (2, points)."""
+    """Return the matrix (2, points) from node values to coefficients of the two highest Legendre polynomials."""
     node, weight = np.polynomial.legendre.leggauss(points)
     values = np.polynomial.legendre.legvander(node, points - 1)[:, -2:]
     found = weight[:, None] * values * np.arange(2 * points - 3, 2 * points, 2)
@@ -300,9 +315,12 @@ def _highest_polynomials(points: int) -> Tensor:
 
 
 def _known(way: _Map, low: Tensor, high: Tensor, humps: Tensor) -> Tensor:
-    """The highest integrand that the density's peaks tell of, (what, box, rows): at the box's nearest point to one; of
-    two numbers also with one number there and the other in the middle, since a peak narrow in one number and broad in
-    the other is a ridge, and crosses boxes that have no peak in them."""
+    """Return the highest integrand that the density's peaks indicate in each box, (probe, box, rows).
+
+    The first probe is the box's nearest point to each peak. For two numbers there are two more, which have one number
+    of that point and the middle of the box in the other: a peak that is narrow in one number and broad in the other is
+    a ridge, which also crosses boxes that hold no peak.
+    """
     numbers = low.shape[-1]
     near = humps.unsqueeze(1).clamp(low, high)  # (peak, box, rows, number)
     middle = ((low + high) / 2).expand_as(near)
@@ -321,7 +339,7 @@ def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
     value, log_prob, weight = _nodes(way, low, high, RULES[low.shape[-1]][0])
     border = mass[:0]
     if low.shape[-1] == 1:
-        order = (low + high)[..., 0].argsort(0)  # empty ones before those that begin there
+        order = (low + high)[..., 0].argsort(0)  # empty boxes come before those that begin at the same place
         mass = mass.gather(0, order)
         ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
         border = way.to(ends.unsqueeze(-1))[0][..., 0]

@@ -1,4 +1,4 @@
-"""What the contract asks of encoders of point clouds, beside what it asks of any."""
+"""Checks of encoders of point clouds, beside those of any encoder."""
 
 import math
 from collections.abc import Callable
@@ -16,14 +16,14 @@ NO_CLOUDS = ((7,), (3, 32, 32), (100, 2))
 
 
 def different_clouds(points: int, columns: int) -> list[Tensor]:
-    """(points, columns) each, off the origin and of different sizes where there is more than one point."""
+    """Return clouds (points, columns) off the origin, of different sizes where there is more than one point."""
     generator = torch.Generator().manual_seed(SEED)
     sizes = (points, 1, -(-points // 3), -(-points // 2))
     return [4 * torch.randn(size, columns, generator=generator) + 7 for size in sizes]
 
 
 def padding(make: Make, clouds: list[Tensor], worst: Worst) -> None:
-    """Rows of NaN at the end change no feature, whether a gradient is asked for or not."""
+    """Check that rows of NaN at the end change no feature, with and without a gradient."""
     encoder = make()
     batch = pad([*clouds, clouds[0].new_zeros(len(clouds[0]) + 5, clouds[0].shape[1])])
     with torch.no_grad():
@@ -35,7 +35,7 @@ def padding(make: Make, clouds: list[Tensor], worst: Worst) -> None:
 
 
 def any_order(make: Make, clouds: list[Tensor], worst: Worst) -> None:
-    """A cloud is a set: the order of its points changes no feature."""
+    """Check that the order of the points changes no feature."""
     encoder = make()
     generator = torch.Generator().manual_seed(SEED)
     with torch.no_grad():
@@ -47,7 +47,7 @@ def any_order(make: Make, clouds: list[Tensor], worst: Worst) -> None:
 
 
 def gradients_of_padding(make: Make, clouds: list[Tensor], worst: Worst) -> None:
-    """None reaches padding, and none is NaN; an encoder may have no gradient at all."""
+    """Check that gradients are finite and 0 in the padding; an encoder may have no gradient."""
     encoder = make().double()
     batch = pad([cloud.double() for cloud in clouds]).requires_grad_()
     found = encoder(batch)
@@ -61,7 +61,7 @@ def gradients_of_padding(make: Make, clouds: list[Tensor], worst: Worst) -> None
 
 
 def bad_clouds(make: Make, clouds: list[Tensor], worst: Worst) -> None:
-    """A number that is not finite, or no point: the error names the cloud, and the point."""
+    """Check that a non-finite number or a cloud without points raises an error that names the cloud and the point."""
     encoder, largest = make(), clouds[0]
     last = len(largest) - 1
     for column in (0, 2):
@@ -86,7 +86,7 @@ def _refused(encoder: Encoder, clouds: Tensor, wanted: tuple[str, ...], worst: W
 
 
 def other_shapes(build: Callable[[tuple[int, ...]], Encoder], worst: Worst) -> None:
-    """What is no cloud is refused as it is built, by name and shape."""
+    """Check that input shapes that are no clouds are refused at construction, with a message that names the shape."""
     for shape in NO_CLOUDS:
         try:
             build(shape)

@@ -1,4 +1,4 @@
-"""The contract of a data set: one function a property, each reporting the worst case it saw."""
+"""Contract tests of a data set: one function for each property; each reports its worst case."""
 
 import math
 import pickle
@@ -47,11 +47,11 @@ from framework.testing.rows import DataRow
 Check = Callable[[Workbench, Worst], None]
 NEEDED = ("input", "target", "index", "group")
 MINUTES = 5.0
-"""Of processor time that a check may take: it may generate the data anew."""
+"""Limit of processor time for a check, minutes; a check may generate the data again."""
 
 
 def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
-    """Every property of one data set; where it cannot be prepared, nothing but that."""
+    """Yield one finding for each property of a data set; if it cannot be prepared, only the first."""
     with TemporaryDirectory() as scratch:
         bench = Workbench(row, build, Path(scratch))
         checks: dict[str, tuple[float, Check]] = {
@@ -94,7 +94,7 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
 
 
 def _applies(name: str, bench: Workbench) -> bool:
-    """Whether the row gives what a check needs, or the data set has what it looks at."""
+    """Return whether the row and the data set have what a check needs."""
     row = bench.row
     match name:
         case "angles are radians":
@@ -118,7 +118,7 @@ def _applies(name: str, bench: Workbench) -> bool:
 
 
 def _attributes(bench: Workbench, worst: Worst) -> None:
-    """What the contract lists is set by `prepare`, each of the right kind."""
+    """Check that `prepare` sets the attributes of the contract, each of the right type."""
     data = bench.data
     columns, shape = data.columns, data.input_shape
     worst.same("target is a Target", isinstance(data.target, Target), True)
@@ -131,7 +131,7 @@ def _attributes(bench: Workbench, worst: Worst) -> None:
     worst.same("synthetic", type(data.synthetic), bool)
     worst.same("varies", type(data.varies), bool)
     worst.count(not _whole((data.skipped,)), f"skipped {data.skipped!r}; wanted a number from 0")
-    if bench.row.synthetic is not None:  # a row's own files are whole
+    if bench.row.synthetic is not None:  # the files of a row are undamaged
         worst.same("skipped", data.skipped, 0)
     worst.same("bibtex", type(data.bibtex), str)
     for name, split in parts(data).items():
@@ -148,7 +148,7 @@ def _names(names: Any) -> bool:
 
 
 def _constructor(bench: Workbench, worst: Worst) -> None:
-    """It can be built where its files are not there yet, and where nothing can be generated."""
+    """Check that the data set can be built before its files exist and where nothing can be generated."""
     place = bench.place()
     away = place.files.rename(place.files.with_name("away"))
     no_folder = place.files.with_name("no folder")
@@ -176,7 +176,7 @@ def _samples(bench: Workbench, worst: Worst) -> None:
 
 
 def _together(data: Data, batch: Batch, asked: Sequence[int], where: str, worst: Worst) -> None:
-    """The same of many samples."""
+    """Check many samples at once in the way `_sample` checks one."""
     missing = [key for key in NEEDED if key not in batch]
     worst.same(f"{where}: fields missing", missing, [])
     if missing:
@@ -198,7 +198,10 @@ def _together(data: Data, batch: Batch, asked: Sequence[int], where: str, worst:
 
 
 def _differ(bench: Workbench, worst: Worst) -> None:
-    """Of inputs that are measured no half is the same again, and in training neither all inputs nor targets are one."""
+    """Check that samples differ: at most half of the measured inputs of a split repeat others.
+
+    In training, neither all inputs nor all targets may be equal.
+    """
     for name, split in parts(bench.data).items():
         found = bench.contents[name].marks
         if len(found) < 2:
@@ -215,13 +218,13 @@ def _differ(bench: Workbench, worst: Worst) -> None:
 
 
 def _measured(inputs: Tensor) -> bool:
-    """Not of so few whole numbers that they may well be the same in two samples."""
+    """Return whether inputs are measured, rather than a few whole numbers that two samples may share by chance."""
     kept = trimmed(inputs)
     return kept.numel() >= 16 or (kept.is_floating_point() and bool((kept != kept.round()).any()))
 
 
 def _images(bench: Workbench, worst: Worst) -> None:
-    """Floats of images, that is: encoders read bytes as 0 to 1 and floats as they are."""
+    """Check that images of floats are in [0, 1], since encoders read bytes as 0 to 1 and floats as they are."""
     for name, split in parts(bench.data).items():
         for number, sample in samples(split):
             inputs = sample["input"]
@@ -267,7 +270,7 @@ def _target(data: Data, target: Tensor, where: str, worst: Worst) -> None:
 
 
 def _radians(bench: Workbench, worst: Worst) -> None:
-    """Angles beyond a turn are most likely degrees."""
+    """Check that no angle is beyond a turn, which most likely means degrees."""
     for name, split in parts(bench.data).items():
         for asked in batches(numbers(split), [64]):
             largest = fetched(split, asked)["target"].abs().flatten(1).amax(-1)
@@ -275,14 +278,14 @@ def _radians(bench: Workbench, worst: Worst) -> None:
 
 
 def _disjoint(bench: Workbench, worst: Worst) -> None:
-    """No input with its target is in two splits."""
+    """Check that no pair of input and target is in two splits."""
     seen: dict[tuple[int, int], str] = {}
     for name, split in parts(bench.data).items():
         own: dict[tuple[int, int], str] = {}
         for number in numbers(split):
             sample = split[number]
             target = sample["target"]
-            # training targets may be kept in half precision
+            # training targets may be stored in half precision
             rounded = target.half() if target.is_floating_point() else target
             one = marks({"input": sample["input"][None], "target": rounded[None]})[0]
             own[one["input"], one["target"]] = f"{name} {number}"
@@ -293,8 +296,11 @@ def _disjoint(bench: Workbench, worst: Worst) -> None:
 
 
 def _repeatable(bench: Workbench, worst: Worst) -> None:
-    """Two preparations in two places give the same samples, also after other random numbers and where folders list
-    their files in another order; so does one more in the same place, and so does a second look."""
+    """Check that two preparations in two places give the same samples to the last bit.
+
+    Between them the random seeds and the order in which folders list files change. A second preparation in the same
+    place, and a second look at the first, must give the same samples too.
+    """
     torch.manual_seed(SEED + 7)
     np.random.seed(SEED + 7)  # noqa: NPY002 - the global generator is the point
     random.seed(SEED + 7)
@@ -309,11 +315,11 @@ def _repeatable(bench: Workbench, worst: Worst) -> None:
 
 
 SIZES = (1, 300, 37, 64, 129)
-"""Of the batches that are fetched of a split, in turn."""
+"""Sizes of the batches that are fetched from a split, in turn."""
 
 
 def _fetching(bench: Workbench, worst: Worst) -> None:
-    """A fetched batch holds the single samples, in whatever order and number they are asked for."""
+    """Check that a fetched batch holds the single samples, whatever their order and number."""
     for name, split in parts(bench.data).items():
         wanted = bench.contents[name].marks
         order = list(wanted)
@@ -333,7 +339,7 @@ def _fetching(bench: Workbench, worst: Worst) -> None:
 
 
 def _owned(bench: Workbench, worst: Worst) -> None:
-    """What is fetched later changes no batch, and a batch has memory of its own, which may be written to."""
+    """Check that a batch has memory of its own, which may be written to, and is not changed by later fetches."""
     for name, split in parts(bench.data).items():
         order = list(bench.contents[name].marks)
         wanted = [bench.contents[name].marks[number] for number in order[:16]]
@@ -386,7 +392,7 @@ def _pictures(bench: Workbench, worst: Worst) -> None:
 
 
 def _on_one_device(bench: Workbench, worst: Worst) -> None:
-    """Batches are varied where the model trains; what the data set holds stays on the CPU."""
+    """Check `augment` for mixed devices: batches are on the model's device, attributes of the data set on the CPU."""
     data, train = bench.data, parts(bench.data)["train"]
     batch = fetched(train, list(range(min(8, len(train)))))
 
@@ -399,7 +405,7 @@ def _on_one_device(bench: Workbench, worst: Worst) -> None:
 
 
 def _augment(bench: Workbench, worst: Worst) -> None:
-    """A varied batch is a batch still, and a function of torch's seed alone; while a model of float64 trains, too."""
+    """Check that an augmented batch is valid and depends on torch's seed alone, also for models of float64."""
     data, train = bench.data, parts(bench.data)["train"]
     usual = torch.get_default_dtype()
     sizes = [(1, usual), (min(16, len(train)), usual), (min(16, len(train)), torch.float64)]
@@ -447,7 +453,7 @@ def _varied(data: Data, batch: Batch, where: str, worst: Worst) -> None:
 
 
 def _workers(bench: Workbench, worst: Worst) -> None:
-    """A loading process gets a copy of a split."""
+    """Check that a pickled copy of a split, as a loading process gets, has the same samples."""
     for name, split in parts(bench.data).items():
         copy = pickle.loads(pickle.dumps(split))
         worst.same(f"length of a copy of {name}", len(copy), len(split))

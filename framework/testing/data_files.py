@@ -1,4 +1,4 @@
-"""What the contract asks of a data set's files: roots that are missing, files that are damaged, a user's own files."""
+"""Checks of a data set's files: roots that are missing, files that are damaged, and a user's own files."""
 
 import io
 import math
@@ -21,7 +21,7 @@ from framework.testing.rows import DAMAGES, Damage
 
 
 def read_back(bench: Workbench, worst: Worst) -> None:
-    """What was generated gives the same samples through `root`; it is synthetic as long as its mark says so."""
+    """Check that generated files give the same samples through `root`, and are synthetic while marked so."""
     for what, synthetic in {"as it is": True, "without its mark": False}.items():
         place, source = bench.spoilt(lambda root, keep=synthetic: None if keep else (root / MARK).unlink())
         found = bench.prepared(place, **source)
@@ -32,7 +32,10 @@ def read_back(bench: Workbench, worst: Worst) -> None:
 
 
 def missing_root(bench: Workbench, worst: Worst) -> None:
-    """A place that is not there is named; without a place real data are asked for, or others generated and said so."""
+    """Check that a missing folder is named in the error.
+
+    Without a folder, real data must be asked for, or be replaced by generated data that are marked as synthetic.
+    """
     nowhere = bench.folder() / "nowhere"
     for key in bench.says_where:
         refused(
@@ -42,7 +45,7 @@ def missing_root(bench: Workbench, worst: Worst) -> None:
             worst,
         )
         if bench.row.synthetic is not False or bench.default(key) is not None:
-            continue  # of others to ask for them may mean to generate many
+            continue  # other data sets may generate many samples here
         try:
             found = bench.prepared(bench.first, **{key: None})
         except DataError as error:
@@ -54,6 +57,7 @@ def missing_root(bench: Workbench, worst: Worst) -> None:
 
 
 def damaged_files(bench: Workbench, worst: Worst) -> None:
+    """Check that each damaged file of the row raises an error that names it."""
     for pattern, kinds in bench.row.fragile.items():
         for kind in kinds:
             names: list[str] = []
@@ -75,7 +79,7 @@ def damaged_files(bench: Workbench, worst: Worst) -> None:
 
 
 def left_out(bench: Workbench, worst: Worst) -> None:
-    """A file that cannot be read costs its samples, and `skipped` says how many."""
+    """Check that the samples of an unreadable file are left out, and that `skipped` counts them."""
     pattern = next(iter(bench.row.fragile))
     place, source = bench.spoilt(lambda root: damage(first_match(root, pattern), "garbage"))
     found = bench.prepared(place, **source, **bench.row.skip)
@@ -85,7 +89,7 @@ def left_out(bench: Workbench, worst: Worst) -> None:
 
 
 def own_files(bench: Workbench, worst: Worst) -> None:
-    """Files are read without preparing anything, in their order, as the splits' samples are; no file is refused."""
+    """Check that user files are read without `prepare`, in their order, in the format of the splits' samples."""
     files, data = _own(bench)
     unknown = [file.name for file in files if data.suffixes and file.suffix.lower() not in data.suffixes]
     worst.count(bool(unknown), f"suffixes do not name that of {', '.join(unknown)}")
@@ -94,7 +98,7 @@ def own_files(bench: Workbench, worst: Worst) -> None:
     apart = [sample for file in files for sample in _read(data, [file], bench, worst)]
     backwards = _read(data, files[::-1], bench, worst)
     count = len(_read(data, files[-1:], bench, worst))
-    times = max(1, min(5, FEW // max(len(together), 1)))  # more samples are not all looked at
+    times = max(1, min(5, FEW // max(len(together), 1)))  # only FEW samples are compared
     renamed = _exchanged(files, bench.folder())
     swapped = [_read(data, [file], bench, worst) for file in renamed]
     for what, found, wanted in (
@@ -114,14 +118,14 @@ def own_files(bench: Workbench, worst: Worst) -> None:
 
 
 def _exchanged(files: Sequence[Path], folder: Path) -> list[Path]:
-    """The first two files under each other's names elsewhere; none where their formats differ."""
+    """Copy the first two files under each other's names, and return the copies; none where their suffixes differ."""
     if len(files) < 2 or files[0].suffix != files[1].suffix or not all(file.is_file() for file in files[:2]):
         return []
     return [Path(shutil.copy(files[other], folder / files[one].name)) for one, other in ((0, 1), (1, 0))]
 
 
 def raw_input(bench: Workbench, worst: Worst) -> None:
-    """With its config and what travels with a model alone it makes of files what the prepared data set makes."""
+    """Check that the config and the stored state alone read files as the prepared data set does."""
     files = list(bench.row.files(bench.folder())) if bench.row.files else []
     nowhere = {key: str(bench.folder() / "nowhere") for key in bench.says_where}
     data, trained = bench.built(bench.first, **nowhere), bench.data
@@ -152,10 +156,11 @@ def raw_input(bench: Workbench, worst: Worst) -> None:
 
 
 def damaged_own_files(bench: Workbench, worst: Worst) -> None:
+    """Check that a damaged file of a user raises an error that names it."""
     for kind in DAMAGES:
         files, data = _own(bench)
         damage(files[0], kind)
-        # looking at a sample counts too: large collections are read when they are used
+        # reading a sample counts too, since large collections are read on use
         refused(
             lambda files=files, data=data: data.read(files[::-1])[len(files) - 1],
             [files[0].name],
@@ -165,7 +170,7 @@ def damaged_own_files(bench: Workbench, worst: Worst) -> None:
 
 
 def refused(act: Callable[[], object], wanted: Sequence[str], what: str, worst: Worst) -> None:
-    """A DataError that says these words and what to do."""
+    """Check that a call raises a DataError that contains these words and says what to do."""
     try:
         act()
     except DataError as error:
@@ -185,13 +190,13 @@ def refused(act: Callable[[], object], wanted: Sequence[str], what: str, worst: 
 
 
 def _own(bench: Workbench) -> tuple[list[Path], Data]:
-    """A user's own files, and a data set that is not prepared."""
+    """Return a user's own files, and a data set that is not prepared."""
     assert bench.row.files is not None
     return list(bench.row.files(bench.folder())), bench.built(bench.first)
 
 
 def _read(data: Data, files: Sequence[Path], bench: Workbench, worst: Worst) -> list[Tensor]:
-    """Every input without padding."""
+    """Return every input without padding."""
     with cache_in(bench.first.cache):
         found = data.read(files)
     sample_of_split = parts(bench.data)["train"][0]
@@ -205,7 +210,7 @@ def _read(data: Data, files: Sequence[Path], bench: Workbench, worst: Worst) -> 
         if lacking:
             continue
         shape = tuple(sample["input"].shape)
-        # of a user's own clouds any may be the largest
+        # any cloud of a user may have more points than those of training
         known = (len(shape) == len(wanted) == 2 and shape[1:] == wanted[1:]) or shape == wanted
         worst.count(not known, f"{where}: input of {shape}, wanted {wanted}")
         worst.same(f"{where}: input", sample["input"].dtype, like.dtype)

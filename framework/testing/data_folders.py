@@ -1,4 +1,4 @@
-"""Folders in which a data set is prepared for a check: its own files, a cache of its own, and what happens to files."""
+"""Folders in which a data set is prepared for a check, with a cache of their own, and damage to its files."""
 
 import inspect
 import os
@@ -24,7 +24,7 @@ Build = Callable[[Mapping[str, Any]], Data]
 
 @contextmanager
 def cache_in(folder: Path) -> Iterator[None]:
-    """What is generated meanwhile goes to this folder, and not to the user's cache."""
+    """Use a folder instead of the user's cache for data that are generated within the block."""
     before = os.environ.get("FRAMEWORK_CACHE")
     os.environ["FRAMEWORK_CACHE"] = str(folder)
     try:
@@ -36,7 +36,7 @@ def cache_in(folder: Path) -> Iterator[None]:
 
 
 class _Entries:
-    """What `os.scandir` gives, in another order."""
+    """Result of `os.scandir` in reverse order of names."""
 
     def __init__(self, entries: Any) -> None:
         with entries:
@@ -55,12 +55,12 @@ class _Entries:
         pass
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, since no resource is open."""
 
 
 @contextmanager
 def listed_backwards() -> Iterator[None]:
-    """Folders list their files in another order meanwhile, as on another machine."""
+    """List the files of folders in reverse order within the block, as another machine may do."""
     listdir, scandir = os.listdir, os.scandir
     os.listdir = lambda *path: sorted(listdir(*path), reverse=True)  # type: ignore[assignment]
     os.scandir = lambda *path: _Entries(scandir(*path))  # type: ignore[assignment]
@@ -71,12 +71,12 @@ def listed_backwards() -> Iterator[None]:
 
 
 class Place:
-    """A folder of its own for one preparation.
+    """Folder for one preparation of a data set.
 
     Attributes:
-        files: where the row's `write` has put what the data set reads; empty for a generated one.
-        cache: where generated data go.
-        source: the parameters that say where the written files are.
+        files: Folder of the files that the row's `write` made for the data set to read; empty for generated data.
+        cache: Folder for generated data.
+        source: Parameters that locate the written files.
     """
 
     def __init__(self, row: DataRow, folder: Path) -> None:
@@ -86,12 +86,12 @@ class Place:
 
 
 class Workbench:
-    """Builds and prepares the data set of one row as often as its checks ask for it.
+    """Builder of the data set of a row, which prepares it as often as checks need it.
 
     Args:
-        row: whose data set it is.
-        build: parameters → the data set, not prepared.
-        scratch: an empty folder.
+        row: Row of the data set.
+        build: Function from parameters to the data set, not prepared.
+        scratch: Empty folder.
     """
 
     def __init__(self, row: DataRow, build: Build, scratch: Path) -> None:
@@ -100,19 +100,21 @@ class Workbench:
         self.scratch = scratch
 
     def folder(self) -> Path:
-        """A new empty folder."""
+        """Return a new empty folder."""
         path = self.scratch / str(len(list(self.scratch.iterdir())))
         path.mkdir()
         return path
 
     def place(self) -> Place:
+        """Return a new place with the row's files."""
         return Place(self.row, self.folder())
 
     def built(self, place: Place, **config: Any) -> Data:
-        """The data set of what lies in a place, not prepared; `config` counts for more than the row's."""
+        """Return the data set of a place, not prepared; `config` overrides the row's."""
         return self.build({**place.source, **self.row.config, **config})
 
     def prepared(self, place: Place, **config: Any) -> Data:
+        """Return a prepared data set of a place; `config` overrides the row's."""
         data = self.built(place, **config)
         with cache_in(place.cache):
             data.prepare()
@@ -120,44 +122,45 @@ class Workbench:
 
     @cached_property
     def first(self) -> Place:
+        """Place of the first preparation."""
         return self.place()
 
     @cached_property
     def data(self) -> Data:
-        """Prepared once, for checks that change nothing."""
+        """Data set that is prepared once, for checks that change nothing."""
         return self.prepared(self.first)
 
     @cached_property
     def again(self) -> Data:
-        """Prepared in the same place once more: of generated data what was written is read."""
+        """Data set that is prepared a second time in the same place, so that generated data are read back."""
         return self.prepared(self.first)
 
     @cached_property
     def contents(self) -> dict[str, Contents]:
-        """Of every split."""
+        """Contents of each split, by name."""
         return {name: contents(split) for name, split in parts(self.data).items()}
 
     @cached_property
     def says_where(self) -> list[str]:
-        """The parameters that say where the data are: those of what was written, else `root` where there is one."""
+        """Parameters that locate the data: those that `write` returned, else `root` where there is one."""
         if self.row.write is None:
             return ["root"] if "root" in inspect.signature(type(self.data)).parameters else []
         below = self.first.files
         return [key for key, value in self.first.source.items() if Path(str(value)).is_relative_to(below)]
 
     def default(self, key: str) -> Any:
-        """What the constructor takes where a parameter is not given."""
+        """Return the constructor's default value of a parameter."""
         return inspect.signature(type(self.data)).parameters[key].default
 
     @cached_property
     def generated(self) -> Path | None:
-        """What the first preparation has generated in the official layout; None where there is no such thing."""
+        """Folder that the first preparation generated in the official layout; None where there is none."""
         if self.row.write or self.row.config.get("root") or not self.says_where:
             return None
         return next((mark.parent for mark in sorted(self.first.cache.rglob(MARK))), None)
 
     def spoilt(self, spoil: Callable[[Path], None]) -> tuple[Place, dict[str, Any]]:
-        """Another copy of what was written or generated, after `spoil`, and the parameters that have it read."""
+        """Return a copy of the data set's files, changed by `spoil`, and the parameters with which it is read."""
         place = self.place()
         if self.generated is None:
             spoil(place.files)
@@ -168,7 +171,7 @@ class Workbench:
 
 
 def damage(file: Path, kind: Damage) -> None:
-    """Do to a file what its name says."""
+    """Damage a file in the given way."""
     content = file.read_bytes()
     file.unlink()
     if kind == "empty":
@@ -182,10 +185,10 @@ def damage(file: Path, kind: Damage) -> None:
 
 
 def first_match(folder: Path, pattern: str) -> Path:
-    """The first file of a pattern.
+    """Return the first file that matches a pattern.
 
     Raises:
-        ValueError: the row names a pattern that no file has.
+        ValueError: No file matches the row's pattern.
     """
     found = sorted(path for path in folder.glob(pattern) if path.is_file())
     if not found:
@@ -194,10 +197,10 @@ def first_match(folder: Path, pattern: str) -> Path:
 
 
 def configured(row: DataRow, own: Mapping[str, Any]) -> DataRow:
-    """The row with a user's own parameters beside its own.
+    """Return the row with a user's parameters added to its own.
 
-    Where they say where the data are, nothing of the row is left: a user's data are read and never damaged, and the row
-    cannot know which columns they have, or which files are like them.
+    Where these parameters locate the data, nothing else of the row is kept. A user's data are read and never damaged,
+    and the row cannot know their columns or which files are equivalent.
     """
     with TemporaryDirectory() as folder:
         says_where = {"root", *(row.write(Path(folder)) if row.write else ())}

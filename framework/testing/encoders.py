@@ -1,4 +1,4 @@
-"""The contract of an encoder: one function a property, each reporting the worst case it saw."""
+"""Contract tests of an encoder: one function for each property; each reports its worst case."""
 
 import copy
 import math
@@ -28,19 +28,19 @@ from framework.testing.rows import CloudRow, EncoderRow
 
 Make = Callable[[], Encoder]
 MANY, SOME = 131, 9
-"""Samples of a large batch; SOME where four take more processor time than SLOW."""
+"""Number of samples of a large batch; SOME where four samples take more processor time than SLOW seconds."""
 SLOW = 0.03
 
 
 def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]) -> Iterator[Finding]:
-    """Every property of one encoder, built for a shape of input, fresh for each."""
+    """Yield one finding for each property of an encoder; `build` makes a new one for an input shape."""
 
     def make(seed: int = SEED) -> Encoder:
         torch.manual_seed(seed)
         return build(row.input_shape).eval()
 
     def inputs(count: int) -> Tensor:
-        """The row's own, or images in [0, 1], or normal vectors."""
+        """Return the row's own inputs, or images in [0, 1], or normal vectors."""
         if row.inputs is not None:
             return row.inputs(count)
         generator = torch.Generator().manual_seed(SEED)
@@ -90,7 +90,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
 
 
 def _on_one_device(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """In evaluation, and in training where a gradient is wanted; images also as bytes."""
+    """Check evaluation, training with a gradient in the input, and images as bytes for mixed devices."""
 
     def questions(mode: OneDevice) -> Questions:
         encoder = make()
@@ -126,14 +126,14 @@ def _shapes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
 
 
 def _number_types(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Features are of the parameters' type, whatever float comes."""
+    """Check that features have the dtype of the parameters, whatever the float dtype of the inputs."""
     for kind in (torch.float32, torch.float64):
         with torch.no_grad():
             worst.same(f"features of {kind}", make().to(kind)(inputs(2).to(kind)).dtype, kind)
 
 
 def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
-    """Also those of an image that is all but black, whose numbers a float might have."""
+    """Check that bytes are read as 0 to 1, also in a nearly black image, whose bytes could be mistaken for floats."""
     encoder = make()
     for what, brightest in {"bytes": 256, "dark bytes": 2}.items():
         pixels = torch.randint(0, brightest, (3, *row.input_shape), dtype=torch.uint8)
@@ -144,7 +144,7 @@ def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
 
 
 def _every_part(make: Make, batch: Tensor, worst: Worst) -> None:
-    """Another channel, or another quarter of the image, gives other features, with weights as after some training."""
+    """Check that each channel and each quarter of an image affects the features, with weights as after training."""
     encoder = make()
     moved_a_little(encoder)
     channels, height, width = batch.shape[1:]
@@ -167,7 +167,7 @@ def _every_part(make: Make, batch: Tensor, worst: Worst) -> None:
 
 
 def _repeatable(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Whatever was encoded before; and evaluation changes no state."""
+    """Check that features repeat, whatever was encoded before, and that evaluation changes no state."""
     with torch.no_grad():
         encoder, batch = make(), inputs(3)
         before = {name: value.clone() for name, value in _state(encoder).items()}
@@ -190,7 +190,7 @@ def _state(encoder: Encoder) -> dict[str, Tensor]:
 
 
 def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst, *, slow: bool) -> None:
-    """In evaluation a sample's features do not depend on its batch, up to the rounding of another matrix product."""
+    """Check that in evaluation a sample's features do not depend on its batch, up to rounding of matrix products."""
     encoder = make()
 
     def compare(batch: Tensor, sizes: list[int]) -> None:
@@ -221,7 +221,7 @@ def _slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
 
 
 def _untouched(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """An ensemble's other members read the same batch."""
+    """Check that encoding leaves the batch as it is, since other members of an ensemble read it."""
     encoder, batches = make(), {"floats": inputs(4)}
     if batches["floats"].dim() == 4:
         batches["bytes"] = (batches["floats"] * 255).round().clamp(0, 255).to(torch.uint8)
@@ -234,9 +234,9 @@ def _untouched(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> Non
 
 
 def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Also of what training has moved beside the parameters: running means, say."""
+    """Check that a stored encoder gives the same bits, also after training changed buffers such as running means."""
     encoder = make()
-    other = make(SEED + 7)  # so that a parameter which is not stored starts elsewhere
+    other = make(SEED + 7)  # so that a parameter that is not stored has another value
     for what, batches in {"the first state": 0, "the state after training": 2}.items():
         with torch.no_grad():
             for _ in range(batches):
@@ -249,7 +249,11 @@ def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], w
 
 
 def _claims(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """`fixed`: a function of the input alone. `vectorises`: several at once are each."""
+    """Check the claims of an encoder.
+
+    With `fixed`, features depend on the input alone. With `vectorises`, several encoders evaluated at once give the
+    features of each.
+    """
     encoder = make()
     worst.count(False, "it says nothing of itself")
     if not (encoder.fixed or encoder.vectorises):
@@ -276,7 +280,10 @@ def _claims(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst
 
 
 def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """In training, on a few batches so that dropout and dead units leave none out by chance."""
+    """Check that in training every parameter gets a gradient.
+
+    Several batches are used, so that dropout and dead units leave out no parameter by chance.
+    """
     encoder = make().train()
     worst.count(False, "no parameters")
     if not any(True for _ in encoder.parameters()):
@@ -294,8 +301,11 @@ def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> Non
 
 
 def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """The directional derivative of the features' mean square in the input, in evaluation and float64, relative to the
-    gradient's size; by the best of a few steps, since units bend within long ones and short ones round."""
+    """Check the directional derivative of the features' mean square in the input, in evaluation mode and float64.
+
+    The error is relative to the gradient's size. The step that agrees best counts, since long steps cross kinks and
+    short steps lose digits.
+    """
     encoder, batch = make().double(), inputs(2).double()
     encoder.requires_grad_(False)
     batch.requires_grad_()
@@ -319,7 +329,7 @@ def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Wor
 
 
 def _extremes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Constant inputs, and for vectors large ones; NaN stays in its row, or is refused."""
+    """Check finite features at constant inputs, and large ones for vectors; NaN must stay in its row or be refused."""
     encoder, like = make(), inputs(3)
     sizes = (0.0, 1.0) if like.dim() == 4 else (0.0, 1e-30, 1.0, 1e6)
     with torch.no_grad():

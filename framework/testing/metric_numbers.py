@@ -1,4 +1,4 @@
-"""What the contract asks of a metric's numbers: their standard error, unit and turns; each reports its worst case."""
+"""Checks of a metric's numbers: their standard errors, units and treatment of NaN; each reports its worst case."""
 
 import math
 import re
@@ -15,10 +15,10 @@ from framework.testing.finding import SEED, Worst
 Numbers = Mapping[str, Tensor]
 SEM = "_sem"
 NEAR = 0.15
-"""Relative difference of a standard error from the jackknife's above which the bootstrap decides."""
+"""Relative difference between a standard error and the jackknife's above which the bootstrap decides."""
 RESAMPLES = 300
 SCALE = 8.0
-"""How many times as large a target in another unit is: a power of two, so that nothing rounds."""
+"""Factor between two units of a target; a power of two, so that scaling is exact."""
 SQUARES = re.compile(
     r"(^|[\W_])(mse|sse|squared?|squares|sq|var|variance|quadratic|energy|power|l2|2)([\W_]|$)"
 )
@@ -27,14 +27,15 @@ ROOTS = re.compile(r"(^|[\W_])(root|rms[a-z]*)([\W_]|$)")
 
 
 def standard_errors(judge: Callable[[Tensor], Numbers], count: int, worst: Worst) -> None:
-    """What is printed behind ± against the jackknife over test cases, else their bootstrap; |log| of the ratio.
+    """Check standard errors against the jackknife over test cases, or else against their bootstrap.
 
-    Of a mean the jackknife's is the standard error itself (Efron & Tibshirani 1993, §11.1); of what is not smooth, a
-    median, only the bootstrap's holds (§11.6).
+    The error is the absolute logarithm of the ratio. The jackknife of a mean is the standard error itself (Efron &
+    Tibshirani 1993, §11.1). For statistics that are not smooth, such as a median, only the bootstrap is valid (§11.6).
 
     Args:
-        judge: which of the test cases → the metric's numbers.
-        count: number of test cases.
+        judge: Function from indices of test cases to the metric's numbers.
+        count: Number of test cases.
+        worst: Recorder of the worst case.
     """
     index = torch.arange(count)
     whole = judge(index)
@@ -62,7 +63,7 @@ def _is_error(key: str, whole: Numbers) -> bool:
 
 
 def _deviation(found: list[Numbers], key: str) -> float:
-    """Of the number that a standard error is of."""
+    """Return the standard deviation of the number to which the standard error `key` belongs."""
     return float(np.std([numbers[key.removesuffix(SEM)].item() for numbers in found]))
 
 
@@ -74,7 +75,7 @@ def _gap(one: float, other: float) -> float:
 
 
 def same(what: str, found: Numbers, wanted: Numbers, worst: Worst) -> None:
-    """Numbers that must not differ; relative where they are above 1. NaN equals NaN."""
+    """Check that numbers agree; the error is relative to values above 1, and NaN equals NaN."""
     worst.same(f"{what}: keys", sorted(found), sorted(wanted))
     for key in found.keys() & wanted.keys():
         one, other = found[key].double(), wanted[key].double()
@@ -84,12 +85,13 @@ def same(what: str, found: Numbers, wanted: Numbers, worst: Worst) -> None:
 
 
 def degrees(columns: Mapping[str, str], wide: Sequence[Numbers], off: Numbers, worst: Worst) -> None:
-    """Numbers of angles that say they are degrees are no radians, and others no degrees.
+    """Check that numbers named as degrees are not radians, and that other numbers of angles are not degrees.
 
     Args:
-        columns: the metric's.
-        wide: its numbers of predictions that are far off in various ways.
-        off: its numbers of predictions that are 1 radian off, each.
+        columns: Columns of the metric.
+        wide: Numbers of the metric for predictions that are far off in various ways.
+        off: Numbers of the metric for predictions that are each 1 radian off.
+        worst: Recorder of the worst case.
     """
     worst.count(False, "no number says its unit")
     for key, title in columns.items():
@@ -116,13 +118,17 @@ def _in_degrees(key: str, title: str) -> bool:
 def scaled(
     columns: Mapping[str, str], found: Numbers, again: Numbers, wanted: Numbers, numbers: int, worst: Worst
 ) -> None:
-    """Of reals in another unit, SCALE times as large, a number scales or does not, and its standard error likewise;
-    logarithms of densities shift by nats.
+    """Check how numbers change with the target's unit: a number scales or does not, its standard error likewise.
+
+    Targets in the other unit are SCALE times as large. Logarithms of densities must shift by nats.
 
     Args:
-        columns: the metric's.
-        found, again, wanted: its numbers in the other unit, in one SCALE times as large as that, and in the first.
-        numbers: how many reals a target has.
+        columns: Columns of the metric.
+        found: Numbers of the metric in the other unit.
+        again: Numbers in a third unit, SCALE times as large as the second.
+        wanted: Numbers in the first unit.
+        numbers: Number of reals of a target.
+        worst: Recorder of the worst case.
     """
     worst.count(False, "no number scales")
     for key, value in wanted.items():
@@ -130,7 +136,7 @@ def scaled(
             continue
         power = _power(found[key], value)
         if power is not None and _power(again[key], found[key]) != power:
-            continue  # a share that happens to be so many times as large
+            continue  # a share that has this ratio by chance
         title = f"{key} {columns.get(key, '')}".lower()
         worst.count(
             power == 2 and (not SQUARES.search(title) or bool(ROOTS.search(title))),
@@ -146,7 +152,7 @@ def scaled(
         error = key + SEM
         if error in wanted and wanted[error].isfinite() and wanted[error] != 0:
             other = _power(found[error], wanted[error])
-            # a share within a fixed distance, say, neither scales nor shifts
+            # a share within a fixed distance, for example, neither scales nor shifts
             known = power is not None or _shifts(found[key], value)
             worst.count(
                 known and other != (power or 0),
@@ -172,11 +178,13 @@ def _whole(number: float) -> bool:
 
 
 def nats(columns: Mapping[str, str], target: Target, flat: Numbers, worst: Worst) -> None:
-    """Of uniform densities, whose every log-density and entropy is known, a number is that in nats and not in bits.
+    """Check that no number is in bits, at uniform densities, whose log-densities and entropies are all known.
 
     Args:
-        columns: the metric's.
-        flat: its numbers of uniform predictions of the target.
+        columns: Columns of the metric.
+        target: Target of the predictions.
+        flat: Numbers of the metric for uniform predictions of the target.
+        worst: Recorder of the worst case.
     """
     uniform = math.log2(len(target.names)) if target.kind == "class" else math.log2(2 * math.pi)
     if target.kind == "angle":
@@ -184,7 +192,7 @@ def nats(columns: Mapping[str, str], target: Target, flat: Numbers, worst: Worst
     worst.count(False, "no number is in bits")
     for key, value in flat.items():
         title = f"{key} {columns.get(key, '')}".lower()
-        # of two or four classes bits are whole numbers, which a share may be too
+        # for two or four classes, bits are whole numbers, which a share may also be
         bits = not _whole(uniform) and abs(abs(value.item()) - uniform) < 1e-6
         worst.count(
             bits and "bit" not in title,
@@ -201,14 +209,16 @@ def not_hidden(
     better: Mapping[str, str],
     worst: Worst,
 ) -> None:
-    """Predictions that are NaN are refused, make the numbers NaN, or count against who made them; none is left out.
+    """Check that predictions of NaN are refused, make the numbers NaN, or make them worse, but are not left out.
 
     Args:
-        judge: the numbers with such predictions.
-        whole: the numbers where there are none.
-        moved: the numbers where they are others.
-        without: the numbers without these samples.
-        columns, better: the metric's.
+        judge: Function that returns the numbers with such predictions.
+        whole: Numbers without such predictions.
+        moved: Numbers where these predictions have other values.
+        without: Numbers without these samples.
+        columns: Columns of the metric.
+        better: Better direction of columns.
+        worst: Recorder of the worst case.
     """
     try:
         found = judge()
@@ -219,13 +229,13 @@ def not_hidden(
     for key in columns:
         if key not in found or not found[key].isfinite():
             continue
-        # what does not depend on these predictions, they cannot spoil
+        # NaN cannot affect a number that does not depend on these predictions
         if (whole[key] - moved[key]).abs() < 1e-12 or whole[key] == without[key]:
             continue
         value, left = found[key].item(), without[key].item()
         flattered = abs(value - left) < 1e-12
         if better.get(key) == "higher":
-            flattered &= left != 0  # of none that is right, one more that is wrong leaves none
+            flattered &= left != 0  # a share of 0 stays 0 with one more wrong prediction
         if key in better:
             flattered |= value > left if better[key] == "higher" else value < left
         worst.count(
